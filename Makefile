@@ -1,0 +1,36 @@
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test bench fuzz lint clean
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+$(VENV)/.installed-%: $(STAMP)
+	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
+	touch $@
+
+test: $(STAMP)
+	$(RUN) -m pytest
+
+bench: $(VENV)/.installed-bench
+	$(RUN) -m pytest tests/benchmarks -s
+
+fuzz: $(STAMP)
+	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k mutated
+
+lint: $(VENV)/.installed-lint
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+demo: $(STAMP)
+	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template $(TEMPLATE)) $(if $(TAKE),--take $(TAKE))
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,54 @@
+"""torchface: learn face rigs from scans, solve performances with them, ship them as ONNX and glTF.
+
+Names load on first use, so that ``import torchface`` is quick and a command needs only what it touches.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Mesh": "torchface.mesh",
+    "Annotations": "torchface.mesh",
+    "Track": "torchface.take",
+    "Take": "torchface.take",
+    "BlendshapeRig": "torchface.rig",
+    "Attachment": "torchface.attachment",
+    "TorchfaceError": "torchface.errors",
+    "load_mesh": "torchface.io",
+    "save_mesh": "torchface.io",
+    "load_rig": "torchface.io",
+    "save_rig": "torchface.io",
+    "save_animation": "torchface.io",
+    "load_take": "torchface.io",
+    "save_take": "torchface.io",
+}
+
+__all__ = [*_HOMES, "__version__"]
+
+if TYPE_CHECKING:
+    from torchface.attachment import Attachment
+    from torchface.errors import TorchfaceError
+    from torchface.io import (
+        load_mesh,
+        load_rig,
+        load_take,
+        save_animation,
+        save_mesh,
+        save_rig,
+        save_take,
+    )
+    from torchface.mesh import Annotations, Mesh
+    from torchface.rig import BlendshapeRig
+    from torchface.take import Take, Track
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'torchface' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,158 @@
+"""Where markers sit on a mesh: a triangle and barycentric coordinates each."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.mesh import Mesh
+
+_FORMAT = "torchface.attachment/1"
+_LARGEST_FILE = 64 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Attachment:
+    """M points fixed to the triangles of a mesh.
+
+    Args:
+        triangles: rows of the mesh's faces, (M,) int64.
+        barycentric: weights of each triangle's corners, (M,3), rows sum to 1.
+        labels: marker labels, no label twice; ``marker000``, ... if absent.
+        residual: what was left between marker and surface, (M,3), millimetres.
+        fingerprint: ``Mesh.fingerprint()`` of the mesh it was made for, checked where known.
+
+    Raises:
+        ShapeError, NameMismatchError, ValueRangeError: the parts do not fit each other.
+    """
+
+    triangles: Tensor
+    barycentric: Tensor
+    labels: tuple[str, ...] | None = None
+    residual: Tensor | None = None
+    fingerprint: str | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.triangles)
+        if self.triangles.shape != (count,) or self.barycentric.shape != (count, 3):
+            raise ShapeError(
+                f"attachment: found triangles {tuple(self.triangles.shape)} and barycentric "
+                f"{tuple(self.barycentric.shape)}, expected (M,) and (M,3)"
+            )
+        if not torch.isfinite(self.barycentric).all() or (self.barycentric.sum(1) - 1).abs().gt(1e-3).any():
+            raise ValueRangeError("attachment: barycentric rows must be finite and sum to 1")
+        if self.residual is not None and self.residual.shape != (count, 3):
+            raise ShapeError(f"attachment: found residual {tuple(self.residual.shape)}, expected ({count},3)")
+        labels = tuple(f"marker{i:03d}" for i in range(count)) if self.labels is None else tuple(self.labels)
+        if len(labels) != count or len(set(labels)) != count:
+            raise NameMismatchError(f"attachment: found {len(set(labels))} distinct labels for {count} markers")
+        object.__setattr__(self, "labels", labels)
+
+    @staticmethod
+    def from_vertices(mesh: Mesh, ids: Tensor | Sequence[int], labels: Sequence[str] | None = None) -> Attachment:
+        """Markers that sit on vertices ``ids`` (M,).
+
+        Raises:
+            TopologyError: an id is outside the mesh, or its vertex belongs to no triangle.
+        """
+        ids = torch.as_tensor(ids, dtype=torch.int64)
+        if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= len(mesh.vertices)):
+            raise TopologyError(
+                f"attachment: found vertex ids {int(ids.min())} to {int(ids.max())}, "
+                f"expected 0 to {len(mesh.vertices) - 1}"
+            )
+        faces = mesh.faces.cpu()
+        corner_of = torch.full((len(mesh.vertices),), -1, dtype=torch.int64)
+        corner_of[faces.flatten()] = torch.arange(faces.numel())
+        corners = corner_of[ids]
+        if (corners < 0).any():
+            loose = ids[corners < 0].tolist()
+            raise TopologyError(f"attachment: vertices {loose[:5]} belong to no triangle; a marker needs one")
+        barycentric = torch.nn.functional.one_hot(corners % 3, 3).to(torch.float32)
+        return Attachment(
+            corners // 3, barycentric, None if labels is None else tuple(labels), fingerprint=mesh.fingerprint()
+        )
+
+    def check(self, mesh: Mesh) -> None:
+        """Raises ``TopologyError`` where this attachment cannot belong to ``mesh``."""
+        if self.fingerprint is not None and self.fingerprint != mesh.fingerprint():
+            raise TopologyError(
+                f"attachment: made for topology {self.fingerprint}, the mesh has {mesh.fingerprint()} "
+                "(vertex count, hash of the triangles)"
+            )
+        if len(self.triangles) and (int(self.triangles.min()) < 0 or int(self.triangles.max()) >= len(mesh.faces)):
+            raise TopologyError(
+                f"attachment: found triangles {int(self.triangles.min())} to {int(self.triangles.max())}, "
+                f"expected 0 to {len(mesh.faces) - 1}"
+            )
+
+    def on(self, faces: Tensor, vertices: Tensor) -> Tensor:
+        """The points (...,M,3) on ``vertices`` (...,V,3); linear, so deltas go in as well as positions."""
+        corners = faces[self.triangles.to(faces.device)]
+        weights = self.barycentric.to(vertices)
+        return (vertices[..., corners, :] * weights[..., None]).sum(-2)
+
+    def select(self, labels: Sequence[str]) -> Attachment:
+        """The markers of these labels, in this order."""
+        row = {label: i for i, label in enumerate(self.labels or ())}
+        missing = [label for label in labels if label not in row]
+        if missing:
+            raise NameMismatchError(f"attachment: no marker {', '.join(map(repr, missing[:5]))} among its {len(row)}")
+        ids = torch.tensor([row[label] for label in labels], dtype=torch.int64)
+        return Attachment(
+            self.triangles[ids],
+            self.barycentric[ids],
+            tuple(labels),
+            None if self.residual is None else self.residual[ids],
+            self.fingerprint,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Writes JSON; the file appears only when it is complete."""
+        path = Path(path)
+        document = {
+            "format": _FORMAT,
+            "fingerprint": self.fingerprint,
+            "labels": list(self.labels or ()),
+            "triangles": self.triangles.tolist(),
+            "barycentric": self.barycentric.tolist(),
+            "residual": None if self.residual is None else self.residual.tolist(),
+        }
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        temporary.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        os.replace(temporary, path)
+
+    @staticmethod
+    def load(path: str | Path) -> Attachment:
+        """Reads what ``save`` wrote.
+
+        Raises:
+            FileFormatError: the file is missing, too large, not JSON, or lacks a field.
+        """
+        path = Path(path)
+        try:
+            size = path.stat().st_size
+            if size > _LARGEST_FILE:
+                raise FileFormatError(f"{path}: found {size} bytes, expected an attachment of at most {_LARGEST_FILE}")
+            document = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(document, dict) or document.get("format") != _FORMAT:
+                raise FileFormatError(f'{path}: no field "format": "{_FORMAT}"; expected an attachment saved as JSON')
+            residual = document.get("residual")
+            return Attachment(
+                torch.tensor(document["triangles"], dtype=torch.int64).reshape(-1),
+                torch.tensor(document["barycentric"], dtype=torch.float32).reshape(-1, 3),
+                tuple(str(label) for label in document["labels"]),
+                None if residual is None else torch.tensor(residual, dtype=torch.float32).reshape(-1, 3),
+                document.get("fingerprint"),
+            )
+        except OSError as error:
+            raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from error
+        except (ValueError, KeyError, TypeError, RuntimeError, RecursionError, OverflowError) as error:
+            raise FileFormatError(f"{path}: not an attachment ({type(error).__name__}: {error})") from error

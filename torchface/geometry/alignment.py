@@ -1,0 +1,83 @@
+"""Rigid and similarity alignment of points whose correspondence is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """:math:`x \\mapsto s R x + t` for a batch: scale (B,), rotation (B,3,3), translation (B,3)."""
+
+    scale: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Moved points (B,N,3); points (N,3) go through each of the B similarities."""
+        turned = points @ self.rotation.transpose(-1, -2).to(points)
+        return self.scale.to(points)[:, None, None] * turned + self.translation.to(points)[:, None, :]
+
+    def apply_vectors(self, vectors: Tensor) -> Tensor:
+        """Turned and scaled, not translated: for deltas (..., B,N,3)."""
+        return self.scale.to(vectors)[:, None, None] * (vectors @ self.rotation.transpose(-1, -2).to(vectors))
+
+    def inverse(self) -> Similarity:
+        """The similarity that undoes this one."""
+        rotation = self.rotation.transpose(-1, -2)
+        scale = 1 / self.scale
+        translation = -scale[:, None] * (rotation @ self.translation[..., None])[..., 0]
+        return Similarity(scale, rotation, translation)
+
+
+def similarity_transform(
+    source: Tensor, target: Tensor, weights: Tensor | None = None, scale: bool = True
+) -> Similarity:
+    r"""The similarity that moves ``source`` onto ``target`` with least squared error.
+
+    .. math:: \min_{s,R,t} \sum_i w_i \lVert s R x_i + t - y_i \rVert^2, \quad R \in SO(3)
+
+    Args:
+        source: points :math:`x`, (B,N,3), millimetres.
+        target: points :math:`y`, (B,N,3); a NaN row, here or in ``source``, counts as missing.
+        weights: non-negative, (B,N); equal if absent.
+        scale: estimate :math:`s`; otherwise it stays 1.
+
+    Returns:
+        ``Similarity(scale (B,), rotation (B,3,3), translation (B,3))``, solved in float64.
+
+    Raises:
+        ShapeError: the shapes differ, or fewer than three points are present.
+
+    Source: Horn 1987; thesis 3.2.3 and 4.1.2.
+    """
+    if source.shape != target.shape or source.ndim != 3 or source.shape[-1] != 3:
+        raise ShapeError(
+            f"similarity_transform: found {tuple(source.shape)} and {tuple(target.shape)}, expected (B,N,3) twice"
+        )
+    x, y = source.double(), target.double()
+    seen = torch.isfinite(x).all(-1) & torch.isfinite(y).all(-1)
+    w = seen.double() if weights is None else weights.double() * seen
+    if int((w > 0).sum(-1).min()) < 3:
+        raise ShapeError(
+            f"similarity_transform: found {int((w > 0).sum(-1).min())} points present, expected at least 3"
+        )
+    x, y = torch.where(seen[..., None], x, 0.0), torch.where(seen[..., None], y, 0.0)
+    w = (w / w.sum(-1, keepdim=True))[..., None]
+    mean_x, mean_y = (w * x).sum(-2, keepdim=True), (w * y).sum(-2, keepdim=True)
+    x, y = x - mean_x, y - mean_y
+    covariance = (w * y).transpose(-1, -2) @ x
+    u, singular, vh = torch.linalg.svd(covariance)
+    # Without the guard a mirrored or flat point set would come back as a reflection.
+    sign = torch.ones_like(singular)
+    sign[..., -1] = torch.where(torch.linalg.det(u @ vh) < 0, -1.0, 1.0)
+    rotation = (u * sign[..., None, :]) @ vh
+    s = (sign * singular).sum(-1) / (w * x.square()).sum((-1, -2)) if scale else torch.ones_like(singular[..., 0])
+    translation = mean_y[..., 0, :] - s[..., None] * (rotation @ mean_x.transpose(-1, -2))[..., 0]
+    dtype = source.dtype
+    return Similarity(s.to(dtype), rotation.to(dtype), translation.to(dtype))

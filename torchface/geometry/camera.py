@@ -1,0 +1,77 @@
+"""Pinhole cameras in OpenCV's convention: K, [R|t], x right, y down, pixel centres at integers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One pinhole camera.
+
+    Args:
+        intrinsics: K, (3,3), pixels.
+        rotation: world to camera, (3,3).
+        translation: world to camera, (3,), millimetres.
+        width, height: of the image, pixels.
+    """
+
+    intrinsics: Tensor
+    rotation: Tensor
+    translation: Tensor
+    width: int
+    height: int
+
+    @property
+    def centre(self) -> Tensor:
+        """Where the camera stands in the world, (3,)."""
+        return -self.rotation.T @ self.translation
+
+    def project(self, points: Tensor) -> Tensor:
+        """Pixels (...,2) of world points (...,3)."""
+        seen = points @ self.rotation.T.to(points) + self.translation.to(points)
+        image = seen @ self.intrinsics.T.to(points)
+        return image[..., :2] / image[..., 2:]
+
+    def rays(self, samples: int = 1) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions of the viewing rays, each (H*s, W*s, 3), ``samples`` s a pixel side."""
+        step = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
+        x = (torch.arange(self.width)[:, None] + step).flatten()
+        y = (torch.arange(self.height)[:, None] + step).flatten()
+        grid = torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones(len(y), len(x), dtype=x.dtype)], dim=-1)
+        back = torch.linalg.inv(self.intrinsics.double()).T @ self.rotation.double()
+        directions = torch.nn.functional.normalize(grid @ back, dim=-1)
+        return self.centre.double().expand_as(directions), directions
+
+
+def look_at(
+    target: Tensor, yaw: float, pitch: float = 0.0, span: float = 300.0, width: int = 512, height: int = 640,
+    field_of_view: float = 18.0,
+) -> Camera:
+    """A camera that looks at a point from an angle, like a portrait photographer's.
+
+    Args:
+        target: what is looked at, (3,), millimetres.
+        yaw: degrees; 0 sees the face from the front, 90 from the viewer's right.
+        pitch: degrees; positive looks down from above.
+        span: how many millimetres the image's height covers at the target.
+        width, height: pixels.
+        field_of_view: vertical, degrees; small is a long lens from far away.
+    """
+    distance = span / 2 / math.tan(math.radians(field_of_view) / 2)
+    a, b = math.radians(yaw), math.radians(pitch)
+    away = torch.tensor([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)], dtype=torch.float64)
+    forward = -away
+    right = torch.tensor([math.cos(a), 0.0, -math.sin(a)], dtype=torch.float64)
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack([right, down, forward])
+    centre = target.double() + distance * away
+    focal = height / 2 / math.tan(math.radians(field_of_view) / 2)
+    intrinsics = torch.tensor(
+        [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64
+    )
+    return Camera(intrinsics, rotation, -rotation @ centre, width, height)

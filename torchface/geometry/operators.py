@@ -1,0 +1,62 @@
+"""What a triangle mesh computes of itself: normals, areas, edges, borders, parts. All functions are batched."""
+
+from __future__ import annotations
+
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+
+def corners(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three corner positions (...,F,3) of each triangle."""
+    a, b, c = faces.unbind(-1)
+    return vertices[..., a, :], vertices[..., b, :], vertices[..., c, :]
+
+
+def triangle_cross(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Edge cross products (...,F,3): along the normal, twice the area long."""
+    a, b, c = corners(vertices, faces)
+    return torch.linalg.cross(b - a, c - a)
+
+
+def triangle_areas(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Areas (...,F), square millimetres."""
+    return 0.5 * triangle_cross(vertices, faces).norm(dim=-1)
+
+
+def triangle_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals (...,F,3); zero for a triangle without area."""
+    return torch.nn.functional.normalize(triangle_cross(vertices, faces), dim=-1, eps=1e-20)
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals (...,V,3), the area-weighted mean of the triangles around; zero for a loose vertex."""
+    cross = triangle_cross(vertices, faces)
+    total = torch.zeros_like(vertices)
+    for corner in range(3):
+        total.index_add_(-2, faces[:, corner], cross)
+    return torch.nn.functional.normalize(total, dim=-1, eps=1e-20)
+
+
+def edges(faces: Tensor) -> Tensor:
+    """Every edge once, (E,2), smaller vertex id first, sorted."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return pairs.sort(dim=1).values.unique(dim=0)
+
+
+def border_vertices(faces: Tensor, vertex_count: int) -> Tensor:
+    """Mask (V,) of the vertices on an edge that only one triangle has."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
+    unique, count = pairs.unique(dim=0, return_counts=True)
+    mask = torch.zeros(vertex_count, dtype=torch.bool, device=faces.device)
+    mask[unique[count == 1].flatten()] = True
+    return mask
+
+
+def components(faces: Tensor, vertex_count: int) -> Tensor:
+    """The connected part each vertex belongs to, (V,) int64, numbered from 0 in order of first vertex."""
+    pairs = edges(faces).cpu().numpy()
+    graph = coo_matrix((torch.ones(len(pairs)).numpy(), (pairs[:, 0], pairs[:, 1])), shape=(vertex_count,) * 2)
+    _, labels = connected_components(graph, directed=False)
+    return torch.from_numpy(labels.astype("int64")).to(faces.device)

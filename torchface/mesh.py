@@ -1,0 +1,253 @@
+"""The triangle mesh with seams, quads and annotations that everything else speaks of."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, fields, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """What is known of a mesh's vertices beyond where they are; travels in glTF extras.
+
+    Args:
+        landmarks: vertex ids of the 68 iBUG landmarks (or another set), (L,) int64.
+        regions: boolean vertex masks by name, each (V,).
+        mirror: the vertex on the other side of the face, (V,) int64; a midline vertex names itself.
+        contacts: pairs of vertex ids that touch when lids or lips close, (K,2) int64.
+    """
+
+    landmarks: Tensor | None = None
+    regions: dict[str, Tensor] = field(default_factory=dict)
+    mirror: Tensor | None = None
+    contacts: Tensor | None = None
+
+    def to(self, device: torch.device | str) -> Annotations:
+        """The same annotations on another device."""
+        return Annotations(
+            *(None if t is None else t.to(device) for t in (self.landmarks,)),
+            {name: mask.to(device) for name, mask in self.regions.items()},
+            *(None if t is None else t.to(device) for t in (self.mirror, self.contacts)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh in millimetres, y up, z toward the viewer.
+
+    Args:
+        vertices: positions, (V,3) float, finite.
+        faces: triangles, (F,3) int64. With ``polygons`` they are its fan triangulation, in order.
+        uvs: texture coordinates, (U,2), origin at the lower left.
+        uv_faces: the rows of ``uvs`` at each triangle's corners, (F,3) int64; a seam gives a vertex several.
+        colors: vertex colours in [0,1], (V,3).
+        texture: an image in [0,1], (3,H,W), first row on top.
+        polygons: the faces as authored, (P,K) int64, shorter rows padded with -1.
+        annotations: landmarks, regions, mirror map, contact pairs.
+
+    Raises:
+        ShapeError: a tensor has the wrong shape.
+        TopologyError: an index points outside, or ``faces`` is not the fan triangulation of ``polygons``.
+        ValueRangeError: a position is NaN or infinite.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    uvs: Tensor | None = None
+    uv_faces: Tensor | None = None
+    colors: Tensor | None = None
+    texture: Tensor | None = None
+    polygons: Tensor | None = None
+    annotations: Annotations | None = None
+
+    def __post_init__(self) -> None:
+        _check_shape("vertices", self.vertices, (None, 3))
+        _check_shape("faces", self.faces, (None, 3))
+        if not torch.isfinite(self.vertices).all():
+            bad = int((~torch.isfinite(self.vertices)).any(-1).sum())
+            raise ValueRangeError(f"mesh: {bad} of {len(self.vertices)} vertices are NaN or infinite; expected none")
+        _check_indices("faces", self.faces, len(self.vertices))
+        if (self.uvs is None) != (self.uv_faces is None):
+            raise TopologyError("mesh: uvs and uv_faces come together; found only one of them")
+        if self.uvs is not None and self.uv_faces is not None:
+            _check_shape("uvs", self.uvs, (None, 2))
+            _check_shape("uv_faces", self.uv_faces, (len(self.faces), 3))
+            _check_indices("uv_faces", self.uv_faces, len(self.uvs))
+        if self.colors is not None:
+            _check_shape("colors", self.colors, (len(self.vertices), 3))
+        if self.texture is not None:
+            _check_shape("texture", self.texture, (3, None, None))
+        if self.polygons is not None and not torch.equal(fan_triangulation(self.polygons), self.faces):
+            raise TopologyError("mesh: faces are not the fan triangulation of polygons")
+        if self.annotations is not None:
+            _check_annotations(self.annotations, len(self.vertices))
+
+    @staticmethod
+    def from_polygons(
+        vertices: Tensor,
+        polygons: Tensor,
+        uvs: Tensor | None = None,
+        uv_polygons: Tensor | None = None,
+        **rest: Tensor | Annotations | None,
+    ) -> Mesh:
+        """A mesh of polygons (P,K), padded with -1; ``uv_polygons`` (P,K) is laid out alike."""
+        uv_faces = None if uv_polygons is None else fan_triangulation(uv_polygons)
+        return Mesh(vertices, fan_triangulation(polygons), uvs, uv_faces, polygons=polygons, **rest)  # type: ignore[arg-type]
+
+    def to(self, device: torch.device | str) -> Mesh:
+        """The same mesh on another device."""
+        moved = {
+            f.name: value.to(device)
+            for f in fields(self)
+            if isinstance(value := getattr(self, f.name), Tensor | Annotations)
+        }
+        return replace(self, **moved)
+
+    def with_vertices(self, vertices: Tensor) -> Mesh:
+        """The same topology, skin and annotations at other positions (V,3)."""
+        if vertices.shape != self.vertices.shape:
+            raise ShapeError(f"vertices: found {tuple(vertices.shape)}, expected {tuple(self.vertices.shape)}")
+        return replace(self, vertices=vertices)
+
+    @property
+    def landmarks(self) -> Tensor:
+        """Landmark vertex ids (L,); raises where the mesh has none."""
+        if self.annotations is None or self.annotations.landmarks is None:
+            raise ValueRangeError("mesh: no landmark vertices are annotated; set Annotations(landmarks=...)")
+        return self.annotations.landmarks
+
+    def fingerprint(self) -> str:
+        """Sixteen hex digits that two meshes share when their triangles are the same."""
+        digest = hashlib.sha256(self.faces.cpu().contiguous().numpy().tobytes())
+        return f"{len(self.vertices)}-{digest.hexdigest()[:16]}"
+
+    def __repr__(self) -> str:
+        extra = "" if self.polygons is None else f", {len(self.polygons)} polygons"
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles{extra})"
+
+
+def fan_triangulation(polygons: Tensor) -> Tensor:
+    """Triangles (F,3) of polygons (P,K) padded with -1: corner 0 with each following edge, polygon by polygon.
+
+    Example:
+        >>> fan_triangulation(torch.tensor([[0, 1, 2, 3], [4, 5, 6, -1]])).tolist()
+        [[0, 1, 2], [0, 2, 3], [4, 5, 6]]
+    """
+    if polygons.ndim != 2 or polygons.shape[1] < 3:
+        raise ShapeError(f"polygons: found {tuple(polygons.shape)}, expected (P,K) with K at least 3")
+    apex = polygons[:, :1].expand(-1, polygons.shape[1] - 2)
+    fan = torch.stack([apex, polygons[:, 1:-1], polygons[:, 2:]], dim=-1).reshape(-1, 3)
+    return fan[(fan >= 0).all(-1)].contiguous()
+
+
+@dataclass(frozen=True)
+class Submesh:
+    """A part of a mesh: the ``mesh`` (V',..), and for each of its vertices the row ``vertex_ids`` (V',) in the whole."""
+
+    mesh: Mesh
+    vertex_ids: Tensor
+
+
+def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
+    """The part of a mesh whose vertices are kept; a face stays when all its corners do.
+
+    Args:
+        mesh: the whole.
+        keep: a boolean mask (V,) or vertex ids (K,) int64; order of the whole is kept.
+
+    Raises:
+        ShapeError: the mask is not (V,).
+        ValueRangeError: nothing is kept.
+    """
+    count, device = len(mesh.vertices), mesh.vertices.device
+    if keep.dtype == torch.bool:
+        _check_shape("keep", keep, (count,))
+    else:
+        _check_indices("keep", keep, count)
+    mask = torch.zeros(count, dtype=torch.bool, device=device)
+    mask[keep] = True
+    ids = mask.nonzero()[:, 0]
+    if len(ids) == 0:
+        raise ValueRangeError("submesh: no vertex is kept; expected at least one")
+    new_id = torch.full((count + 1,), -1, dtype=torch.int64, device=device)  # the last row answers for padding
+    new_id[ids] = torch.arange(len(ids), device=device)
+    kept_faces = mask[mesh.faces].all(-1)
+    uvs, uv_faces = mesh.uvs, None
+    if uvs is not None and mesh.uv_faces is not None:
+        used, uv_faces = mesh.uv_faces[kept_faces].unique(return_inverse=True)
+        uvs = uvs[used]
+    polygons = mesh.polygons
+    if polygons is not None:
+        kept_polygons = (mask[polygons.clamp(min=0)] | (polygons < 0)).all(-1)
+        polygons = new_id[polygons[kept_polygons]]
+        faces = fan_triangulation(polygons)
+        owner = _polygon_of_triangle(mesh.polygons)
+        if uv_faces is not None and mesh.uv_faces is not None and mesh.uvs is not None:
+            used, uv_faces = mesh.uv_faces[kept_polygons[owner]].unique(return_inverse=True)
+            uvs = mesh.uvs[used]
+    else:
+        faces = new_id[mesh.faces[kept_faces]]
+    part = Mesh(
+        mesh.vertices[ids],
+        faces,
+        uvs,
+        uv_faces,
+        None if mesh.colors is None else mesh.colors[ids],
+        mesh.texture,
+        polygons,
+        None if mesh.annotations is None else _part_of_annotations(mesh.annotations, ids, new_id),
+    )
+    return Submesh(part, ids)
+
+
+def _polygon_of_triangle(polygons: Tensor) -> Tensor:
+    triangles = (polygons >= 0).sum(1) - 2
+    return torch.repeat_interleave(torch.arange(len(polygons), device=polygons.device), triangles)
+
+
+def _part_of_annotations(whole: Annotations, ids: Tensor, new_id: Tensor) -> Annotations:
+    """Landmarks survive only complete: a set with holes would change the meaning of its rows."""
+    landmarks = None if whole.landmarks is None else new_id[whole.landmarks]
+    mirror = None if whole.mirror is None else new_id[whole.mirror[ids]]
+    contacts = None if whole.contacts is None else new_id[whole.contacts]
+    return Annotations(
+        landmarks if landmarks is not None and (landmarks >= 0).all() else None,
+        {name: mask[ids] for name, mask in whole.regions.items()},
+        mirror if mirror is not None and (mirror >= 0).all() else None,
+        None if contacts is None else contacts[(contacts >= 0).all(-1)],
+    )
+
+
+def _check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
+    found = tuple(tensor.shape)
+    if len(found) != len(expected) or any(e is not None and f != e for f, e in zip(found, expected, strict=True)):
+        wanted = ",".join("*" if e is None else str(e) for e in expected)
+        raise ShapeError(f"{name}: found {found}, expected ({wanted})")
+
+
+def _check_indices(name: str, indices: Tensor, count: int) -> None:
+    if indices.dtype != torch.int64:
+        raise TopologyError(f"{name}: found {indices.dtype}, expected torch.int64")
+    if indices.numel() and (int(indices.min()) < 0 or int(indices.max()) >= count):
+        raise TopologyError(
+            f"{name}: found indices {int(indices.min())} to {int(indices.max())}, expected 0 to {count - 1}"
+        )
+
+
+def _check_annotations(annotations: Annotations, count: int) -> None:
+    if annotations.landmarks is not None:
+        _check_shape("landmarks", annotations.landmarks, (None,))
+        _check_indices("landmarks", annotations.landmarks, count)
+    if annotations.mirror is not None:
+        _check_shape("mirror", annotations.mirror, (count,))
+        _check_indices("mirror", annotations.mirror, count)
+    if annotations.contacts is not None:
+        _check_shape("contacts", annotations.contacts, (None, 2))
+        _check_indices("contacts", annotations.contacts, count)
+    for name, mask in annotations.regions.items():
+        _check_shape(f"regions[{name!r}]", mask, (count,))

@@ -1,0 +1,58 @@
+"""Pictures put together: heat colours, captions, sheets of many, files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+
+def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
+    """Colours (V,3) of non-negative values (V,), 0 to ``maximum``; beyond it the last colour."""
+    table = torch.tensor(np.asarray(colormaps[colormap].resampled(256)(np.arange(256)))[:, :3], dtype=torch.float32)
+    return table[(values / maximum * 255).clamp(0, 255).long()]
+
+
+def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
+    """The image (3,H,W) with a line of text under it."""
+    strip = Image.new("RGB", (image.shape[2], size + 10), "white")
+    draw = ImageDraw.Draw(strip)
+    draw.text((image.shape[2] / 2, (size + 10) / 2), text, fill="black", font=ImageFont.load_default(size), anchor="mm")
+    return torch.cat([image, from_pillow(strip)], dim=1)
+
+
+def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
+    """Images (3,H,W) laid out in rows of ``columns``, on white; smaller ones are padded."""
+    height = max(image.shape[1] for image in images) + gap
+    width = max(image.shape[2] for image in images) + gap
+    rows = -(-len(images) // columns)
+    page = torch.ones(3, rows * height - gap, min(columns, len(images)) * width - gap)
+    for i, image in enumerate(images):
+        y, x = i // columns * height, i % columns * width
+        page[:, y : y + image.shape[1], x : x + image.shape[2]] = image
+    return page
+
+
+def to_pillow(image: Tensor) -> Image.Image:
+    """An 8-bit Pillow image of (3,H,W) in [0,1]."""
+    return Image.fromarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
+
+
+def from_pillow(image: Image.Image) -> Tensor:
+    """(3,H,W) in [0,1] of a Pillow image."""
+    return torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
+
+
+def save_picture(image: Tensor, path: str | Path) -> None:
+    """Writes (3,H,W) as PNG or JPEG by the path's ending; the file appears only when it is complete."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    to_pillow(image).save(temporary)
+    os.replace(temporary, path)

@@ -1,0 +1,61 @@
+"""Rays against a triangle mesh, by Embree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from torch import Tensor
+
+from torchface.errors import ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays hit: ``triangle`` (R,) is -1 for a miss, ``barycentric`` (R,3), ``distance`` (R,) along the ray."""
+
+    triangle: Tensor
+    barycentric: Tensor
+    distance: Tensor
+
+
+class RayCaster:
+    """A mesh prepared for ray casting.
+
+    Embree keeps single precision, so the mesh is moved to its own centre first.
+
+    Args:
+        vertices: (V,3), millimetres.
+        faces: (F,3) int64.
+    """
+
+    def __init__(self, vertices: Tensor, faces: Tensor) -> None:
+        self._centre = vertices.double().mean(0)
+        self._scene = rtcore_scene.EmbreeScene()
+        centred = (vertices.double() - self._centre).cpu().numpy().astype(np.float32)
+        TriangleMesh(self._scene, np.ascontiguousarray(centred), faces.cpu().numpy().astype(np.int32))
+
+    def cast(self, origins: Tensor, directions: Tensor) -> Hits:
+        """The first hit of each ray; origins and unit directions (R,3)."""
+        starts, ways = self._prepare(origins, directions)
+        result = self._scene.run(starts, ways, output=True)
+        triangle = torch.from_numpy(result["primID"].astype(np.int64))
+        u, v = torch.from_numpy(result["u"]), torch.from_numpy(result["v"])
+        barycentric = torch.stack([1 - u - v, u, v], dim=-1)
+        distance = torch.from_numpy(result["tfar"].astype(np.float64))
+        missed = triangle < 0
+        return Hits(triangle, barycentric.masked_fill(missed[:, None], 0.0), distance.masked_fill(missed, torch.inf))
+
+    def occluded(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """Whether anything stands in a ray's way, (R,) bool."""
+        starts, ways = self._prepare(origins, directions)
+        return torch.from_numpy(self._scene.run(starts, ways, query="OCCLUDED").astype(np.int64)) >= 0
+
+    def _prepare(self, origins: Tensor, directions: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
+            raise ShapeError(f"rays: found {tuple(origins.shape)} and {tuple(directions.shape)}, expected (R,3) twice")
+        starts = (origins.double() - self._centre).numpy().astype(np.float32)
+        return np.ascontiguousarray(starts), np.ascontiguousarray(directions.numpy().astype(np.float32))

@@ -1,0 +1,73 @@
+"""Names of blendshapes: ARKit's 52, what other rigs call the same shapes, and which is whose mirror image."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+ARKIT: tuple[str, ...] = (
+    *("eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft"),
+    *("eyeWideLeft", "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight", "eyeLookOutRight", "eyeLookUpRight"),
+    *("eyeSquintRight", "eyeWideRight", "jawForward", "jawRight", "jawLeft", "jawOpen"),
+    *("mouthClose", "mouthFunnel", "mouthPucker", "mouthRight", "mouthLeft", "mouthSmileLeft", "mouthSmileRight"),
+    *("mouthFrownLeft", "mouthFrownRight", "mouthDimpleLeft", "mouthDimpleRight", "mouthStretchLeft"),
+    *("mouthStretchRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper"),
+    *("mouthPressLeft", "mouthPressRight", "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft"),
+    *("mouthUpperUpRight", "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
+    *("cheekPuff", "cheekSquintLeft", "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut"),
+)
+"""The 52 in the order in which Live Link Face writes them."""
+
+
+def _canonical(name: str) -> str:
+    """One spelling for a shape: ``EyeBlinkLeft``, ``eyeBlink_L`` and ``eyeblinkleft`` are the same."""
+    name = re.sub(r"_(L|R)$", lambda side: {"L": "Left", "R": "Right"}[side[1]], name)
+    return name.lower()
+
+
+def _halves(canonical: str) -> tuple[str, str]:
+    return canonical + "left", canonical + "right"
+
+
+def mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
+    """The matrix (N_to,N_from) that turns weights by one set of names into weights by another.
+
+    A whole shape drives both halves of a split one; two halves give the whole their mean.
+    A name that the other side lacks leaves its row or column zero.
+
+    Example:
+        >>> mapping(["browInnerUp", "eyeBlinkLeft"], ["eyeBlink_L", "browInnerUp_L", "browInnerUp_R"]).tolist()
+        [[0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]
+    """
+    sources = {_canonical(name): column for column, name in enumerate(from_names)}
+    matrix = torch.zeros(len(to_names), len(from_names))
+    for row, name in enumerate(to_names):
+        wanted = _canonical(name)
+        whole = re.sub(r"(left|right)$", "", wanted)
+        halves = [sources[half] for half in _halves(wanted) if half in sources]
+        if wanted in sources:
+            matrix[row, sources[wanted]] = 1.0
+        elif len(halves) == 2:
+            matrix[row, halves] = 0.5
+        elif whole != wanted and whole in sources:
+            matrix[row, sources[whole]] = 1.0
+    return matrix
+
+
+def mirror(names: Sequence[str]) -> Tensor:
+    """For each name the index of its mirror image, (N,) int64; a name without one is its own.
+
+    Example:
+        >>> mirror(["jawOpen", "mouthSmileLeft", "mouthSmileRight", "jawLeft", "jawRight"]).tolist()
+        [0, 2, 1, 4, 3]
+    """
+    row = {_canonical(name): i for i, name in enumerate(names)}
+    swapped = {"left": "right", "right": "left"}
+    twins = []
+    for i, name in enumerate(names):
+        twin = re.sub(r"(left|right)$", lambda side: swapped[side[1]], _canonical(name))
+        twins.append(row.get(twin, i))
+    return torch.tensor(twins, dtype=torch.int64)

@@ -1,0 +1,107 @@
+"""A performance: what was seen or solved in each frame, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Named channels over time.
+
+    Args:
+        names: one a channel, no name twice (marker labels, shape names, landmark names).
+        values: (T,C,D): markers D=3 in millimetres, landmarks D=2 in pixels, weights D=1. NaN means not seen.
+        confidence: (T,C) in [0,1], where the source gives one.
+
+    Raises:
+        ShapeError: ``values`` is not (T,C,D) with one channel a name.
+        NameMismatchError: a name stands twice.
+    """
+
+    names: tuple[str, ...]
+    values: Tensor
+    confidence: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        if self.values.ndim != 3 or self.values.shape[1] != len(self.names):
+            raise ShapeError(f"track: found values {tuple(self.values.shape)}, expected (T,{len(self.names)},D)")
+        if self.confidence is not None and self.confidence.shape != self.values.shape[:2]:
+            raise ShapeError(
+                f"track: found confidence {tuple(self.confidence.shape)}, expected {tuple(self.values.shape[:2])}"
+            )
+        if len(set(self.names)) != len(self.names):
+            twice = sorted({name for name in self.names if self.names.count(name) > 1})
+            raise NameMismatchError(f"track: found names more than once: {', '.join(twice[:5])}; expected each once")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def select(self, names: Sequence[str]) -> Track:
+        """The channels of these names, in this order."""
+        row = {name: i for i, name in enumerate(self.names)}
+        missing = [name for name in names if name not in row]
+        if missing:
+            raise NameMismatchError(
+                f"track: no channel {', '.join(map(repr, missing[:5]))}; it has {', '.join(self.names[:5])}, ..."
+            )
+        ids = torch.tensor([row[name] for name in names], dtype=torch.int64, device=self.values.device)
+        return Track(
+            tuple(names), self.values[:, ids], None if self.confidence is None else self.confidence[:, ids]
+        )
+
+    def frames(self, rows: slice | Tensor) -> Track:
+        """Some of the frames."""
+        return Track(self.names, self.values[rows], None if self.confidence is None else self.confidence[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """One performance; its tracks have the same number of frames.
+
+    Args:
+        fps: frames a second.
+        markers: values (T,M,3), millimetres.
+        landmarks: values (T,L,2), pixels.
+        weights: values (T,N,1), blendshape weights.
+        timecode: one text a frame, as the file had it.
+        extras: what the file held besides (columns by name, device, subject), kept for writing it back.
+
+    Raises:
+        ShapeError: the tracks differ in length.
+        ValueRangeError: ``fps`` is not a positive number.
+    """
+
+    fps: float
+    markers: Track | None = None
+    landmarks: Track | None = None
+    weights: Track | None = None
+    timecode: tuple[str, ...] | None = None
+    extras: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (self.fps > 0 and self.fps < float("inf")):
+            raise ValueRangeError(f"take: found {self.fps} frames a second, expected a positive number")
+        if self.timecode is not None:
+            object.__setattr__(self, "timecode", tuple(self.timecode))
+        lengths = {
+            name: len(track)
+            for name in ("markers", "landmarks", "weights", "timecode")
+            if (track := getattr(self, name)) is not None
+        }
+        if len(set(lengths.values())) > 1:
+            raise ShapeError(f"take: found frame counts {lengths}, expected the same for all")
+
+    def __len__(self) -> int:
+        for track in (self.markers, self.landmarks, self.weights, self.timecode):
+            if track is not None:
+                return len(track)
+        return 0
