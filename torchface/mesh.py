@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,9 +31,10 @@ class Annotations:
     def to(self, device: torch.device | str) -> Annotations:
         """The same annotations on another device."""
         return Annotations(
-            *(None if t is None else t.to(device) for t in (self.landmarks,)),
+            None if self.landmarks is None else self.landmarks.to(device),
             {name: mask.to(device) for name, mask in self.regions.items()},
-            *(None if t is None else t.to(device) for t in (self.mirror, self.contacts)),
+            None if self.mirror is None else self.mirror.to(device),
+            None if self.contacts is None else self.contacts.to(device),
         )
 
 
@@ -101,7 +103,7 @@ class Mesh:
 
     def to(self, device: torch.device | str) -> Mesh:
         """The same mesh on another device."""
-        moved = {
+        moved: dict[str, Any] = {
             f.name: value.to(device)
             for f in fields(self)
             if isinstance(value := getattr(self, f.name), Tensor | Annotations)
@@ -147,7 +149,7 @@ def fan_triangulation(polygons: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Submesh:
-    """A part of a mesh: the ``mesh`` (V',..), and for each of its vertices the row ``vertex_ids`` (V',) in the whole."""
+    """A part of a mesh: ``mesh`` with V' vertices, and where each stands in the whole, ``vertex_ids`` (V',)."""
 
     mesh: Mesh
     vertex_ids: Tensor
@@ -176,25 +178,20 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
         raise ValueRangeError("submesh: no vertex is kept; expected at least one")
     new_id = torch.full((count + 1,), -1, dtype=torch.int64, device=device)  # the last row answers for padding
     new_id[ids] = torch.arange(len(ids), device=device)
-    kept_faces = mask[mesh.faces].all(-1)
-    uvs, uv_faces = mesh.uvs, None
-    if uvs is not None and mesh.uv_faces is not None:
-        used, uv_faces = mesh.uv_faces[kept_faces].unique(return_inverse=True)
-        uvs = uvs[used]
     polygons = mesh.polygons
-    if polygons is not None:
-        kept_polygons = (mask[polygons.clamp(min=0)] | (polygons < 0)).all(-1)
-        polygons = new_id[polygons[kept_polygons]]
-        faces = fan_triangulation(polygons)
-        owner = _polygon_of_triangle(mesh.polygons)
-        if uv_faces is not None and mesh.uv_faces is not None and mesh.uvs is not None:
-            used, uv_faces = mesh.uv_faces[kept_polygons[owner]].unique(return_inverse=True)
-            uvs = mesh.uvs[used]
+    if polygons is None:
+        kept_faces = mask[mesh.faces].all(-1)
     else:
-        faces = new_id[mesh.faces[kept_faces]]
+        kept_polygons = (mask[polygons.clamp(min=0)] | (polygons < 0)).all(-1)
+        kept_faces = kept_polygons[_polygon_of_triangle(polygons)]
+        polygons = new_id[polygons[kept_polygons]]
+    uvs, uv_faces = None, None
+    if mesh.uvs is not None and mesh.uv_faces is not None:
+        used, uv_faces = mesh.uv_faces[kept_faces].unique(return_inverse=True)
+        uvs = mesh.uvs[used]
     part = Mesh(
         mesh.vertices[ids],
-        faces,
+        new_id[mesh.faces[kept_faces]],
         uvs,
         uv_faces,
         None if mesh.colors is None else mesh.colors[ids],

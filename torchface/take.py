@@ -54,9 +54,7 @@ class Track:
                 f"track: no channel {', '.join(map(repr, missing[:5]))}; it has {', '.join(self.names[:5])}, ..."
             )
         ids = torch.tensor([row[name] for name in names], dtype=torch.int64, device=self.values.device)
-        return Track(
-            tuple(names), self.values[:, ids], None if self.confidence is None else self.confidence[:, ids]
-        )
+        return Track(tuple(names), self.values[:, ids], None if self.confidence is None else self.confidence[:, ids])
 
     def frames(self, rows: slice | Tensor) -> Track:
         """Some of the frames."""

@@ -15,9 +15,7 @@ def test_areas_and_normals_agree_with_trimesh() -> None:
     mesh = trimesh.creation.icosphere(2, radius=80)
     vertices, faces = as_tensors(mesh)
     torch.testing.assert_close(operators.triangle_areas(vertices, faces), torch.from_numpy(mesh.area_faces.copy()))
-    torch.testing.assert_close(
-        operators.triangle_normals(vertices, faces), torch.from_numpy(mesh.face_normals.copy())
-    )
+    torch.testing.assert_close(operators.triangle_normals(vertices, faces), torch.from_numpy(mesh.face_normals.copy()))
     outward = vertices / vertices.norm(dim=1, keepdim=True)
     assert (operators.vertex_normals(vertices, faces) * outward).sum(1).min() > 0.999
 

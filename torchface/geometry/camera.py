@@ -49,7 +49,12 @@ class Camera:
 
 
 def look_at(
-    target: Tensor, yaw: float, pitch: float = 0.0, span: float = 300.0, width: int = 512, height: int = 640,
+    target: Tensor,
+    yaw: float,
+    pitch: float = 0.0,
+    span: float = 300.0,
+    width: int = 512,
+    height: int = 640,
     field_of_view: float = 18.0,
 ) -> Camera:
     """A camera that looks at a point from an angle, like a portrait photographer's.

@@ -1,0 +1,52 @@
+"""BlendshapeRig: equation 1, parts, names."""
+
+import pytest
+import torch
+
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+
+def small_rig(seed: int = 0) -> BlendshapeRig:
+    generator = torch.Generator().manual_seed(seed)
+    neutral = Mesh(torch.randn(6, 3, generator=generator), torch.tensor([[0, 1, 2], [2, 3, 4], [3, 4, 5]]))
+    return BlendshapeRig(neutral, torch.randn(4, 6, 3, generator=generator), ["a", "b", "c", "d"])
+
+
+def test_forward_is_neutral_plus_weighted_deltas() -> None:
+    rig = small_rig()
+    weights = torch.rand(5, 4, generator=torch.Generator().manual_seed(1))
+    expected = rig.vertices + sum(weights[:, i, None, None] * rig.deltas[i] for i in range(4))
+    torch.testing.assert_close(rig(weights), expected)
+    torch.testing.assert_close(rig(torch.eye(4))[2], rig.neutral.vertices + rig.deltas[2])
+
+
+def test_casting_moves_the_neutral_too() -> None:
+    rig = small_rig().to(torch.float64)
+    assert rig.neutral.vertices.dtype == rig.deltas.dtype == torch.float64
+    assert set(rig.state_dict()) == {"vertices", "deltas"}
+
+
+def test_part_moves_as_the_whole_does() -> None:
+    rig = small_rig()
+    part = rig.part(torch.tensor([2, 3, 4, 5]))
+    weights = torch.rand(3, 4, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(part(weights), rig(weights)[:, 2:])
+    torch.testing.assert_close(rig.select(["d", "a"]).deltas, rig.deltas[[3, 0]])
+
+
+def test_bad_rigs_and_weights_are_named() -> None:
+    rig = small_rig()
+    with pytest.raises(NameMismatchError, match="no shape 'smile'"):
+        rig.select(["smile"])
+    with pytest.raises(ShapeError, match=r"found \(2, 3\), expected \(B,4\)"):
+        rig(torch.zeros(2, 3))
+    with pytest.raises(NameMismatchError, match="more than once: a"):
+        BlendshapeRig(rig.neutral, rig.deltas, ["a", "a", "b", "c"])
+    with pytest.raises(ShapeError, match=r"expected \(N,6,3\)"):
+        BlendshapeRig(rig.neutral, rig.deltas[:, :5], rig.names)
+    broken = rig.deltas.clone()
+    broken[1, 0, 0] = torch.inf
+    with pytest.raises(ValueRangeError, match="NaN or infinite in b"):
+        BlendshapeRig(rig.neutral, broken, rig.names)

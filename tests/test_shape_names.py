@@ -1,0 +1,35 @@
+"""Weights keep their meaning from one naming to the other."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.shape_names import ARKIT, mapping, mirror
+
+
+def test_arkit_has_52_names_and_its_mirror_is_an_involution() -> None:
+    assert len(set(ARKIT)) == 52
+    twin = mirror(ARKIT)
+    assert torch.equal(twin[twin], torch.arange(52))
+    for i, name in enumerate(ARKIT):
+        expected = name.replace("Left", "#").replace("Right", "Left").replace("#", "Right")
+        assert ARKIT[int(twin[i])] == expected
+
+
+def test_live_link_spelling_is_a_permutation() -> None:
+    shuffled = [name[0].upper() + name[1:] for name in reversed(ARKIT)]
+    matrix = mapping(shuffled, ARKIT)
+    assert torch.equal(matrix, torch.eye(52).flip(1))
+
+
+@pytest.mark.real
+def test_ict_and_back_keeps_every_weight_that_ict_has(ict_folder: Path) -> None:
+    ict = json.loads((ict_folder / "vertex_indices.json").read_text())["expressions"]
+    there, back = mapping(ARKIT, ict), mapping(ict, ARKIT)
+    weights = torch.rand(52, generator=torch.Generator().manual_seed(0))
+    expected = weights.clone()
+    expected[ARKIT.index("tongueOut")] = 0
+    torch.testing.assert_close(back @ there @ weights, expected)
+    assert (there.sum(1) == 1).all()

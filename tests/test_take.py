@@ -1,0 +1,36 @@
+"""Take and Track: frames agree, channels go by name."""
+
+import pytest
+import torch
+
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.take import Take, Track
+
+
+def test_selecting_channels_follows_names_not_order() -> None:
+    track = Track(("a", "b", "c"), torch.arange(12.0).reshape(2, 3, 2), torch.arange(6.0).reshape(2, 3) / 6)
+    picked = track.select(["c", "a"])
+    assert torch.equal(picked.values, track.values[:, [2, 0]])
+    assert picked.confidence is not None
+    assert track.confidence is not None
+    assert torch.equal(picked.confidence, track.confidence[:, [2, 0]])
+    assert torch.equal(picked.frames(slice(1, 2)).values, track.values[1:, [2, 0]])
+
+
+def test_disagreements_are_named() -> None:
+    track = Track(("a",), torch.zeros(4, 1, 3))
+    with pytest.raises(NameMismatchError, match="no channel 'x'"):
+        track.select(["x"])
+    with pytest.raises(NameMismatchError, match="more than once: a"):
+        Track(("a", "a"), torch.zeros(4, 2, 3))
+    with pytest.raises(ShapeError, match=r"expected \(T,2,D\)"):
+        Track(("a", "b"), torch.zeros(4, 3, 3))
+    with pytest.raises(ShapeError, match="'markers': 4, 'weights': 5"):
+        Take(60.0, markers=track, weights=Track(("w",), torch.zeros(5, 1, 1)))
+    with pytest.raises(ValueRangeError, match="found 0 frames a second"):
+        Take(0)
+
+
+def test_length_is_the_number_of_frames() -> None:
+    assert len(Take(60.0, weights=Track(("w",), torch.zeros(5, 1, 1)))) == 5
+    assert len(Take(60.0)) == 0
