@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
+from torchface.shape_names import mapping
+from torchface.take import Track
 
 
 class BlendshapeRig(nn.Module):
@@ -75,6 +77,20 @@ class BlendshapeRig(nn.Module):
                 f"{', '.join(self.names[:5])}, ..."
             )
         return [row[name] for name in names]
+
+    def weights_from(self, track: Track) -> Tensor:
+        """A weight track in the order of the rig's shapes, (T,N); see ``torchface.shape_names.mapping``.
+
+        Raises:
+            NameMismatchError: no name of the track means a shape of the rig.
+        """
+        matrix = mapping(track.names, self.names).to(track.values)
+        if not matrix.any():
+            raise NameMismatchError(
+                f"weights: found {', '.join(track.names[:5])}, ...; expected some of the rig's shapes, "
+                f"{', '.join(self.names[:5])}, ..."
+            )
+        return track.values[..., 0] @ matrix.T
 
     def select(self, names: Sequence[str]) -> BlendshapeRig:
         """The rig with these shapes only, in this order."""
