@@ -1,0 +1,5 @@
+"""Blendshape weights from what cameras and marker systems saw."""
+
+from torchface.capture.markers import MarkerSolver
+
+__all__ = ["MarkerSolver"]

@@ -1,0 +1,137 @@
+"""Energies of blendshape weights: quadratics that add up and go to ``box_qp``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    r"""An energy :math:`E(w) = \tfrac12 w^\top H w + f^\top w + c` of blendshape weights, a frame each.
+
+    Energies add: ``marker_term(...) + sparsity_term(...)`` is the energy of both. Every term is in mm² a marker.
+
+    Args:
+        H: (N,N) for all frames, or (B,N,N).
+        f: (B,N), or (1,N) for all frames.
+        constant: :math:`c`, (B,) or (1,); it moves no minimum, it makes energies comparable.
+
+    Raises:
+        ShapeError: the parts do not fit each other.
+    """
+
+    H: Tensor
+    f: Tensor
+    constant: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shapes = self.f.ndim == 2 and self.H.ndim in (2, 3) and self.H.shape[-2:] == (self.f.shape[1],) * 2
+        if not shapes or (self.H.ndim == 3 and len(self.f) not in (1, len(self.H))):
+            raise ShapeError(
+                f"quadratic: found H {tuple(self.H.shape)} and f {tuple(self.f.shape)}, "
+                "expected (N,N) or (B,N,N) and (B,N)"
+            )
+
+    def __add__(self, other: Quadratic) -> Quadratic:
+        if self.H.shape[-1] != other.H.shape[-1]:
+            raise ShapeError(f"quadratic: found {self.H.shape[-1]} and {other.H.shape[-1]} weights in a sum")
+        constant = other.constant if self.constant is None else self.constant
+        if self.constant is not None and other.constant is not None:
+            constant = self.constant + other.constant
+        return Quadratic(self.H + other.H, self.f + other.f, constant)
+
+    def __mul__(self, factor: float) -> Quadratic:
+        return Quadratic(factor * self.H, factor * self.f, None if self.constant is None else factor * self.constant)
+
+    __rmul__ = __mul__
+
+    def value(self, weights: Tensor) -> Tensor:
+        """:math:`E(w)` (B,) at weights (B,N)."""
+        bent = weights @ self.H if self.H.ndim == 2 else torch.bmm(self.H, weights[..., None])[..., 0]
+        value = (weights * (0.5 * bent + self.f)).sum(-1)
+        return value if self.constant is None else value + self.constant
+
+
+def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
+    r"""The mean squared distance of the seen markers to their points on the rig.
+
+    .. math:: E(w) = \frac{1}{|S|} \sum_{m \in S} \lVert b_m + B_m w - t_m \rVert^2
+
+    With every marker of every frame seen, H is one matrix (N,N); otherwise it is (B,N,N).
+
+    Args:
+        basis: :math:`B`, what a unit of each weight moves each marker, (M,3,N), millimetres.
+        rest: :math:`b`, where markers are at rest, (M,3), millimetres.
+        targets: :math:`t`, where markers were seen, (B,M,3), millimetres; a NaN coordinate means not seen.
+
+    Returns:
+        The term in mm² a marker. A frame without any marker gets a term of zero.
+
+    Raises:
+        ShapeError: the shapes do not fit each other.
+        ValueRangeError: a target is infinite.
+
+    Source: thesis 4.1.4, equation 33, and appendix, with f's factor 2 and the sign of its targets restored.
+    """
+    markers, _, shapes = basis.shape
+    if basis.ndim != 3 or rest.shape != (markers, 3) or targets.ndim != 3 or targets.shape[1:] != (markers, 3):
+        raise ShapeError(
+            f"marker_term: found basis {tuple(basis.shape)}, rest {tuple(rest.shape)}, targets "
+            f"{tuple(targets.shape)}, expected (M,3,N), (M,3), (B,M,3)"
+        )
+    if torch.isinf(targets).any():
+        frames = torch.isinf(targets).flatten(1).any(1).nonzero()[:, 0].tolist()
+        raise ValueRangeError(f"markers: infinite in frames {frames[:5]}; expected millimetres, or NaN for not seen")
+    seen = ~torch.isnan(targets).any(-1)
+    offset = torch.where(seen[..., None], rest - targets.nan_to_num(0.0), 0.0)
+    rows = basis.flatten(0, 1)
+    if bool(seen.all()):
+        H = (2.0 / markers) * (rows.T @ rows)
+        return Quadratic(H, (2.0 / markers) * (offset.flatten(1) @ rows), offset.square().sum((-1, -2)) / markers)
+    share = seen.to(basis) / seen.sum(-1, keepdim=True).clamp(min=1)
+    own = (basis.transpose(1, 2) @ basis).flatten(1)
+    H = 2.0 * (share @ own).unflatten(1, (shapes, shapes))
+    weighted = share[..., None] * offset
+    return Quadratic(H, 2.0 * (weighted.flatten(1) @ rows), (weighted * offset).sum((-1, -2)))
+
+
+def sparsity_term(shapes: int, weight: float, like: Tensor) -> Quadratic:
+    r"""A price on every active shape, :math:`E(w) = \beta \sum_i w_i = \beta \lVert w \rVert_1` for w ≥ 0.
+
+    Args:
+        shapes: N.
+        weight: :math:`\beta`, mm² a marker for a weight of 1.
+        like: a tensor whose dtype and device the term takes.
+
+    Source: thesis 4.1.4, equation 33.
+    """
+    _check_weight("sparsity", weight)
+    return Quadratic(like.new_zeros(shapes, shapes), like.new_full((1, shapes), weight))
+
+
+def ridge_term(shapes: int, weight: float, like: Tensor, center: Tensor | None = None) -> Quadratic:
+    r"""Tikhonov's term, :math:`E(w) = \varepsilon \lVert w - \bar w \rVert^2`: one minimum, whatever the markers see.
+
+    Args:
+        shapes: N.
+        weight: :math:`\varepsilon`, mm² a marker for a squared weight of 1.
+        like: a tensor whose dtype and device the term takes.
+        center: :math:`\bar w`, (B,N); zero if absent.
+
+    Source: thesis 4.1.4, equation 33.
+    """
+    _check_weight("ridge", weight)
+    H = 2 * weight * torch.eye(shapes, dtype=like.dtype, device=like.device)
+    if center is None:
+        return Quadratic(H, like.new_zeros(1, shapes))
+    return Quadratic(H, -2 * weight * center.to(like), weight * center.to(like).square().sum(-1))
+
+
+def _check_weight(name: str, weight: float) -> None:
+    if not 0 <= weight < float("inf"):
+        raise ValueRangeError(f"{name}: found {weight}, expected a number that is not negative")

@@ -1,0 +1,195 @@
+"""Blendshape weights from 3D markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from torchface.attachment import Attachment
+from torchface.capture.energy import Quadratic, marker_term, ridge_term, sparsity_term
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.geometry.alignment import Similarity
+from torchface.optim import BoxQP, box_qp
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+
+SPARSITY = 0.03
+RIDGE = 1e-4
+
+_COARSE, _FINE = 3e-6, 1e-11
+# Numbers in the matrices of frames with gaps that are in memory at once: 64 MB of float64.
+_CHUNK_NUMBERS = 2**23
+
+
+class MarkerSolver(nn.Module):
+    r"""Solves markers for blendshape weights, every frame on its own.
+
+    .. math::
+        \min_{0 \le w \le 1} \frac{1}{|S|} \sum_{m \in S} \lVert b_m + B_m w - t_m \rVert^2
+        + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
+
+    The first term is the mean over the markers S that a frame shows, in mm² a marker, so that ``sparsity`` and
+    ``ridge`` mean the same for any number of markers. H and f are formed in float64.
+
+    Args:
+        rig: N shapes.
+        attachment: where the M markers sit on it; its ``residual``, where it has one, is added to the points.
+        alignment: moves marker space into rig space, one similarity; none if absent. Errors count in rig space.
+        sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``.
+        ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1.
+
+    Raises:
+        TopologyError: the attachment belongs to another mesh.
+        ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite.
+        ShapeError: ``alignment`` holds more than one similarity.
+
+    Source: thesis 4.1.3, 4.1.4 and appendix.
+    """
+
+    basis: Tensor
+    rest: Tensor
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        attachment: Attachment,
+        alignment: Similarity | None = None,
+        sparsity: float = SPARSITY,
+        ridge: float = RIDGE,
+    ) -> None:
+        super().__init__()
+        attachment.check(rig.neutral)
+        faces = rig.neutral.faces
+        rest = attachment.on(faces, rig.vertices)
+        if attachment.residual is not None:
+            rest = rest + attachment.residual.to(rest)
+        self.names: tuple[str, ...] = rig.names
+        self.labels: tuple[str, ...] = tuple(attachment.labels or ())
+        self.sparsity, self.ridge = float(sparsity), float(ridge)
+        self.register_buffer("basis", attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous())
+        self.register_buffer("rest", rest)
+        if alignment is not None and alignment.scale.shape != (1,):
+            raise ShapeError(f"alignment: found {tuple(alignment.scale.shape)} similarities, expected (1,)")
+        for name in ("scale", "rotation", "translation"):
+            moved = None if alignment is None else getattr(alignment, name).to(rest)
+            self.register_buffer(f"alignment_{name}", moved)
+        self._prepared: tuple[Tensor, float, float, BoxQP] | None = None
+        self.regularization(self.rest)  # a negative weight is an error here, not at the first solve
+
+    @property
+    def alignment(self) -> Similarity | None:
+        """Marker space to rig space."""
+        parts = [getattr(self, f"alignment_{name}") for name in ("scale", "rotation", "translation")]
+        return None if parts[0] is None else Similarity(*parts)
+
+    def regularization(self, like: Tensor) -> Quadratic:
+        """The sparsity and the ridge term, in the dtype and on the device of ``like``."""
+        shapes = len(self.names)
+        return sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+
+    def energy(self, markers: Tensor) -> Quadratic:
+        """What the solve minimises for markers (B,M,3), float64."""
+        term = marker_term(self.basis.double(), self.rest.double(), self._in_rig_space(markers.double()))
+        return term + self.regularization(term.H)
+
+    def forward(self, markers: Tensor, start: Tensor | None = None) -> Tensor:
+        """Weights for markers.
+
+        Args:
+            markers: (B,M,3), millimetres, in the order of ``labels``; a marker with a NaN coordinate is not seen.
+            start: a guess of the weights, (B,N).
+
+        Returns:
+            Weights in [0,1], (B,N), in the dtype of ``markers``; differentiable in ``markers``.
+
+        Raises:
+            ShapeError: ``markers`` is not (B,M,3).
+            ValueRangeError: a coordinate is infinite, or frames show no marker at all.
+        """
+        if markers.ndim != 3 or markers.shape[1:] != self.rest.shape:
+            raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
+        missing = torch.isnan(markers).any(-1)
+        _check_seen(missing)
+        tolerance = _FINE if markers.dtype == torch.float64 else _COARSE
+        start = None if start is None else start.double()
+        gaps = missing.any(-1)
+        if not bool(gaps.any()):
+            return self._complete(markers, start, tolerance).to(markers.dtype)
+        whole = (~gaps).nonzero()[:, 0]
+        rows, parts = [whole], [self._complete(markers[whole], None if start is None else start[whole], tolerance)]
+        # A frame with gaps has an H of its own; a chunk of them bounds the memory.
+        for chunk in gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
+            energy = self.energy(markers[chunk])
+            rows.append(chunk)
+            guess = None if start is None else start[chunk]
+            parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
+        weights = markers.new_zeros(len(markers), len(self.names), dtype=torch.float64)
+        return weights.index_copy(0, torch.cat(rows), torch.cat(parts)).to(markers.dtype)
+
+    def solve_take(self, take: Take) -> Take:
+        """The take with weights solved from its markers, matched by label.
+
+        A marker of the attachment that the take lacks counts as never seen.
+
+        Raises:
+            NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
+            ValueRangeError: frames show no marker at all; the message names them.
+        """
+        if take.markers is None:
+            raise NameMismatchError("take: has no markers, expected a track of them")
+        weights = self(self.arrange(take.markers))
+        return replace(take, weights=Track(self.names, weights[..., None]))
+
+    def arrange(self, markers: Track) -> Tensor:
+        """Marker positions (T,M,3) in the order of ``labels``; NaN for a marker that the track lacks."""
+        check_labels(markers.names, self.labels)
+        row = {label: i for i, label in enumerate(self.labels)}
+        ids = torch.tensor([row[name] for name in markers.names], device=markers.values.device)
+        arranged = markers.values.new_full((len(markers), len(self.labels), 3), torch.nan)
+        return arranged.index_copy(1, ids, markers.values).to(self.rest.device)
+
+    def _complete(self, markers: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
+        """Weights (B,N), float64, for markers without gaps: one H, factored on first use."""
+        offset = self.rest.double() - self._in_rig_space(markers.double())
+        f = (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
+        return self._shared(tolerance)(f, start)
+
+    def _shared(self, tolerance: float) -> BoxQP:
+        prepared = self._prepared
+        # The buffer is another tensor after .to(); then H is formed anew.
+        if prepared is None or prepared[0] is not self.basis or prepared[1:3] != (self.ridge, tolerance):
+            H = marker_term(self.basis.double(), self.rest.double(), self.rest.double()[None]).H
+            H = H + self.regularization(H).H
+            self._prepared = prepared = (self.basis, self.ridge, tolerance, BoxQP(H, 0.0, 1.0, tolerance))
+        return prepared[3]
+
+    def _in_rig_space(self, markers: Tensor) -> Tensor:
+        alignment = self.alignment
+        return markers if alignment is None else alignment.apply(markers)
+
+    def extra_repr(self) -> str:
+        return f"{len(self.labels)} markers, {len(self.names)} shapes, sparsity={self.sparsity}, ridge={self.ridge}"
+
+
+def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
+    """Raises ``NameMismatchError`` for marker labels that an attachment does not know, or where it knows none."""
+    unknown = sorted(set(found) - set(known))
+    if unknown or not found:
+        shown = ", ".join(map(repr, unknown[:5])) or "no marker at all"
+        raise NameMismatchError(
+            f"markers: found {shown}{' and others' if len(unknown) > 5 else ''}, expected labels of the attachment: "
+            f"{', '.join(known[:5])}, ...; drop markers that are not of the face with Track.select"
+        )
+
+
+def _check_seen(missing: Tensor) -> None:
+    empty = missing.all(-1).nonzero()[:, 0].tolist()
+    if empty:
+        shown = ", ".join(map(str, empty[:10])) + (", ..." if len(empty) > 10 else "")
+        raise ValueRangeError(
+            f"markers: all {missing.shape[1]} are missing in {len(empty)} of {len(missing)} frames ({shown}); "
+            "expected at least one seen in every frame: cut these frames or fill them first"
+        )

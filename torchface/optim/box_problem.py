@@ -1,0 +1,70 @@
+"""A batch of box-constrained quadratic programs: its gradient, objective and how far a point is from the optimum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# Below this share of the largest, a diagonal entry counts as zero: the variable is as good as linear.
+_SMALLEST_DIAGONAL = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class BoxProblem:
+    r"""B problems :math:`\min \tfrac12 x^\top H x + f^\top x,\ l \le x \le u`, in float64.
+
+    Args:
+        H: symmetric, positive semidefinite, (N,N) for all problems or (B,N,N).
+        f: (B,N).
+        lower, upper: (N,), infinite where there is no bound.
+        diagonal: the metric, diag H kept from zero, (N,) or (B,N).
+    """
+
+    H: Tensor
+    f: Tensor
+    lower: Tensor
+    upper: Tensor
+    diagonal: Tensor
+
+    @staticmethod
+    def of(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> BoxProblem:
+        return BoxProblem(H, f, lower, upper, metric(H))
+
+    def rows(self, keep: Tensor | slice) -> BoxProblem:
+        """Some of the problems."""
+        if self.H.ndim == 2:
+            return BoxProblem(self.H, self.f[keep], self.lower, self.upper, self.diagonal)
+        return BoxProblem(self.H[keep], self.f[keep], self.lower, self.upper, self.diagonal[keep])
+
+    def clip(self, x: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(x, self.lower), self.upper)
+
+    def curvature(self, x: Tensor) -> Tensor:
+        """:math:`Hx` for x (B,N)."""
+        return x @ self.H if self.H.ndim == 2 else torch.bmm(self.H, x[..., None])[..., 0]
+
+    def gradient(self, x: Tensor) -> Tensor:
+        return self.curvature(x) + self.f
+
+    def objective(self, x: Tensor) -> Tensor:
+        """:math:`\\tfrac12 x^\\top H x + f^\\top x`, (B,)."""
+        return (x * (0.5 * self.curvature(x) + self.f)).sum(-1)
+
+    def residual(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
+        """:math:`\\max_i |x - clip(x - (Hx+f)/diag H)|_i / (1 + |x_i|)`, (B,); zero only at the optimum."""
+        gradient = self.gradient(x) if gradient is None else gradient
+        return ((x - self.clip(x - gradient / self.diagonal)).abs() / (1 + x.abs())).amax(-1)
+
+    def rounding(self, x: Tensor) -> Tensor:
+        """What rounding alone can leave of the residual at x, (B,)."""
+        sums = BoxProblem(self.H.abs(), self.f.abs(), self.lower, self.upper, self.diagonal).gradient(x.abs())
+        return 4 * torch.finfo(x.dtype).eps * (sums / self.diagonal / (1 + x.abs())).amax(-1)
+
+
+def metric(H: Tensor) -> Tensor:
+    """diag H with entries that are as good as zero lifted, (N,) or (B,N)."""
+    diagonal = H.diagonal(dim1=-2, dim2=-1)
+    floor = _SMALLEST_DIAGONAL * diagonal.amax(-1, keepdim=True)
+    return torch.where(floor > 0, torch.maximum(diagonal, floor), 1.0)

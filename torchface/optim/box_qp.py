@@ -1,0 +1,211 @@
+"""Box-constrained quadratic programs in batches: the solver behind every blendshape solve."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.optim.active_set import projected_newton
+from torchface.optim.box_problem import BoxProblem, metric
+from torchface.optim.implicit import BoxSolution
+from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
+
+# Steps of splitting between looks at the residual; what is still open after the last goes to Newton steps.
+# Beyond six digits splitting takes longer than one factorisation a problem, so there Newton follows at once.
+_ROUNDS_COARSE, _ROUNDS_FINE = (60, 40, 40), (60,)
+_COARSE = 1e-7
+_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
+# Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
+_CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
+
+
+def box_qp(
+    H: Tensor,
+    f: Tensor,
+    lower: float | Tensor = 0.0,
+    upper: float | Tensor = 1.0,
+    start: Tensor | None = None,
+    tolerance: float | None = None,
+) -> Tensor:
+    r"""The minimisers of quadratic functions over a box.
+
+    .. math:: x = \arg\min_{l \le x \le u} \tfrac12 x^\top H x + f^\top x
+
+    Solved by splitting (one factorisation, then products and clamps), then by projected Newton steps where digits are
+    missing, all in float64 inside. Differentiable once in H and f, by implicit differentiation at the solution.
+
+    Args:
+        H: symmetric and positive semidefinite, (N,N) or (B,N,N), float32 or float64; only its symmetric part counts.
+        f: (B,N), of the same dtype and device.
+        lower: a number or (N,); ``-inf`` for none. Bounds are constants: no gradient flows to them.
+        upper: a number or (N,); ``inf`` for none.
+        start: a guess, (B,N), such as the frame before; the answer does not depend on it where it is unique.
+        tolerance: on the residual :math:`\max |x - clip(x - (Hx+f)/\mathrm{diag} H)|`, relative to :math:`1 + |x|`;
+            3e-6 for float32 and 1e-11 for float64 if absent.
+
+    Returns:
+        x, (B,N), within the bounds exactly. Where H is singular and the minimiser not unique, one of them.
+
+    Raises:
+        ShapeError: the shapes do not fit each other.
+        ValueRangeError: H or f is not finite, H is not symmetric or has a negative eigenvalue, ``lower`` exceeds
+            ``upper``, or infinite bounds leave the objective unbounded below.
+
+    Source: thesis 4.1.4 and appendix, equations 67 and 68.
+
+    Example:
+        >>> H = torch.tensor([[2.0, 0.0], [0.0, 4.0]])
+        >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).tolist()
+        [[0.5, 1.0], [0.0, 0.5]]
+    """
+    return BoxQP(H, lower, upper, tolerance)(f, start)
+
+
+class BoxQP:
+    """``box_qp`` with H checked and factored once, for many calls.
+
+    Args:
+        H: (N,N), or (B,N,N) for exactly B problems a call.
+        lower, upper, tolerance: as in ``box_qp``.
+
+    Raises:
+        ShapeError, ValueRangeError: as in ``box_qp``.
+
+    Example:
+        >>> qp = BoxQP(torch.eye(2), lower=0.0, upper=float("inf"))
+        >>> qp(torch.tensor([[-3.0, 1.0]])).tolist()
+        [[3.0, 0.0]]
+    """
+
+    def __init__(
+        self,
+        H: Tensor,
+        lower: float | Tensor = 0.0,
+        upper: float | Tensor = 1.0,
+        tolerance: float | None = None,
+    ) -> None:
+        self.H = H
+        with torch.no_grad():
+            self._exact = _checked_hessian(H)
+            self.tolerance = _TOLERANCE[H.dtype] if tolerance is None else tolerance
+            self.lower, self.upper = _checked_bounds(lower, upper, self._exact)
+            self._factors: SplittingFactors | None = prepare_splitting(self._exact) if H.ndim == 2 else None
+
+    def __call__(self, f: Tensor, start: Tensor | None = None) -> Tensor:
+        """The minimisers (B,N) for f (B,N)."""
+        _check_vectors(self.H, f, start)
+        if torch.is_grad_enabled() and (self.H.requires_grad or f.requires_grad):
+            solution: Tensor = BoxSolution.apply(self.H, f, self.lower, self.upper, lambda: self._solve(f, start))
+            return solution
+        return self._solve(f, start)
+
+    @torch.no_grad()
+    def _solve(self, f: Tensor, start: Tensor | None) -> Tensor:
+        count, variables = f.shape
+        solution = torch.empty_like(f)
+        numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
+        chunk = max(1, numbers // max(variables if self.H.ndim == 2 else variables**2, 1))
+        for first in range(0, count, chunk):
+            rows = slice(first, first + chunk)
+            H = self._exact if self.H.ndim == 2 else self._exact[rows]
+            problem = BoxProblem.of(H, f[rows].double(), self.lower, self.upper)
+            factors = prepare_splitting(H) if self._factors is None else self._factors
+            x = _solve(problem, factors, None if start is None else start[rows].double(), self.tolerance)
+            # Rounding to float32 must not step over a bound.
+            solution[rows] = torch.minimum(torch.maximum(x.to(f.dtype), self.lower.to(f)), self.upper.to(f))
+        return solution
+
+
+def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None, tolerance: float) -> Tensor:
+    """Rounds of splitting for the problems still open, Newton steps for the last of them."""
+    rounds = _ROUNDS_COARSE if tolerance >= _COARSE else _ROUNDS_FINE
+    state = start_splitting(problem, start)
+    x = state.z.clone()
+    open_ = torch.arange(len(x), device=x.device)
+    part = problem
+    for steps in (*rounds, None):
+        still = (part.residual(state.z) > tolerance).nonzero()[:, 0]
+        if not len(still):
+            return x
+        if len(still) < len(open_):
+            open_, part, state, factors = open_[still], part.rows(still), state.rows(still), factors.rows(still)
+        if steps is not None:
+            state = splitting_steps(part, factors, state, steps)
+            x[open_] = state.z
+    x[open_] = projected_newton(part, state.z, tolerance)
+    _check_bounded(part, x[open_])
+    return x
+
+
+def _checked_hessian(H: Tensor) -> Tensor:
+    """The symmetric part of H in float64, after every check that needs no f."""
+    if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0:
+        raise ShapeError(f"box_qp: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
+    if H.dtype not in _TOLERANCE:
+        raise ValueRangeError(f"box_qp: found H of {H.dtype}, expected float32 or float64")
+    exact = H.detach().double()
+    if not torch.isfinite(exact).all():
+        raise ValueRangeError("box_qp: H holds NaN or infinite entries, expected finite ones")
+    precision = torch.finfo(H.dtype).eps * H.shape[-1]
+    largest = exact.abs().amax((-1, -2)) if exact.numel() else exact.new_zeros(len(exact))
+    skew = (exact - exact.transpose(-1, -2)).abs().amax((-1, -2)) if exact.numel() else largest
+    if (skew > 100 * precision * largest).any():
+        raise ValueRangeError(
+            f"box_qp: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
+        )
+    exact = 0.5 * (exact + exact.transpose(-1, -2))
+    scale = metric(exact).rsqrt()
+    lifted = exact * scale[..., :, None] * scale[..., None, :]
+    lifted.diagonal(dim1=-2, dim2=-1).add_(100 * precision)
+    if (torch.linalg.cholesky_ex(lifted)[1] > 0).any():
+        least = float(torch.linalg.eigvalsh(exact).min())
+        raise ValueRangeError(
+            f"box_qp: H is not positive semidefinite: found the eigenvalue {least:.3g}, expected none below 0"
+        )
+    return exact
+
+
+def _checked_bounds(lower: float | Tensor, upper: float | Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
+    variables = H.shape[-1]
+    bounds = []
+    for name, bound in (("lower", lower), ("upper", upper)):
+        bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
+        if bound.ndim and bound.shape != (variables,):
+            raise ShapeError(f"box_qp: found {name} {tuple(bound.shape)}, expected a number or ({variables},)")
+        if torch.isnan(bound).any():
+            raise ValueRangeError(f"box_qp: {name} holds NaN, expected numbers or infinity")
+        bounds.append(bound.expand(variables).contiguous())
+    low, high = bounds
+    if (low > high).any():
+        where = int((low > high).nonzero()[0, 0])
+        raise ValueRangeError(
+            f"box_qp: found lower {float(low[where])} above upper {float(high[where])} at variable {where}"
+        )
+    if (low == torch.inf).any() or (high == -torch.inf).any():
+        raise ValueRangeError("box_qp: found a lower bound of inf or an upper bound of -inf, which nothing can meet")
+    return low, high
+
+
+def _check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
+    if f.ndim != 2 or f.shape[1] != H.shape[-1] or (H.ndim == 3 and len(H) != len(f)):
+        wanted = f"({len(H)},{H.shape[-1]})" if H.ndim == 3 else f"(B,{H.shape[-1]})"
+        raise ShapeError(f"box_qp: found f {tuple(f.shape)}, expected {wanted} for H {tuple(H.shape)}")
+    if f.dtype != H.dtype:
+        raise ValueRangeError(f"box_qp: found f of {f.dtype} and H of {H.dtype}, expected the same")
+    if start is not None and start.shape != f.shape:
+        raise ShapeError(f"box_qp: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
+    for name, vectors in (("f", f), ("start", start)):
+        if vectors is not None and not torch.isfinite(vectors).all():
+            bad = (~torch.isfinite(vectors)).any(1).nonzero()[:, 0].tolist()
+            raise ValueRangeError(f"box_qp: {name} holds NaN or infinite entries in rows {bad[:5]}")
+
+
+def _check_bounded(problem: BoxProblem, x: Tensor) -> None:
+    if torch.isfinite(problem.lower).all() and torch.isfinite(problem.upper).all():
+        return
+    lost = (problem.residual(x) > 1e-3) | (x.abs().amax(-1) > 1e12)
+    if lost.any():
+        raise ValueRangeError(
+            f"box_qp: the objective of {int(lost.sum())} problems has no minimum: H is singular, bounds infinite"
+        )

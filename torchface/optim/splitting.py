@@ -1,0 +1,117 @@
+r"""Operator splitting for box-constrained quadratic programs: matrix products and clamps only.
+
+One step of the alternating direction method in the metric :math:`\rho D`, :math:`D = \mathrm{diag} H`, over-relaxed by
+:math:`\alpha`, with z the clipped and u the scaled dual variable:
+
+.. math::
+    y = (H + \rho D)^{-1} (\rho D (z - u) - f), \quad
+    v = \alpha y + (1 - \alpha) z + u, \quad
+    z' = \mathrm{clip}(v), \quad u' = v - z'
+
+In the variable :math:`t = z - u` everything but the clip is one affine map,
+:math:`v = t G + (2 - \alpha) z + c` with :math:`G = \alpha \rho D (H + \rho D)^{-1} - I` and
+:math:`c = -\alpha (H + \rho D)^{-1} f`, and :math:`t' = 2 z' - v`: a product, two additions and a clamp a step.
+
+Source: Boyd et al. 2011, sections 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.optim.box_problem import BoxProblem, metric
+
+# Measured on a real rig of 53 shapes, whose eigenvalues span five decades.
+RHO = 0.12
+RELAXATION = 1.9
+
+
+@dataclass(frozen=True, eq=False)
+class SplittingFactors:
+    """What a step needs of H.
+
+    Args:
+        step: :math:`G`, (N,N) or (B,N,N).
+        offset: :math:`-\\alpha (H + \\rho D)^{-1}`, (N,N) or (B,N,N).
+        relaxation: :math:`\\alpha`.
+    """
+
+    step: Tensor
+    offset: Tensor
+    relaxation: float = RELAXATION
+
+    def rows(self, keep: Tensor) -> SplittingFactors:
+        """The factors of some problems; one H serves all."""
+        if self.step.ndim == 2:
+            return self
+        return SplittingFactors(self.step[keep], self.offset[keep], self.relaxation)
+
+
+@dataclass(frozen=True, eq=False)
+class SplittingState:
+    """Where the iteration stands: clipped z and :math:`t = z - u`, both (B,N)."""
+
+    z: Tensor
+    t: Tensor
+
+    def rows(self, keep: Tensor) -> SplittingState:
+        return SplittingState(self.z[keep], self.t[keep])
+
+
+def prepare_splitting(H: Tensor, rho: float = RHO, relaxation: float = RELAXATION) -> SplittingFactors:
+    """Factors H (N,N) or (B,N,N), float64."""
+    diagonal = metric(H)
+    lifted = H.clone()
+    lifted.diagonal(dim1=-2, dim2=-1).add_(rho * diagonal)
+    offset = torch.cholesky_inverse(torch.linalg.cholesky(lifted)).mul_(-relaxation)
+    step = torch.mul(offset, -rho * diagonal[..., :, None], out=lifted)
+    step.diagonal(dim1=-2, dim2=-1).sub_(1)
+    return SplittingFactors(step, offset, relaxation)
+
+
+def start_splitting(problem: BoxProblem, start: Tensor | None, rho: float = RHO) -> SplittingState:
+    """The state at ``start`` (B,N), its dual guessed from the gradient; at the clipped zero if absent."""
+    if start is None:
+        z = problem.clip(torch.zeros_like(problem.f))
+        return SplittingState(z, z.clone())
+    z = problem.clip(start)
+    gradient = problem.gradient(z)
+    # At the optimum u = -g/(rho D) where a bound holds the variable, and 0 elsewhere.
+    held = ((z <= problem.lower) & (gradient > 0)) | ((z >= problem.upper) & (gradient < 0))
+    return SplittingState(z, z + torch.where(held, gradient / (rho * problem.diagonal), 0.0))
+
+
+def splitting_steps(
+    problem: BoxProblem, factors: SplittingFactors, state: SplittingState, steps: int
+) -> SplittingState:
+    """The state after this many steps."""
+    if factors.step.ndim == 3:
+        return _steps_of_many(problem, factors, state, steps)
+    constant = problem.f @ factors.offset
+    keep = 2 - factors.relaxation
+    lower, upper = problem.lower, problem.upper
+    z, t = state.z.clone(), state.t.clone()
+    v = torch.empty_like(z)
+    for _ in range(steps):
+        torch.addmm(constant, t, factors.step, out=v)
+        v.add_(z, alpha=keep)
+        torch.clamp(v, lower, upper, out=z)
+        torch.lerp(v, z, 2.0, out=t)  # 2 z - v
+    return SplittingState(z, t)
+
+
+def _steps_of_many(problem: BoxProblem, factors: SplittingFactors, state: SplittingState, steps: int) -> SplittingState:
+    """The same with an H a problem: rows as (B,1,N)."""
+    constant = torch.bmm(problem.f[:, None], factors.offset)
+    keep = 2 - factors.relaxation
+    z, t = state.z[:, None].clone(), state.t[:, None].clone()
+    v = torch.empty_like(z)
+    for _ in range(steps):
+        torch.baddbmm(constant, t, factors.step, out=v)
+        v.add_(z, alpha=keep)
+        torch.clamp(v, problem.lower, problem.upper, out=z)
+        torch.lerp(v, z, 2.0, out=t)
+    return SplittingState(z[:, 0], t[:, 0])
