@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
@@ -28,14 +30,15 @@ def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
 
 
 def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
-    """Images (3,H,W) laid out in rows of ``columns``, on white; smaller ones are padded."""
-    height = max(image.shape[1] for image in images) + gap
-    width = max(image.shape[2] for image in images) + gap
-    rows = -(-len(images) // columns)
-    page = torch.ones(3, rows * height - gap, min(columns, len(images)) * width - gap)
-    for i, image in enumerate(images):
-        y, x = i // columns * height, i % columns * width
-        page[:, y : y + image.shape[1], x : x + image.shape[2]] = image
+    """Images (3,H,W) in rows of ``columns``, on white; a column is as wide as its widest, a row as high as its highest."""
+    rows = [images[i : i + columns] for i in range(0, len(images), columns)]
+    heights = [max(image.shape[1] for image in row) for row in rows]
+    widths = [max(image.shape[2] for image in images[i::columns]) for i in range(min(columns, len(images)))]
+    page = torch.ones(3, sum(heights) + gap * (len(heights) - 1), sum(widths) + gap * (len(widths) - 1))
+    for r, row in enumerate(rows):
+        for c, image in enumerate(row):
+            y, x = sum(heights[:r]) + gap * r, sum(widths[:c]) + gap * c
+            page[:, y : y + image.shape[1], x : x + image.shape[2]] = image
     return page
 
 
@@ -47,6 +50,13 @@ def to_pillow(image: Tensor) -> Image.Image:
 def from_pillow(image: Image.Image) -> Tensor:
     """(3,H,W) in [0,1] of a Pillow image."""
     return torch.from_numpy(np.asarray(image.convert("RGB")).copy()).permute(2, 0, 1).float() / 255
+
+
+def from_figure(figure: Figure) -> Tensor:
+    """(3,H,W) in [0,1] of a matplotlib figure."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return torch.from_numpy(np.asarray(canvas.buffer_rgba())[..., :3].copy()).permute(2, 0, 1).float() / 255
 
 
 def save_picture(image: Tensor, path: str | Path) -> None:

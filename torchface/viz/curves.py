@@ -1,0 +1,57 @@
+"""Curves over a take: marker error, sums of weights, single weights (the thesis's figures 58 and 60), and bars."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchface.rendering.compositing import from_figure
+
+SOLVED, TRUE = "#1f5fa8", "#d9822b"
+
+
+def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
+    """An error a frame (T,) over time, with its median; a picture (3,H,W)."""
+    figure = Figure(figsize=(10, 2.6), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    seconds = torch.arange(len(error)) / fps
+    axes.plot(seconds, error, color=SOLVED, linewidth=0.8)
+    median = float(error.nanmedian())
+    axes.axhline(median, color="grey", linewidth=0.8, linestyle="--", label=f"median {median:.3f}")
+    axes.set(xlabel="seconds", ylabel=label, ylim=(0, None), xlim=(0, float(seconds[-1])))
+    axes.legend(loc="upper right", frameon=False)
+    return from_figure(figure)
+
+
+def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps: float, most: int = 6) -> Tensor:
+    """The sum of weights over time and the curves of the shapes that move most, solved (T,N) over true; (3,H,W)."""
+    order = (solved if true is None else true).std(0).argsort(descending=True)[:most].tolist()
+    figure = Figure(figsize=(10, 1.5 * (len(order) + 1)), dpi=100, layout="constrained")
+    rows = figure.subplots(len(order) + 1, 1, sharex=True)
+    seconds = torch.arange(len(solved)) / fps
+    curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
+    curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
+    for axes, (label, found, truth) in zip(rows, curves, strict=True):
+        if truth is not None:
+            axes.plot(seconds, truth, color=TRUE, linewidth=1.6, alpha=0.8, label="true")
+        axes.plot(seconds, found, color=SOLVED, linewidth=0.8, label="solved")
+        axes.set_ylabel(label, fontsize=8)
+        axes.set_ylim(0, None if label == "sum of weights" else 1.02)
+    rows[0].legend(loc="upper right", frameon=False, ncols=2, fontsize=8)
+    rows[-1].set(xlabel="seconds", xlim=(0, float(seconds[-1])))
+    return from_figure(figure)
+
+
+def named_bars(values: Tensor, names: Sequence[str], label: str) -> Tensor:
+    """One horizontal bar a name, longest on top, for values (N,); (3,H,W)."""
+    order = values.argsort().tolist()
+    figure = Figure(figsize=(6, 0.5 + 0.17 * len(order)), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    axes.barh([names[i] for i in order], values[order], color=SOLVED)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.set_xlabel(label)
+    axes.margins(y=0.005)
+    return from_figure(figure)

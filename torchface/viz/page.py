@@ -1,0 +1,77 @@
+"""A report as one HTML page with pictures beside it; opens in any browser, needs no script and no network."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from torchface.rendering.compositing import save_picture
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222 }
+h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+img { max-width: 100%; height: auto; display: block; margin: .6rem 0 }
+table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8rem .15rem 0; text-align: left }
+td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
+thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
+p { max-width: 60rem }
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under a heading row."""
+
+    heading: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A heading, a paragraph, then tables and pictures (3,H,W) by file name, in this order."""
+
+    title: str
+    text: str = ""
+    tables: Sequence[Table] = ()
+    pictures: Sequence[tuple[str, Tensor]] = ()
+
+
+def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
+    """Writes ``index.html`` and its pictures into a folder; the page appears last, complete.
+
+    Returns:
+        The page's path.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [
+        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"
+    ]
+    for section in sections:
+        parts.append(f"<h2>{html.escape(section.title)}</h2>\n")
+        if section.text:
+            parts.append(f"<p>{html.escape(section.text)}</p>\n")
+        parts.extend(_table(table) for table in section.tables)
+        for name, picture in section.pictures:
+            save_picture(picture, folder / name)
+            size = f'width="{picture.shape[2]}" height="{picture.shape[1]}"'
+            parts.append(f'<img src="{html.escape(name)}" alt="{html.escape(section.title)}" {size}>\n')
+    page = folder / "index.html"
+    temporary = folder / f".index.{os.getpid()}.html"
+    temporary.write_text("".join(parts), encoding="utf-8")
+    os.replace(temporary, page)
+    return page
+
+
+def _table(table: Table) -> str:
+    def row(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "\n".join(row(cells, "td") for cells in table.rows)
+    return f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"
