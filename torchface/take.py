@@ -103,3 +103,25 @@ class Take:
             if track is not None:
                 return len(track)
         return 0
+
+
+def empty_frames(take: Take) -> Tensor:
+    """The frames in which no marker was seen, (K,) int64, rising."""
+    if take.markers is None:
+        raise ValueRangeError("take: found no markers, expected some")
+    return take.markers.values.isnan().any(2).all(1).nonzero()[:, 0]
+
+
+def require_seen(take: Take) -> None:
+    """Checks that every frame shows at least one marker, for what cannot do without.
+
+    Raises:
+        ValueRangeError: a frame shows none; the message names the file that the take was read from.
+    """
+    rows = empty_frames(take)
+    if len(rows):
+        shown = ", ".join(str(int(row)) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+        raise ValueRangeError(
+            f"{take.extras.get('source', 'take')}: found {len(rows)} of {len(take)} frames without a single marker "
+            f"(rows {shown}), expected at least one marker in each"
+        )

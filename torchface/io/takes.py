@@ -1,0 +1,103 @@
+"""Takes in and out, by the file's suffix and header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.csv_table import TableReader, quoted
+from torchface.io.landmarks_csv import is_landmark_header, load_landmarks_csv, save_landmarks_csv
+from torchface.io.live_link import are_live_link_shapes, is_live_link, load_live_link, save_live_link
+from torchface.io.markers_c3d import load_c3d, save_c3d
+from torchface.io.markers_csv import is_marker_header, load_markers_csv, save_markers_csv
+from torchface.io.markers_trc import load_trc, save_trc
+from torchface.io.numbered_csv import is_numbered
+from torchface.io.weights import load_weights_csv, save_weights_csv
+from torchface.take import Take
+
+_SUFFIXES = "'.c3d', '.trc' or '.csv'"
+
+
+def load_take(path: str | Path, unit: str | None = None) -> Take:
+    """Reads a performance; a ``.csv`` is told by its header.
+
+    ==================================== =====================================================
+    ``.c3d``                             markers, :func:`torchface.io.markers_c3d.load_c3d`
+    ``.trc``                             markers, :func:`torchface.io.markers_trc.load_trc`
+    ``Timecode,BlendshapeCount,...``     weights, :func:`torchface.io.live_link.load_live_link`
+    ``frame,time,<label>_x,...``         markers, :func:`torchface.io.markers_csv.load_markers_csv`
+    ``frame,time,<shape>,...``           weights, :func:`torchface.io.weights.load_weights_csv`
+    ``frame,timestamp,...,x_0,...``      landmarks, :func:`torchface.io.landmarks_csv.load_landmarks_csv`
+    ==================================== =====================================================
+
+    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it.
+
+    Args:
+        path: the file.
+        unit: of its markers, ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what the file says (CSV: millimetres).
+
+    Raises:
+        FileFormatError: the file is none of these, or is damaged.
+        ValueRangeError: ``unit`` is unknown.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".c3d":
+        return load_c3d(path, unit)
+    if suffix == ".trc":
+        return load_trc(path, unit)
+    if suffix != ".csv":
+        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
+    header = TableReader(path).header
+    if is_live_link(header):
+        return load_live_link(path)
+    if is_marker_header(header):
+        return load_markers_csv(path, unit)
+    if is_numbered(header):
+        return load_weights_csv(path)
+    if is_landmark_header(header):
+        return load_landmarks_csv(path)
+    raise FileFormatError(
+        f"{path}: found the columns {quoted(header)}; expected Timecode,BlendshapeCount,... or frame,time,... "
+        "or OpenFace's frame,timestamp,...,x_0,..."
+    )
+
+
+def save_take(take: Take, path: str | Path) -> None:
+    """Writes a performance in the format that ``path`` ends in.
+
+    ``.c3d`` and ``.trc`` hold the markers; whatever else the take holds is left out. A ``.csv`` holds the take's one
+    track: markers, landmarks, or weights. Weights whose names are ARKit's 52, in whatever order and case, become a
+    Live Link Face file; others a plain table that keeps their names
+    (:func:`torchface.io.live_link.save_live_link` maps them to ARKit's instead).
+
+    Args:
+        take: markers in millimetres, landmarks in pixels, or weights.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        FileFormatError: the suffix is none of ``.c3d``, ``.trc``, ``.csv``.
+        ValueRangeError: the take holds nothing for this format, or too much for a ``.csv``, or infinite numbers.
+        NameMismatchError: a name would not come back as it is.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".c3d":
+        return save_c3d(take, path)
+    if suffix == ".trc":
+        return save_trc(take, path)
+    if suffix != ".csv":
+        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
+    held = [name for name in ("markers", "landmarks", "weights") if getattr(take, name) is not None]
+    if len(held) != 1:
+        raise ValueRangeError(
+            f"{path}: found a take of {' and '.join(held) or 'no track'}, expected one track for a .csv; "
+            "save_markers_csv, save_landmarks_csv, save_weights_csv and save_live_link each write theirs"
+        )
+    if take.markers is not None:
+        return save_markers_csv(take, path)
+    if take.landmarks is not None:
+        return save_landmarks_csv(take, path)
+    if take.weights is not None and are_live_link_shapes(take.weights.names):
+        return save_live_link(take, path)
+    return save_weights_csv(take, path)
