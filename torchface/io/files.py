@@ -5,6 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
 from torchface.errors import FileFormatError, ValueRangeError
 
 LARGEST_FILE = 2**31
@@ -60,3 +65,16 @@ def write_file(path: str | Path, data: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise FileFormatError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def finite_vertices(path: Path, values: NDArray[np.float64]) -> Tensor:
+    """Positions as float32; raises ``FileFormatError`` with the first one that is NaN or too large."""
+    with np.errstate(over="ignore"):
+        vertices = torch.from_numpy(values.astype(np.float32))
+    bad = (~torch.isfinite(vertices)).any(-1).nonzero()[:, 0]
+    if len(bad):
+        raise FileFormatError(
+            f"{path}: found NaN or infinity in {len(bad)} of {len(vertices)} vertices, first at {int(bad[0])}; "
+            "expected finite numbers"
+        )
+    return vertices

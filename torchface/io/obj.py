@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.io.files import millimetres_per, read_file, write_file
+from torchface.io.files import finite_vertices, millimetres_per, read_file, write_file
 from torchface.io.images import encode_png, load_image
 from torchface.io.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh
@@ -108,19 +108,6 @@ def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
     end = np.cumsum(sizes).tolist()
     text += ["f " + " ".join(words[e - n : e]) for e, n in zip(end, sizes.tolist(), strict=True)]
     write_file(path, ("\n".join(text) + "\n").encode())
-
-
-def finite_vertices(path: Path, values: NDArray[np.float64]) -> Tensor:
-    """Positions as float32; raises ``FileFormatError`` with the first one that is NaN or too large."""
-    with np.errstate(over="ignore"):
-        vertices = torch.from_numpy(values.astype(np.float32))
-    bad = (~torch.isfinite(vertices)).any(-1).nonzero()[:, 0]
-    if len(bad):
-        raise FileFormatError(
-            f"{path}: found NaN or infinity in {len(bad)} of {len(vertices)} vertices, first at {int(bad[0])}; "
-            "expected finite numbers"
-        )
-    return vertices
 
 
 def _lines_by_keyword(path: Path, data: bytes) -> dict[str, list[bytes]]:

@@ -36,17 +36,17 @@ def corners_of_polygons(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64
         sizes = np.full(len(mesh.faces), 3, dtype=np.int64)
     else:
         sizes = (mesh.polygons >= 0).sum(1).cpu().numpy()
-    corners = _corners_of_fans(sizes, mesh.faces)
-    uv_corners = np.zeros(0, np.int64) if mesh.uv_faces is None else _corners_of_fans(sizes, mesh.uv_faces)
+    corners = corners_of_fans(sizes, mesh.faces.cpu().numpy())
+    uv_corners = np.zeros(0, np.int64) if mesh.uv_faces is None else corners_of_fans(sizes, mesh.uv_faces.cpu().numpy())
     return sizes, corners, uv_corners
 
 
-def _corners_of_fans(sizes: NDArray[np.int64], triangles: Tensor) -> NDArray[np.int64]:
-    """A fan's corners are the first two of its first triangle, then the third of each."""
-    faces = triangles.cpu().numpy()
+def corners_of_fans(sizes: NDArray[np.int64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The corners (C,) of polygons with ``sizes`` (P,) corners, whose fan triangulation is ``faces`` (F,3)."""
     first = np.cumsum(sizes - 2) - (sizes - 2)  # each polygon's first triangle
     start = np.cumsum(sizes) - sizes
     corners = np.empty(int(sizes.sum()), dtype=np.int64)
+    # A fan's corners are the first two of its first triangle, then the third of each.
     corners[start], corners[start + 1] = faces[first, 0], faces[first, 1]
     third = np.ones(len(corners), dtype=bool)
     third[start] = third[start + 1] = False

@@ -9,6 +9,7 @@ import torch
 
 from torchface.errors import FileFormatError
 from torchface.io.files import read_file
+from torchface.io.gltf import read_gltf_rig
 from torchface.io.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.obj import face_bytes, read_obj, read_obj_vertices
 from torchface.rig import BlendshapeRig
@@ -41,8 +42,10 @@ def load_rig(
         if is_ict_folder(path) and neutral is None:
             return load_ict_facekit(path, shapes, part, unit)
         rig = load_obj_folder(path, unit or "mm", neutral)
+    elif path.suffix.lower() in (".glb", ".gltf") or not path.exists():
+        rig = read_gltf_rig(path, unit or "m")
     else:
-        raise FileFormatError(f"{path}: found neither a folder nor a glTF file, expected a rig")
+        raise FileFormatError(f"{path}: found a file that is no .glb or .gltf, expected one, or a folder of OBJ files")
     rig = rig if shapes is None else rig.select(shapes)
     return rig if part is None else rig.part(region(rig.neutral, part))
 

@@ -1,0 +1,6 @@
+"""glTF 2.0 with morph targets, read from whoever wrote it and written for whoever reads it."""
+
+from torchface.io.gltf.reading import read_gltf_mesh, read_gltf_rig
+from torchface.io.gltf.writing import ShapeMatch, save_animation, save_gltf_mesh, save_rig
+
+__all__ = ["ShapeMatch", "read_gltf_mesh", "read_gltf_rig", "save_animation", "save_gltf_mesh", "save_rig"]

@@ -1,0 +1,223 @@
+"""The two ways a glTF file comes: one binary, or JSON with its buffers beside it or inside it."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from torchface.errors import FileFormatError
+from torchface.io.files import read_file, write_file
+
+_MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
+_LARGEST_JSON = 2**26
+_LARGEST_JSON_WITH_BUFFERS = 2**28
+_UNPACKED_ALWAYS = 2**26
+_UNPACKED_PER_BYTE = 64
+_EXTENSIONS = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_punctual")
+"""Extensions a file may require: the first is read, the others change no vertex."""
+
+
+@dataclass
+class Document:
+    """A glTF document whose every access is checked; errors name the file and the place in it.
+
+    Args:
+        path: the file.
+        root: the JSON object.
+        binary: the binary chunk of a ``.glb``.
+    """
+
+    path: Path
+    root: dict[str, Any]
+    binary: memoryview | None = None
+    _buffers: dict[int, memoryview] = field(default_factory=dict)
+    _unpacked: int = 0
+
+    def error(self, where: str, found: object, expected: str) -> FileFormatError:
+        """An error to raise; a long ``found`` is cut."""
+        text = found if isinstance(found, str) else repr(found)[:80]
+        return FileFormatError(f"{self.path}: {where}: found {text}, expected {expected}")
+
+    def objects(self, kind: str) -> list[dict[str, Any]]:
+        """A top-level array such as ``"accessors"``, empty where absent."""
+        return [self.record(row, f"{kind}[{i}]") for i, row in enumerate(self.array(self.root, kind, "document"))]
+
+    def item(self, kind: str, index: object, where: str) -> dict[str, Any]:
+        """The object of a top-level array that ``index`` names."""
+        rows = self.array(self.root, kind, "document")
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(rows):
+            raise self.error(where, index, f"an index into the {len(rows)} {kind}")
+        return self.record(rows[index], f"{kind}[{index}]")
+
+    def record(self, value: object, where: str) -> dict[str, Any]:
+        """``value`` where it is an object; an absent one is empty."""
+        if value is None:
+            return {}
+        if not isinstance(value, dict):
+            raise self.error(where, value, "an object")
+        return value
+
+    def array(self, parent: dict[str, Any], key: str, where: str) -> list[Any]:
+        """An array field, empty where absent."""
+        value = parent.get(key, [])
+        if not isinstance(value, list):
+            raise self.error(f"{where}.{key}", value, "an array")
+        return value
+
+    def integer(self, parent: dict[str, Any], key: str, where: str, default: int | None = None) -> int:
+        """A field that is an integer from 0 to 2**53."""
+        value = parent.get(key, default)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
+            raise self.error(f"{where}.{key}", value, "a non-negative integer")
+        return value
+
+    def numbers(self, parent: dict[str, Any], key: str, where: str, count: int) -> list[float] | None:
+        """A field of ``count`` finite numbers; none where absent."""
+        value = parent.get(key)
+        if value is None:
+            return None
+        plain = isinstance(value, list) and len(value) == count
+        if not plain or not all(isinstance(x, int | float) and abs(x) < 1e30 for x in value):
+            raise self.error(f"{where}.{key}", value, f"{count} finite numbers")
+        return [float(x) for x in value]
+
+    def view(self, index: object, where: str) -> tuple[memoryview, int | None]:
+        """The bytes of a bufferView, and its stride."""
+        view = self.item("bufferViews", index, where)
+        place = f"bufferViews[{index}]"
+        if "EXT_meshopt_compression" in self.record(view.get("extensions"), f"{place}.extensions"):
+            raise self.error(place, "meshopt compression", "plain data; decompress the file first")
+        start, length = self.integer(view, "byteOffset", place, 0), self.integer(view, "byteLength", place)
+        buffer = self._buffer(self.integer(view, "buffer", place))
+        if start + length > len(buffer):
+            raise self.error(place, f"bytes {start} to {start + length}", f"at most the buffer's {len(buffer)}")
+        stride = self.integer(view, "byteStride", place) if "byteStride" in view else None
+        return buffer[start : start + length], stride
+
+    def bytes_at(self, uri: object, where: str) -> memoryview:
+        """The bytes that a URI names: data in it, or a file in the document's folder or below."""
+        if not isinstance(uri, str):
+            raise self.error(where, uri, "a URI")
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            if not head.endswith(";base64"):
+                raise self.error(where, f"'{head[:60]}'", "base64 data")
+            try:
+                return memoryview(base64.b64decode(body, validate=True))
+            except (binascii.Error, ValueError) as error:
+                raise self.error(where, f"broken base64 ({error})", "base64 data") from error
+        folder = self.path.resolve().parent
+        try:
+            file = (folder / unquote(uri)).resolve()
+        except (OSError, ValueError, RuntimeError) as error:
+            raise self.error(where, f"'{uri[:60]}'", f"a file name ({error})") from error
+        if "://" in uri or not file.is_relative_to(folder):
+            raise self.error(where, f"'{uri[:60]}'", "a file in the folder of the document")
+        return memoryview(read_file(file))
+
+    def reserve(self, size: int, where: str) -> None:
+        """Counts memory about to be taken; refuses what no honest file of this size unpacks to."""
+        self._unpacked += size
+        packed = sum(map(len, self._buffers.values()))
+        most = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * packed)
+        if self._unpacked > most:
+            raise self.error(where, f"data that unpacks to {self._unpacked} bytes", f"at most {most}")
+
+    def _buffer(self, index: int) -> memoryview:
+        if index not in self._buffers:
+            buffer = self.item("buffers", index, f"buffers[{index}]")
+            place = f"buffers[{index}]"
+            length = self.integer(buffer, "byteLength", place)
+            if buffer.get("uri") is None:
+                if index != 0 or self.binary is None:
+                    raise self.error(place, "no uri", "one, or the binary chunk of a .glb")
+                data = self.binary
+            else:
+                data = self.bytes_at(buffer["uri"], f"{place}.uri")
+            if len(data) < length:
+                raise self.error(place, f"{len(data)} bytes (truncated)", f"byteLength {length}")
+            self._buffers[index] = data[:length]
+        return self._buffers[index]
+
+
+def read_document(path: str | Path) -> Document:
+    """Opens a ``.glb`` or ``.gltf``, whichever the bytes say it is.
+
+    Raises:
+        FileFormatError: missing, empty, truncated, not glTF 2, or an extension it requires is not known.
+    """
+    path = Path(path)
+    data = read_file(path)
+    if data[:4] == _MAGIC:
+        text, binary = _chunks(path, data)
+    else:
+        text, binary = data, None
+        if not data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+            raise FileFormatError(f"{path}: found neither 'glTF' nor JSON at its start, expected a glTF 2.0 file")
+    largest = _LARGEST_JSON_WITH_BUFFERS if binary is None else _LARGEST_JSON
+    if len(text) > largest:
+        raise FileFormatError(f"{path}: found {len(text)} bytes of JSON, expected at most {largest}")
+    try:
+        root = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: found broken JSON ({str(error)[:100]}), expected a glTF 2.0 file") from error
+    if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):
+        raise FileFormatError(f"{path}: found JSON without 'asset', expected a glTF 2.0 file")
+    document = Document(path, root, binary)
+    version = root["asset"].get("version")
+    if not isinstance(version, str) or not version.startswith("2."):
+        raise document.error("asset.version", version, "'2.0'")
+    for name in document.array(root, "extensionsRequired", "document"):
+        if not isinstance(name, str) or not name.startswith(_EXTENSIONS):
+            raise document.error("extensionsRequired", name, "none but " + ", ".join(_EXTENSIONS))
+    return document
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
+    if len(data) < 20:
+        raise FileFormatError(f"{path}: found {len(data)} bytes (truncated), expected a .glb of at least 20")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise FileFormatError(f"{path}: found glTF container version {version}, expected 2")
+    if length > len(data):
+        raise FileFormatError(f"{path}: found {len(data)} bytes (truncated), expected the {length} its header tells")
+    at, text, binary = 12, None, None
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, at)
+        at += 8
+        if at + size > length:
+            raise FileFormatError(f"{path}: found {length - at} bytes in a chunk (truncated), expected {size}")
+        if kind == _JSON_CHUNK and text is None:
+            text = data[at : at + size]
+        elif kind == _BINARY_CHUNK and binary is None:
+            binary = memoryview(data)[at : at + size]
+        at += size
+    if text is None:
+        raise FileFormatError(f"{path}: found no JSON chunk, expected a glTF 2.0 file")
+    return text, memoryview(b"") if binary is None else binary
+
+
+def write_document(path: str | Path, root: dict[str, Any], binary: bytes) -> None:
+    """Writes a ``.glb``; the one buffer's length is filled in.
+
+    Raises:
+        FileFormatError: it would pass the format's 4 GB, or the folder cannot be written to.
+    """
+    root = {**root, "buffers": [{"byteLength": len(binary)}]} if binary else root
+    text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
+    if binary:
+        chunks += struct.pack("<II", len(binary), _BINARY_CHUNK) + binary
+    if 12 + len(chunks) >= 2**32:
+        raise FileFormatError(f"{path}: would take {len(chunks)} bytes, expected less than 4 GB for a .glb")
+    write_file(path, _MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks)

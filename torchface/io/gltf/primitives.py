@@ -1,0 +1,204 @@
+"""A glTF mesh as one part of a rig: its primitives' vertices, triangles and morph targets put together."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchface.io.gltf.accessors import read_floats, read_indices
+from torchface.io.gltf.container import Document
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+@dataclass(frozen=True)
+class Part:
+    """A mesh as the file has it: C vertices, split wherever texture coordinates differ.
+
+    Args:
+        positions: (C,3), the file's unit and the mesh's own axes.
+        deltas: (N,C,3), one a name.
+        names: of the morph targets.
+        triangles: (F,3) into the C vertices.
+        uvs: (C,2), origin at the lower left.
+        colors: (C,3) in [0,1], encoded as pictures are.
+        vertex_ids: (C,), which vertex of the mesh as authored each was split from.
+        picture: index of the texture of most triangles.
+        extras: the mesh's ``extras``.
+    """
+
+    positions: NDArray[np.float32]
+    deltas: NDArray[np.float32]
+    names: tuple[str, ...]
+    triangles: NDArray[np.int64]
+    uvs: NDArray[np.float32] | None
+    colors: NDArray[np.float32] | None
+    vertex_ids: NDArray[np.int64] | None
+    picture: int | None
+    extras: dict[str, Any]
+
+
+def read_part(document: Document, index: int) -> Part | None:
+    """The triangles of mesh ``index``; none where it has only points and lines.
+
+    Raises:
+        FileFormatError: broken accessors, primitives of different morph targets, or names that do not match them.
+    """
+    place = f"meshes[{index}]"
+    mesh = document.item("meshes", index, place)
+    blocks: dict[str, _Block] = {}
+    triangles, pictures, first = [], [], 0
+    for i, row in enumerate(document.array(mesh, "primitives", place)):
+        primitive = document.record(row, f"{place}.primitives[{i}]")
+        if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+            continue
+        # Exporters that split by material let all primitives share one set of vertices.
+        key = json.dumps([primitive.get("attributes"), primitive.get("targets")], sort_keys=True)
+        if key not in blocks:
+            blocks[key] = _read_block(document, primitive, f"{place}.primitives[{i}]", first)
+            first += len(blocks[key].positions)
+        corners = _read_triangles(document, primitive, f"{place}.primitives[{i}]", len(blocks[key].positions))
+        triangles.append(corners + blocks[key].first)
+        pictures.append((len(corners), _picture(document, primitive, f"{place}.primitives[{i}]")))
+    if not blocks:
+        return None
+    rows = list(blocks.values())
+    if len({len(block.deltas) for block in rows}) > 1:
+        counts = [len(block.deltas) for block in rows]
+        raise document.error(place, f"primitives of {counts} morph targets", "the same number in each")
+    has = [count for count, picture in pictures if picture is not None]
+    return Part(
+        np.concatenate([block.positions for block in rows]),
+        np.concatenate([block.deltas for block in rows], axis=1),
+        _target_names(document, mesh, place, len(rows[0].deltas)),
+        np.concatenate(triangles),
+        _stack([block.uvs for block in rows], rows, 0.0),
+        _stack([block.colors for block in rows], rows, 1.0),
+        None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
+        next((picture for count, picture in pictures if has and count == max(has) and picture is not None), None),
+        document.record(mesh.get("extras"), f"{place}.extras") if isinstance(mesh.get("extras"), dict) else {},
+    )
+
+
+@dataclass(frozen=True)
+class _Block:
+    """The vertices of one set of accessors; ``first`` is where they begin in the part."""
+
+    first: int
+    positions: NDArray[np.float32]
+    deltas: NDArray[np.float32]
+    uvs: NDArray[np.float32] | None
+    colors: NDArray[np.float32] | None
+    vertex_ids: NDArray[np.int64] | None
+
+
+def _read_block(document: Document, primitive: dict[str, Any], place: str, first: int) -> _Block:
+    if "KHR_draco_mesh_compression" in document.record(primitive.get("extensions"), f"{place}.extensions"):
+        raise document.error(place, "Draco compression", "plain data; decompress the file first")
+    attributes = document.record(primitive.get("attributes"), f"{place}.attributes")
+    if "POSITION" not in attributes:
+        raise document.error(f"{place}.attributes", "no POSITION", "one")
+    positions = read_floats(document, attributes["POSITION"], f"{place}.POSITION", ("VEC3",))
+    count = len(positions)
+    targets = document.array(primitive, "targets", place)
+    document.reserve(len(targets) * count * 12, f"{place}.targets")
+    deltas = np.zeros((len(targets), count, 3), np.float32)
+    for i, row in enumerate(targets):  # each target has accessors of its own
+        target = document.record(row, f"{place}.targets[{i}]")
+        if "POSITION" in target:
+            deltas[i] = read_floats(document, target["POSITION"], f"{place}.targets[{i}].POSITION", ("VEC3",), count)
+    uv_name = f"TEXCOORD_{_texture(document, primitive, place)[1]}"
+    uvs = colors = ids = None
+    if uv_name in attributes:
+        uvs = read_floats(document, attributes[uv_name], f"{place}.{uv_name}", ("VEC2",), count)
+        uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+    if "COLOR_0" in attributes:
+        colors = read_floats(document, attributes["COLOR_0"], f"{place}.COLOR_0", ("VEC3", "VEC4"), count)
+        colors = encode_srgb(colors[:, :3].clip(0, 1))
+    if "_VERTEX_ID" in attributes:
+        numbers = read_floats(document, attributes["_VERTEX_ID"], f"{place}._VERTEX_ID", ("SCALAR",), count)[:, 0]
+        whole = numbers == np.floor(numbers)
+        ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < max(count, 1)))) else None
+    return _Block(first, positions, deltas, uvs, colors, ids)
+
+
+def _read_triangles(document: Document, primitive: dict[str, Any], place: str, count: int) -> NDArray[np.int64]:
+    if primitive.get("indices") is None:
+        corners = np.arange(count)
+    else:
+        corners = read_indices(document, primitive["indices"], f"{place}.indices")
+    if len(corners) and int(corners.max()) >= count:
+        raise document.error(f"{place}.indices", int(corners.max()), f"less than the {count} vertices")
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise document.error(f"{place}.indices", f"{len(corners)} corners", "three a triangle")
+        return corners.reshape(-1, 3)
+    if len(corners) < 3:
+        raise document.error(f"{place}.indices", f"{len(corners)} corners", "at least three")
+    if mode == _FAN:
+        return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    odd = np.arange(len(corners) - 2) % 2  # every second triangle of a strip runs the other way
+    steps = np.arange(len(corners) - 2)
+    return np.stack([corners[steps], corners[steps + 1 + odd], corners[steps + 2 - odd]], axis=1)
+
+
+def _texture(document: Document, primitive: dict[str, Any], place: str) -> tuple[int | None, int]:
+    """The base colour's texture, and which set of texture coordinates it takes."""
+    if primitive.get("material") is None:
+        return None, 0
+    material = document.item("materials", primitive["material"], f"{place}.material")
+    surface = document.record(material.get("pbrMetallicRoughness"), f"{place}.material")
+    texture = document.record(surface.get("baseColorTexture"), f"{place}.material.baseColorTexture")
+    if "index" not in texture:
+        return None, 0
+    found = document.integer(texture, "index", f"{place}.material.baseColorTexture")
+    return found, document.integer(texture, "texCoord", f"{place}.material.baseColorTexture", 0)
+
+
+def _picture(document: Document, primitive: dict[str, Any], place: str) -> int | None:
+    return _texture(document, primitive, place)[0]
+
+
+def _target_names(document: Document, mesh: dict[str, Any], place: str, count: int) -> tuple[str, ...]:
+    """From the mesh, as Blender and three.js have it, or its first primitive; else ``target_0`` and so on."""
+    primitives = [row for row in document.array(mesh, "primitives", place) if isinstance(row, dict)]
+    for owner in (mesh, *primitives[:1]):
+        extras = owner.get("extras")
+        names = extras.get("targetNames") if isinstance(extras, dict) else None
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise document.error(f"{place}.extras.targetNames", names, "a list of names")
+        if len(names) != count or len(set(names)) != count:
+            found = f"{len(names)} names, {len(set(names))} of them different"
+            raise document.error(f"{place}.extras.targetNames", found, f"one for each of {count} morph targets")
+        return tuple(names)
+    return tuple(f"target_{i}" for i in range(count))
+
+
+def _stack(arrays: list[NDArray[np.float32] | None], blocks: list[_Block], filler: float) -> NDArray[np.float32] | None:
+    """The arrays in a line; a block that lacks what another has gets the filler."""
+    width = next((array.shape[1] for array in arrays if array is not None), None)
+    if width is None:
+        return None
+    full = [
+        np.full((len(block.positions), width), filler, np.float32) if array is None else array
+        for array, block in zip(arrays, blocks, strict=True)
+    ]
+    return np.concatenate(full)
+
+
+def encode_srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Light to the code of pictures; glTF's vertex colours are light."""
+    low = linear <= 0.0031308
+    return np.where(low, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def decode_srgb(coded: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The inverse of ``encode_srgb``."""
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)

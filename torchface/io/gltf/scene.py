@@ -1,0 +1,111 @@
+"""The meshes that a scene shows, each with the transform of its node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchface.io.gltf.container import Document
+
+_MOST_INSTANCES = 4096
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A mesh in the scene.
+
+    Args:
+        mesh: its index among the document's meshes.
+        name: the node's name, else the mesh's, else ``mesh_0`` and so on.
+        transform: from mesh to scene, (4,4).
+    """
+
+    mesh: int
+    name: str
+    transform: NDArray[np.float64]
+
+
+def instances(document: Document) -> list[Instance]:
+    """What the default scene shows; without a scene all root nodes, without nodes all meshes.
+
+    A skinned mesh stands where its skeleton's rest pose puts it, so its node does not move it.
+
+    Raises:
+        FileFormatError: nodes in a cycle or with two parents, a broken transform, or more than 4096 instances.
+    """
+    meshes = document.objects("meshes")
+    nodes = document.objects("nodes")
+    if not nodes:
+        return [Instance(i, _name(mesh, {}, i), np.eye(4)) for i, mesh in enumerate(meshes[:_MOST_INSTANCES])]
+    found = []
+    for index, transform in _walk(document, nodes):
+        node, place = nodes[index], f"nodes[{index}]"
+        if node.get("mesh") is None:
+            continue
+        mesh = document.item("meshes", node["mesh"], f"{place}.mesh")
+        skinned = node.get("skin") is not None
+        found.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), np.eye(4) if skinned else transform))
+        if len(found) > _MOST_INSTANCES:
+            raise document.error("nodes", f"more than {_MOST_INSTANCES} meshes in the scene", "a rig")
+    return found
+
+
+def _name(first: dict[str, Any], second: dict[str, Any], index: int) -> str:
+    names = [name for thing in (first, second) if isinstance(name := thing.get("name"), str) and name]
+    return names[0] if names else f"mesh_{index}"
+
+
+def _walk(document: Document, nodes: list[dict[str, Any]]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    pending = [(root, np.eye(4)) for root in reversed(_roots(document, nodes))]
+    seen: set[int] = set()
+    while pending:
+        index, parent = pending.pop()
+        node = document.item("nodes", index, "nodes")
+        if index in seen:
+            raise document.error(f"nodes[{index}]", "a cycle or a second parent", "a tree of nodes")
+        seen.add(index)
+        transform = parent @ _local(document, node, f"nodes[{index}]")
+        if not np.isfinite(transform).all():
+            raise document.error(f"nodes[{index}]", "a transform that overflows", "finite numbers")
+        yield index, transform
+        pending += [(child, transform) for child in reversed(document.array(node, "children", f"nodes[{index}]"))]
+
+
+def _roots(document: Document, nodes: list[dict[str, Any]]) -> list[Any]:
+    scenes = document.objects("scenes")
+    if scenes:
+        scene = document.item("scenes", document.root.get("scene", 0), "scene")
+        return document.array(scene, "nodes", "scene")
+    lists = [document.array(node, "children", f"nodes[{i}]") for i, node in enumerate(nodes)]
+    children = {child for row in lists for child in row if isinstance(child, int)}
+    roots = [i for i in range(len(nodes)) if i not in children]
+    if not roots:
+        raise document.error("nodes", "a cycle", "a tree of nodes")
+    return roots
+
+
+def _local(document: Document, node: dict[str, Any], place: str) -> NDArray[np.float64]:
+    matrix = document.numbers(node, "matrix", place, 16)
+    if matrix is not None:
+        transform = np.array(matrix).reshape(4, 4).T  # column by column in the file
+        if not np.allclose(transform[3], (0, 0, 0, 1)):
+            raise document.error(f"{place}.matrix", transform[3].tolist(), "a last row of 0, 0, 0, 1")
+        return transform
+    x, y, z, w = document.numbers(node, "rotation", place, 4) or (0.0, 0.0, 0.0, 1.0)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    if not 0.5 < length < 2:
+        raise document.error(f"{place}.rotation", [x, y, z, w], "a unit quaternion")
+    x, y, z, w = x / length, y / length, z / length, w / length
+    transform = np.eye(4)
+    transform[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    transform[:3, :3] *= document.numbers(node, "scale", place, 3) or (1.0, 1.0, 1.0)
+    transform[:3, 3] = document.numbers(node, "translation", place, 3) or (0.0, 0.0, 0.0)
+    return transform

@@ -1,0 +1,56 @@
+"""Back from vertices split at seams to the vertices of the mesh as authored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchface.io.gltf.primitives import Part
+
+
+@dataclass(frozen=True)
+class Weld:
+    """Which split vertices are one.
+
+    Args:
+        vertex_of: for each split vertex the vertex it belongs to, (C,).
+        row_of: for each vertex the first split one, (V,).
+        authored: the numbering is the one the mesh was written with, so annotations hold.
+    """
+
+    vertex_of: NDArray[np.int64]
+    row_of: NDArray[np.int64]
+    authored: bool
+
+
+def weld(part: Part) -> Weld:
+    """By the vertex ids in the file where they are consistent, else by equal position and equal deltas."""
+    if part.vertex_ids is not None:
+        found = _by_id(part, part.vertex_ids)
+        if found is not None:
+            return found
+    return _by_position(part)
+
+
+def _by_id(part: Part, ids: NDArray[np.int64]) -> Weld | None:
+    """None where an id is missing or its split vertices lie apart, as when another program has edited the mesh."""
+    present, row_of = np.unique(ids, return_index=True)
+    if len(present) == 0 or int(present[-1]) != len(present) - 1:
+        return None
+    same = np.array_equal(part.positions, part.positions[row_of[ids]])
+    same = same and all(np.array_equal(delta, delta[row_of[ids]]) for delta in part.deltas)
+    return Weld(ids, row_of, True) if same else None
+
+
+def _by_position(part: Part) -> Weld:
+    """Vertices numbered by first appearance; lips that touch at rest stay apart because they move differently."""
+    rows = np.concatenate([part.positions[None], part.deltas]).transpose(1, 0, 2).reshape(len(part.positions), -1)
+    rows = np.ascontiguousarray(rows + np.float32(0))  # so that -0 equals 0 byte by byte
+    keys = rows.view([("", np.void, rows.shape[1] * 4)]).reshape(-1)
+    _, row_of, vertex_of = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(row_of)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return Weld(rank[vertex_of.reshape(-1)], row_of[order], False)
