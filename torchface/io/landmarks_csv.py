@@ -109,7 +109,7 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
     if len(set(header)) < len(header):
         raise NameMismatchError(f"{path}: found a kept column named like another one, expected every name once")
     confidence = take.landmarks.confidence
-    level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().mean(1).to(torch.float32)
+    level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().double().mean(1).float()
     numbers = frame_numbers(take, first=1)
     coordinates = [number_texts(values[:, :, axis].reshape(-1)) for axis in (0, 1)]
     others = [number_texts(column.detach().cpu().to(torch.float64).numpy()) for column in columns.values()]

@@ -56,7 +56,7 @@ def read_timecodes(texts: Sequence[str], path: Path, first_row: int = 2) -> Timi
         seconds[row] = 3600 * int(match[1]) + 60 * int(match[2]) + int(match[3])
         frames[row] = float(match[5])
         drop |= match[4] == ";"
-    base = _base(seconds, frames)
+    base = _base(seconds, frames, drop)
     clock = seconds * base + frames
     rate_of_base, day = float(base), _DAY * base
     if drop and base % 30 == 0:  # every minute but each tenth lacks its first numbers, and 1000/1001 makes up for it
@@ -80,15 +80,17 @@ def read_timecodes(texts: Sequence[str], path: Path, first_row: int = 2) -> Timi
     return Timing(check_rate(fps, f"{path}: timecodes"), measured, jumps(steps / step))
 
 
-def _base(seconds: np.ndarray, frames: np.ndarray) -> int:
-    rise, within = np.diff(seconds), np.diff(frames)
+def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
+    rise, within = np.diff(seconds) % _DAY, np.diff(frames)
     steps = within[(rise == 0) & (within > 0)]
-    wraps = (frames[:-1] - frames[1:])[(rise == 1) & (within < 0)]
+    falls = (rise == 1) & (within < 0) & ~(drop & (seconds[1:] % 60 == 0))  # where numbers are dropped FF falls less
+    wraps = (frames[:-1] - frames[1:])[falls]
     if len(steps) and len(wraps):
         base = round(float(np.median(wraps) + np.median(steps)))
         if base > frames.max():
             return base
-    return next((base for base in (60, *_BASES) if base > frames.max()), 1000)
+    first = 30 if drop else 60
+    return next((base for base in (first, *_BASES) if base > frames.max()), 1000)
 
 
 def write_timecodes(count: int, fps: float) -> tuple[str, ...]:
