@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchface.io.gltf.container import Document
+from torchface.io.gltf.container import Document, shown
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -18,7 +18,7 @@ def read_indices(document: Document, index: object, where: str) -> NDArray[np.in
     """The integers (C,) of a primitive's ``indices``."""
     accessor = document.item("accessors", index, where)
     if accessor.get("componentType") not in _INDEX_COMPONENTS:
-        raise document.error(where, accessor.get("componentType"), "unsigned integers (5121, 5123 or 5125)")
+        raise document.error(where, shown(accessor.get("componentType")), "unsigned integers (5121, 5123 or 5125)")
     return _read(document, accessor, f"accessors[{index}]", ("SCALAR",), None)[:, 0].astype(np.int64)
 
 
@@ -53,9 +53,9 @@ def _read(
 ) -> NDArray[Any]:
     component, kind = accessor.get("componentType"), accessor.get("type")
     if not isinstance(component, int) or component not in _COMPONENTS:
-        raise document.error(f"{place}.componentType", component, f"one of {', '.join(map(str, _COMPONENTS))}")
+        raise document.error(f"{place}.componentType", shown(component), f"one of {', '.join(map(str, _COMPONENTS))}")
     if not isinstance(kind, str) or kind not in types:
-        raise document.error(f"{place}.type", kind, " or ".join(types))
+        raise document.error(f"{place}.type", shown(kind), " or ".join(types))
     count = document.integer(accessor, "count", place)
     if expected is not None and count != expected:
         raise document.error(f"{place}.count", count, f"{expected}, as the primitive's other attributes")
@@ -103,7 +103,7 @@ def _replace(document: Document, sparse: dict[str, Any], place: str, rows: NDArr
     values = document.record(sparse.get("values"), f"{place}.values")
     component = indices.get("componentType")
     if component not in _INDEX_COMPONENTS:
-        raise document.error(f"{place}.indices.componentType", component, "5121, 5123 or 5125")
+        raise document.error(f"{place}.indices.componentType", shown(component), "5121, 5123 or 5125")
     view, _ = document.view(indices.get("bufferView"), f"{place}.indices.bufferView")
     offset = document.integer(indices, "byteOffset", f"{place}.indices", 0)
     where = _rows(document, f"{place}.indices", view, offset, None, count, 1, np.dtype(_COMPONENTS[component]))[:, 0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import reprlib
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,15 @@ _LARGEST_JSON = 2**26
 _LARGEST_JSON_WITH_BUFFERS = 2**28
 _UNPACKED_ALWAYS = 2**26
 _UNPACKED_PER_BYTE = 64
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = 60
 _EXTENSIONS = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_punctual")
 """Extensions a file may require: the first is read, the others change no vertex."""
+
+
+def shown(value: object) -> str:
+    """A value of the file for an error's text, cut where it is long."""
+    return _SHORT.repr(value)
 
 
 @dataclass
@@ -40,9 +48,8 @@ class Document:
     _unpacked: int = 0
 
     def error(self, where: str, found: object, expected: str) -> FileFormatError:
-        """An error to raise; a long ``found`` is cut."""
-        text = found if isinstance(found, str) else repr(found)[:80]
-        return FileFormatError(f"{self.path}: {where}: found {text}, expected {expected}")
+        """An error to raise; ``found`` is in words, or what ``shown`` makes of a value."""
+        return FileFormatError(f"{self.path}: {where}: found {found}, expected {expected}")
 
     def objects(self, kind: str) -> list[dict[str, Any]]:
         """A top-level array such as ``"accessors"``, empty where absent."""
@@ -52,7 +59,7 @@ class Document:
         """The object of a top-level array that ``index`` names."""
         rows = self.array(self.root, kind, "document")
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(rows):
-            raise self.error(where, index, f"an index into the {len(rows)} {kind}")
+            raise self.error(where, shown(index), f"an index into the {len(rows)} {kind}")
         return self.record(rows[index], f"{kind}[{index}]")
 
     def record(self, value: object, where: str) -> dict[str, Any]:
@@ -60,14 +67,14 @@ class Document:
         if value is None:
             return {}
         if not isinstance(value, dict):
-            raise self.error(where, value, "an object")
+            raise self.error(where, shown(value), "an object")
         return value
 
     def array(self, parent: dict[str, Any], key: str, where: str) -> list[Any]:
         """An array field, empty where absent."""
         value = parent.get(key, [])
         if not isinstance(value, list):
-            raise self.error(f"{where}.{key}", value, "an array")
+            raise self.error(f"{where}.{key}", shown(value), "an array")
         return value
 
     def integer(self, parent: dict[str, Any], key: str, where: str, default: int | None = None) -> int:
@@ -76,7 +83,7 @@ class Document:
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
-            raise self.error(f"{where}.{key}", value, "a non-negative integer")
+            raise self.error(f"{where}.{key}", shown(value), "a non-negative integer")
         return value
 
     def numbers(self, parent: dict[str, Any], key: str, where: str, count: int) -> list[float] | None:
@@ -86,7 +93,7 @@ class Document:
             return None
         plain = isinstance(value, list) and len(value) == count
         if not plain or not all(isinstance(x, int | float) and abs(x) < 1e30 for x in value):
-            raise self.error(f"{where}.{key}", value, f"{count} finite numbers")
+            raise self.error(f"{where}.{key}", shown(value), f"{count} finite numbers")
         return [float(x) for x in value]
 
     def view(self, index: object, where: str) -> tuple[memoryview, int | None]:
@@ -105,7 +112,7 @@ class Document:
     def bytes_at(self, uri: object, where: str) -> memoryview:
         """The bytes that a URI names: data in it, or a file in the document's folder or below."""
         if not isinstance(uri, str):
-            raise self.error(where, uri, "a URI")
+            raise self.error(where, shown(uri), "a URI")
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
@@ -174,10 +181,10 @@ def read_document(path: str | Path) -> Document:
     document = Document(path, root, binary)
     version = root["asset"].get("version")
     if not isinstance(version, str) or not version.startswith("2."):
-        raise document.error("asset.version", version, "'2.0'")
+        raise document.error("asset.version", shown(version), "'2.0'")
     for name in document.array(root, "extensionsRequired", "document"):
         if not isinstance(name, str) or not name.startswith(_EXTENSIONS):
-            raise document.error("extensionsRequired", name, "none but " + ", ".join(_EXTENSIONS))
+            raise document.error("extensionsRequired", shown(name), "none but " + ", ".join(_EXTENSIONS))
     return document
 
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchface.io.gltf.container import Document
+from torchface.io.gltf.container import Document, shown
 from torchface.io.polygons import corners_of_fans, corners_of_polygons, pad_polygons
 from torchface.mesh import Annotations, Mesh
 
@@ -119,5 +119,7 @@ def _integers(
     flat = [x for row in rows for x in row] if shape and all(isinstance(row, list) for row in rows) else rows
     whole = all(type(x) is int and abs(x) < 2**53 for x in flat)
     if not whole or (shape and not all(isinstance(row, list) and len(row) == shape[0] for row in rows)):
-        raise document.error(f"{place}.{name[:40]}", rows, "a list of integers" if not shape else "pairs of integers")
+        raise document.error(
+            f"{place}.{name[:40]}", shown(rows), "a list of integers" if not shape else "pairs of integers"
+        )
     return np.array(flat, np.int64).reshape(-1, *shape)

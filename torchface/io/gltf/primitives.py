@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchface.io.gltf.accessors import read_floats, read_indices
-from torchface.io.gltf.container import Document
+from torchface.io.gltf.container import Document, shown
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
@@ -173,7 +173,7 @@ def _target_names(document: Document, mesh: dict[str, Any], place: str, count: i
         if names is None:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise document.error(f"{place}.extras.targetNames", names, "a list of names")
+            raise document.error(f"{place}.extras.targetNames", shown(names), "a list of names")
         if len(names) != count or len(set(names)) != count:
             found = f"{len(names)} names, {len(set(names))} of them different"
             raise document.error(f"{place}.extras.targetNames", found, f"one for each of {count} morph targets")

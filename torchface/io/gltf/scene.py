@@ -68,7 +68,8 @@ def _walk(document: Document, nodes: list[dict[str, Any]]) -> Iterator[tuple[int
         if index in seen:
             raise document.error(f"nodes[{index}]", "a cycle or a second parent", "a tree of nodes")
         seen.add(index)
-        transform = parent @ _local(document, node, f"nodes[{index}]")
+        with np.errstate(over="ignore", invalid="ignore"):
+            transform = parent @ _local(document, node, f"nodes[{index}]")
         if not np.isfinite(transform).all():
             raise document.error(f"nodes[{index}]", "a transform that overflows", "finite numbers")
         yield index, transform
