@@ -150,6 +150,8 @@ def test_columns_in_another_order_and_case_are_found(tmp_path: Path) -> None:
     assert good.weights is not None
     assert take.weights.names == tuple(name.lower() for name in reversed(_SPELLED))
     assert same(take.weights.values, good.weights.values.flip(1))
+    save_live_link(take, tmp_path / "again.csv")
+    assert _same_take(load_live_link(tmp_path / "again.csv"), take)
 
 
 @pytest.mark.parametrize("commas", [0, 61])

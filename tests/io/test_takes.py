@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from mutation import check_reader
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.takes import load_take, save_take
@@ -60,3 +61,16 @@ def test_what_no_reader_knows_is_refused(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("a,b\n1,2\n")
     with pytest.raises(FileFormatError, match=r"take\.csv: found the columns 'a', 'b'; expected Timecode"):
         load_take(tmp_path / "take.csv")
+
+
+def test_a_mutated_csv_of_any_kind_is_read_or_refused(tmp_path: Path) -> None:
+    values = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0))
+    takes = {
+        "markers": Take(60.0, markers=_markers()),
+        "landmarks": Take(60.0, landmarks=Track(("0", "1"), values)),
+        "weights": Take(60.0, weights=Track(("jawOpen", "smile"), values[..., :1])),
+        "live_link": Take(60.0, weights=Track(ARKIT, torch.zeros(3, 52, 1))),
+    }
+    for name, take in takes.items():
+        save_take(take, tmp_path / f"{name}.csv")
+    check_reader(load_take, [tmp_path / f"{name}.csv" for name in takes], ".csv")

@@ -113,7 +113,8 @@ def save_live_link(take: Take, path: str | Path) -> None:
     A take that ``load_live_link`` read gives the same file again, byte by byte where it came from the app. Weights by
     other names go to ARKit's by :func:`torchface.shape_names.mapping`: halves of a split shape give their mean, a
     shape that the take lacks is 0, one that ARKit lacks is left out. Without timecodes of its own a take starts at
-    00:00:00:00.000; without rotations they are 0.
+    00:00:00:00.000; those it has are written as they are. Without rotations they are 0. ARKit's own spelling
+    (``eyeBlinkLeft``) becomes the app's (``EyeBlinkLeft``).
 
     Args:
         take: weights (T,N,1); NaN becomes an empty cell.
@@ -155,7 +156,8 @@ def save_live_link(take: Take, path: str | Path) -> None:
         [timecode, str(count), *cells[row * width : (row + 1) * width], *(str(column[row]) for column in others)]
         for row, (timecode, count) in enumerate(zip(timecodes, counts, strict=True))
     )
-    write_table(path, ["Timecode", "BlendshapeCount", *(name[:1].upper() + name[1:] for name in names), *columns], rows)
+    header = [name[0].upper() + name[1:] if name in ARKIT else name for name in names]
+    write_table(path, ["Timecode", "BlendshapeCount", *header, *columns], rows)
 
 
 def _as_arkit(names: tuple[str, ...], values: np.ndarray, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
