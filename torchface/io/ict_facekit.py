@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
 from torchface.io.files import read_file
+from torchface.io.mirror import mirror_by_parts
 from torchface.io.obj import face_bytes, read_obj, read_obj_vertices
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
@@ -88,7 +89,7 @@ def is_ict_folder(folder: str | Path) -> bool:
 def load_ict_facekit(
     folder: str | Path, shapes: Sequence[str] | None = None, part: str | None = None, unit: str | None = None
 ) -> BlendshapeRig:
-    """The expression rig: 26,719 vertices in 17 parts, quads, 68 landmarks, one region mask a part.
+    """The expression rig: 26,719 vertices in 17 parts, quads, 68 landmarks, a mirror map, one region mask a part.
 
     Args:
         folder: the ``FaceXModel`` folder.
@@ -149,27 +150,30 @@ def region(mesh: Mesh, name: str) -> Tensor:
 
 def _read_neutral(folder: Path, indices: dict[str, list], unit: str) -> tuple[Mesh, bytes | None]:
     path = folder / f"{NEUTRAL}.obj"
-    mesh, count = read_obj(path, unit), None
+    mesh = read_obj(path, unit)
     count = len(mesh.vertices)
     landmarks = torch.tensor(indices["idx_to_landmark_verts"], dtype=torch.int64)
     if len(landmarks) and int(landmarks.max()) >= count:
         raise FileFormatError(
             f"{folder / _INDICES}: found landmark vertex {int(landmarks.max())}, expected less than {count}"
         )
-    annotations = Annotations(landmarks=landmarks, regions=_regions(count))
+    parts = _parts(count)
+    regions = {**parts, "narrow_face": torch.arange(count) <= _NARROW_FACE} if parts else {}
+    mirror = mirror_by_parts(mesh.vertices, parts) if parts else None
+    annotations = Annotations(landmarks, regions, mirror)
     return replace(mesh, annotations=annotations), face_bytes(read_file(path))
 
 
-def _regions(count: int) -> dict[str, Tensor]:
+def _parts(count: int) -> dict[str, Tensor]:
     """One mask a part; a head of another vertex count is not ICT's topology and has none."""
     if count != _VERTICES:
         return {}
     ids = torch.arange(count)
-    regions, first = {}, 0
+    parts, first = {}, 0
     for name, last in _LAST_VERTEX.items():
-        regions[name] = (ids >= first) & (ids <= last)
+        parts[name] = (ids >= first) & (ids <= last)
         first = last + 1
-    return {**regions, "narrow_face": ids <= _NARROW_FACE}
+    return parts
 
 
 def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: bytes | None, unit: str) -> Tensor:

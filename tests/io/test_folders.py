@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+from rig_samples import quad_sheet, sheet_rig
+
+from torchface.errors import FileFormatError, NameMismatchError, TopologyError
+from torchface.io import load_rig, save_mesh
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+
+def save_folder(rig: BlendshapeRig, folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    save_mesh(rig.neutral, folder / "Face_Neutral.obj")
+    for name, delta in zip(rig.names, rig.deltas, strict=True):
+        save_mesh(rig.neutral.with_vertices(rig.neutral.vertices + delta), folder / f"{name}.obj")
+
+
+def test_a_folder_of_obj_files_is_a_rig(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_folder(rig, tmp_path / "rig")
+    found = load_rig(tmp_path / "rig")
+    assert found.names == tuple(sorted(rig.names))
+    assert (found.deltas - rig.select(found.names).deltas).abs().max() < 1e-4
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.uv_faces, rig.neutral.uv_faces)
+    assert found.neutral.texture is not None
+    assert load_rig(tmp_path / "rig", shapes=["jawOpen"]).names == ("jawOpen",)
+    assert load_rig(tmp_path / "rig", unit="cm").deltas[1].allclose(found.deltas[1] * 10, atol=1e-3)
+
+
+def test_the_neutral_is_the_one_that_is_named(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_folder(rig, tmp_path / "rig")
+    other = load_rig(tmp_path / "rig", neutral="jawOpen")
+    assert other.names == ("Face_Neutral", "eyeBlinkRight", "mouthSmileLeft")
+    assert (other.deltas[0] + rig.deltas[0]).abs().max() < 1e-4
+    with pytest.raises(FileFormatError, match=r"4 OBJ files, of them neutral: rest; expected one neutral"):
+        load_rig(tmp_path / "rig", neutral="rest")
+    shutil.copy(tmp_path / "rig" / "jawOpen.obj", tmp_path / "rig" / "neutral_2.obj")
+    with pytest.raises(FileFormatError, match=r"of them neutral: Face_Neutral, neutral_2; expected one neutral"):
+        load_rig(tmp_path / "rig")
+    with pytest.raises(NameMismatchError, match="no shape 'smile'"):
+        load_rig(tmp_path / "rig", neutral="Face_Neutral", shapes=["smile"])
+
+
+def test_shapes_that_do_not_fit_the_neutral_are_named(tmp_path: Path) -> None:
+    rig, mesh = sheet_rig(), quad_sheet()
+    save_folder(rig, tmp_path / "rig")
+    path = tmp_path / "rig" / "jawOpen.obj"
+    save_mesh(Mesh(torch.cat([mesh.vertices, mesh.vertices[:1]]), mesh.faces), path)
+    with pytest.raises(TopologyError, match=r"jawOpen.obj: found 31 vertices, expected the 30 of the neutral mesh"):
+        load_rig(tmp_path / "rig")
+    save_mesh(Mesh(mesh.vertices, mesh.faces.flip(0)), path)
+    with pytest.raises(TopologyError, match=r"jawOpen.obj: found other faces than in the neutral mesh"):
+        load_rig(tmp_path / "rig")
+    # The same triangles written without texture coordinates are the same topology.
+    save_mesh(Mesh(mesh.vertices + 1, mesh.faces), path)
+    assert torch.allclose(load_rig(tmp_path / "rig").deltas[1], torch.ones(30, 3), atol=1e-4)
+    path.write_text(re.sub(r"^v \S+", "v nan", path.read_text(), count=1, flags=re.MULTILINE))
+    with pytest.raises(FileFormatError, match=r"jawOpen.obj: found NaN or infinity in 1 of 30 vertices, first at 0"):
+        load_rig(tmp_path / "rig")
+
+
+def test_an_empty_folder_and_a_lone_neutral_are_no_rig(tmp_path: Path) -> None:
+    (tmp_path / "rig").mkdir()
+    with pytest.raises(FileFormatError, match=r"rig: found 0 OBJ files, of them neutral: none; expected one neutral"):
+        load_rig(tmp_path / "rig")
+    save_mesh(quad_sheet(), tmp_path / "rig" / "neutral.obj")
+    with pytest.raises(FileFormatError, match=r"rig: found only the neutral neutral.obj, expected a file for each"):
+        load_rig(tmp_path / "rig")
+
+
+def load_with_this_shape(path: Path) -> BlendshapeRig:
+    """A folder of a good neutral and, as its only shape, the file at ``path``."""
+    folder = path.parent / "rig"
+    if not folder.exists():
+        folder.mkdir()
+        save_mesh(quad_sheet(), folder / "neutral.obj")
+    shutil.copy(path, folder / "shape.obj")
+    return load_rig(folder)
+
+
+def test_a_mutated_shape_is_read_or_refused(tmp_path: Path) -> None:
+    save_mesh(quad_sheet(), tmp_path / "good.obj")
+    report = check_reader(load_with_this_shape, [tmp_path / "good.obj"], ".obj")
+    assert report.read > 0
+    assert report.refused > report.cases / 4
