@@ -72,16 +72,13 @@ def prepare_splitting(H: Tensor, rho: float = RHO, relaxation: float = RELAXATIO
     return SplittingFactors(step, offset, relaxation)
 
 
-def start_splitting(problem: BoxProblem, start: Tensor | None, rho: float = RHO) -> SplittingState:
-    """The state at ``start`` (B,N), its dual guessed from the gradient; at the clipped zero if absent."""
-    if start is None:
-        z = problem.clip(torch.zeros_like(problem.f))
-        return SplittingState(z, z.clone())
-    z = problem.clip(start)
-    gradient = problem.gradient(z)
-    # At the optimum u = -g/(rho D) where a bound holds the variable, and 0 elsewhere.
-    held = ((z <= problem.lower) & (gradient > 0)) | ((z >= problem.upper) & (gradient < 0))
-    return SplittingState(z, z + torch.where(held, gradient / (rho * problem.diagonal), 0.0))
+def start_splitting(problem: BoxProblem, start: Tensor | None) -> SplittingState:
+    """The state at ``start`` (B,N), at zero if absent, clipped; its dual is zero.
+
+    A dual guessed from the gradient at ``start`` is no better near the solution and far worse elsewhere.
+    """
+    z = problem.clip(torch.zeros_like(problem.f) if start is None else start)
+    return SplittingState(z, z.clone())
 
 
 def splitting_steps(
