@@ -1,0 +1,76 @@
+"""``torchface pick``: landmarks, marker sites and correspondences by clicking."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from torchface.cli.progress import console, steps
+
+
+def pick(
+    mesh: Path,
+    scan: Path | None = None,
+    out: Path = Path("picks"),
+    mode: Literal["landmarks", "markers", "correspondences"] = "landmarks",
+    landmarks: Literal["68", "12"] = "68",
+    names: tuple[str, ...] = (),
+    unit: str | None = None,
+    scan_unit: str | None = None,
+    part: str | None = None,
+    port: int = 8080,
+    quiet: bool = False,
+) -> None:
+    """Pick points on a head by clicking, in the browser: landmark vertices, marker sites, correspondences with a scan.
+
+    Save writes into the folder OUT what has been picked: landmarks.json, annotated.glb (once every landmark is there),
+    attachment.json for the markers, correspondences.json for pairs. The page is at 127.0.0.1 and no other machine can
+    open it. Needs the extra: pip install torchface[viewer].
+
+    Args:
+        mesh: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        scan: A mesh to find the same places on: click on the head, then on the scan.
+        out: The folder to save into.
+        mode: What to pick first; the page can change it.
+        landmarks: iBUG's 68, or the twelve of eyes, nose, cheeks and mouth.
+        names: Names of landmarks of your own instead; "left" and "right" in a name are mirror images.
+        unit: Unit of the mesh (mm, cm, m) where it is not the format's own.
+        scan_unit: Unit of the scan.
+        part: Keep this region only, such as face.
+        port: The first port to try.
+        quiet: Show no progress.
+    """
+    from torchface.errors import FileFormatError
+    from torchface.io import load_mesh, load_rig
+    from torchface.io.ict_facekit import region
+    from torchface.mesh import Mesh, submesh
+    from torchface.rig import BlendshapeRig
+    from torchface.viz.browser.landmark_sets import IBUG_68, TWELVE, free_set
+    from torchface.viz.browser.page import import_viser
+    from torchface.viz.browser.picker import Picker
+
+    def read() -> Mesh | BlendshapeRig:
+        if mesh.is_dir():
+            return load_rig(mesh, unit, part)
+        if mesh.suffix.lower() in (".glb", ".gltf"):
+            try:
+                return load_rig(mesh, unit, part)
+            except FileFormatError:  # no morph targets: a mesh
+                pass
+        found = load_mesh(mesh, unit)
+        return found if part is None else submesh(found, region(found, part)).mesh
+
+    import_viser()
+    with steps(quiet) as step:
+        step("reading")
+        head = read()
+        target = None if scan is None else load_mesh(scan, scan_unit)
+        wanted = free_set(names) if names else IBUG_68 if landmarks == "68" else TWELVE
+        step("opening the page")
+        picker = Picker(head, target, out, wanted, mode, mesh.stem, port)
+    console.print("Open this page; Ctrl+C ends.")
+    print(picker.url, flush=True)
+    try:
+        picker.wait()
+    except KeyboardInterrupt:
+        picker.stop()

@@ -1,0 +1,51 @@
+"""``torchface view``: a rig in the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchface.cli.progress import console, steps
+
+
+def view(
+    rig: Path,
+    weights: Path | None = None,
+    out: Path | None = None,
+    part: str | None = None,
+    port: int = 8080,
+    quiet: bool = False,
+) -> None:
+    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, saving edited weights.
+
+    The page is at 127.0.0.1 and no other machine can open it. Needs the extra: pip install torchface[viewer].
+
+    Args:
+        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        weights: A weight take to play and edit, such as a Live Link Face CSV.
+        out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
+        part: Keep this region of the rig only, such as face.
+        port: The first port to try.
+        quiet: Show no progress.
+    """
+    from torchface.io import load_rig, load_take
+    from torchface.viz.browser.page import import_viser
+    from torchface.viz.browser.viewer import RigViewer
+
+    import_viser()  # what is missing should be said before a large rig is read
+    if out is None:
+        out = Path("edited_weights.csv") if weights is None else weights.with_name(f"{weights.stem}_edited.csv")
+    with steps(quiet) as step:
+        step("reading the rig")
+        loaded = load_rig(rig, part=part)
+        take = None
+        if weights is not None:
+            step("reading the take")
+            take = load_take(weights)
+        step("opening the page")
+        viewer = RigViewer(loaded, take, out, rig.stem, port)
+    console.print("Open this page; Ctrl+C ends.")
+    print(viewer.url, flush=True)
+    try:
+        viewer.wait()
+    except KeyboardInterrupt:
+        viewer.stop()

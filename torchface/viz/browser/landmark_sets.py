@@ -1,0 +1,77 @@
+"""Sets of landmarks with their names, and which is whose mirror image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LandmarkSet:
+    """Landmarks in their order.
+
+    Args:
+        names: one a landmark; left and right are the performer's own.
+        mirror: for each its mirror image's row; a midline landmark names itself.
+    """
+
+    names: tuple[str, ...]
+    mirror: tuple[int, ...]
+
+
+def _numbered(part: str, count: int) -> list[str]:
+    return [f"{part} {i}" for i in range(1, count + 1)]
+
+
+def _reversed_pairs(first: int, last: int) -> dict[int, int]:
+    """Rows first..last of a row of points that runs from one side of the face to the other."""
+    return {row: first + last - row for row in range(first, last + 1)}
+
+
+def _mirror_68() -> tuple[int, ...]:
+    twins = {row: row for row in range(68)}
+    twins |= _reversed_pairs(0, 16) | _reversed_pairs(17, 26) | _reversed_pairs(31, 35)
+    eyes = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
+    twins |= eyes | {twin: row for row, twin in eyes.items()}
+    twins |= _reversed_pairs(48, 54) | _reversed_pairs(55, 59) | _reversed_pairs(60, 64) | _reversed_pairs(65, 67)
+    return tuple(twins[row] for row in range(68))
+
+
+IBUG_68 = LandmarkSet(
+    (
+        *_numbered("jaw line", 17),
+        *_numbered("right brow", 5),
+        *_numbered("left brow", 5),
+        *_numbered("nose bridge", 4),
+        *_numbered("nose base", 5),
+        *_numbered("right eye", 6),
+        *_numbered("left eye", 6),
+        *_numbered("outer lip", 12),
+        *_numbered("inner lip", 8),
+    ),
+    _mirror_68(),
+)
+"""iBUG's 68 in their order, which begins at the performer's right ear."""
+
+TWELVE = LandmarkSet(
+    (
+        *("nose tip", "between the eyes", "right eye outer corner", "right eye inner corner"),
+        *("left eye inner corner", "left eye outer corner", "right cheek", "left cheek"),
+        *("right mouth corner", "left mouth corner", "top of mouth", "bottom of mouth"),
+    ),
+    (0, 1, 5, 4, 3, 2, 7, 6, 9, 8, 10, 11),
+)
+"""The twelve of the thesis, section 3.2.2."""
+
+
+def free_set(names: Sequence[str]) -> LandmarkSet:
+    """A set of one's own; a name with ``left`` in it mirrors the one with ``right`` there instead.
+
+    Example:
+        >>> free_set(["chin", "left ear", "right ear"]).mirror
+        (0, 2, 1)
+    """
+    row = {name: i for i, name in enumerate(names)}
+    swap = str.maketrans({"\0": "right", "\1": "left"})
+    twins = (name.replace("left", "\0").replace("right", "\1").translate(swap) for name in names)
+    return LandmarkSet(tuple(names), tuple(row.get(twin, i) for i, twin in enumerate(twins)))
