@@ -184,3 +184,11 @@ def test_points_and_lines_beside_the_face_are_left_out(tmp_path: Path) -> None:
     build.root["nodes"] = [{"mesh": 1}, {"mesh": 0}]
     build.root["scenes"] = [{"nodes": [0, 1]}]
     assert load_mesh(build.save(tmp_path / "face.gltf")).faces.tolist() == SQUARE_TRIANGLES.reshape(2, 3).tolist()
+
+
+def test_vertex_colours_are_light_in_the_file_and_coded_in_the_mesh(tmp_path: Path) -> None:
+    build = square(["a", "b"])
+    light = np.array([[0, 1, 0.2140411, 1]] * 4, np.float32)
+    build.root["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = build.accessor(light)
+    mesh = load_mesh(build.save(tmp_path / "face.gltf"))
+    assert close(mesh.colors, [[0, 1, 0.5]] * 4, 1e-5)
