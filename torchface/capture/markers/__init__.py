@@ -1,5 +1,14 @@
 """Capture from 3D markers."""
 
+from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
 
-__all__ = ["MarkerSolver"]
+__all__ = [
+    "MarkerSolver",
+    "Observability",
+    "SparsityTrial",
+    "observability",
+    "sparsity_by_rule",
+    "sparsity_experiment",
+]
