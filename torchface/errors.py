@@ -25,5 +25,9 @@ class TopologyError(TorchfaceError):
     """Meshes, rigs or attachments of different topology were put together, or a mesh's indices are broken."""
 
 
+class AlignmentError(TorchfaceError):
+    """Two things could not be laid on one another without help."""
+
+
 class MissingExtraError(TorchfaceError):
     """An optional dependency is not installed."""
