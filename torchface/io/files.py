@@ -70,11 +70,12 @@ def write_file(path: str | Path, data: bytes) -> None:
 def finite_vertices(path: Path, values: NDArray[np.float64]) -> Tensor:
     """Positions as float32; raises ``FileFormatError`` with the first one that is NaN or too large."""
     with np.errstate(over="ignore"):
-        vertices = torch.from_numpy(values.astype(np.float32))
-    bad = (~torch.isfinite(vertices)).any(-1).nonzero()[:, 0]
-    if len(bad):
+        vertices = values.astype(np.float32)
+    finite = np.isfinite(vertices)
+    if not finite.all():
+        bad = np.flatnonzero(~finite.all(1))
         raise FileFormatError(
             f"{path}: found NaN or infinity in {len(bad)} of {len(vertices)} vertices, first at {int(bad[0])}; "
             "expected finite numbers"
         )
-    return vertices
+    return torch.from_numpy(vertices)

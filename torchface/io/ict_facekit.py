@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -178,12 +179,13 @@ def _parts(count: int) -> dict[str, Tensor]:
 
 def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: bytes | None, unit: str) -> Tensor:
     deltas = torch.empty(len(names), *neutral.vertices.shape)
-    for row, name in zip(deltas, names, strict=True):  # a file a turn
+    at_rest = neutral.vertices.numpy()
+    for row, name in zip(deltas.numpy(), names, strict=True):  # a file a turn
         path = folder / f"{name}.obj"
         if Path(name).name != name or not path.is_file():
             have = sorted(file.stem for file in folder.glob("*.obj"))
             raise NameMismatchError(f"{folder}: found no shape {name!r}; its files are {', '.join(have[:60])}")
-        torch.sub(read_obj_vertices(path, neutral, topology, unit), neutral.vertices, out=row)
+        np.subtract(read_obj_vertices(path, neutral, topology, unit).numpy(), at_rest, out=row)
     return deltas
 
 

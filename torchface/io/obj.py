@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -62,9 +62,9 @@ def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, u
         TopologyError: another number of vertices, or other faces.
     """
     path, data = Path(path), read_file(path)
-    end = data.find(b"\n", max(data.rfind(b"\nv "), data.rfind(b"\nv\t")) + 1)
-    lines = [line[2:] for line in data[: end if end >= 0 else None].split(b"\n") if line[:2] in (b"v ", b"v\t")]
-    table = _number_rows(path, "v", lines, (3, 4, 6, 7))
+    table = _plain_vertices(path, data)
+    if table is None:
+        table = _number_rows(path, "v", _lines_by_keyword(path, data)["v"], (3, 4, 6, 7))
     if len(table) != len(neutral.vertices):
         raise TopologyError(
             f"{path}: found {len(table)} vertices, expected the {len(neutral.vertices)} of the neutral mesh"
@@ -110,6 +110,30 @@ def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
     write_file(path, ("\n".join(text) + "\n").encode())
 
 
+def _plain_vertices(path: Path, data: bytes) -> NDArray[np.float64] | None:
+    """The vertices of a file whose first to last vertex line hold nothing but ``v x y z``; none of another file.
+
+    All is split at once; every fourth word being the keyword, and a line a vertex, says that no line is odd.
+    """
+    start = 0 if data.startswith(b"v ") else data.find(b"\nv ") + 1
+    last = data.rfind(b"\nv ") + 1
+    end = data.find(b"\n", last)
+    block = data[start : end if end >= 0 else None].rstrip()
+    words = block.split()
+    count = len(words) // 4
+    if not count or len(words) % 4 or words[::4].count(b"v") != count or block.count(b"\n") != count - 1:
+        return None
+    del words[::4]
+    return _floats(path, "v", words).reshape(count, 3)
+
+
+def _floats(path: Path, keyword: str, words: Iterable[bytes]) -> NDArray[np.float64]:
+    try:
+        return np.array(list(map(float, words)), dtype=np.float64)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: found text in a '{keyword}' line, expected numbers ({error})") from error
+
+
 def _lines_by_keyword(path: Path, data: bytes) -> dict[str, list[bytes]]:
     """What follows the keyword, for the keywords that are read; text comes by the line, hence the loop."""
     if b"\0" in data[:4096]:
@@ -146,10 +170,7 @@ def _number_rows(path: Path, keyword: str, lines: Sequence[bytes], widths: Seque
             f"{path}: found {len(rows[odd])} numbers in '{keyword}' line {odd + 1}, "
             f"expected {' or '.join(map(str, widths))}, in every line the same"
         )
-    try:
-        numbers = np.array(list(map(float, chain.from_iterable(rows))), dtype=np.float64)
-    except ValueError as error:
-        raise FileFormatError(f"{path}: found text in a '{keyword}' line, expected numbers ({error})") from error
+    numbers = _floats(path, keyword, chain.from_iterable(rows))
     return numbers.reshape(len(rows), -1) if rows else numbers.reshape(0, widths[0])
 
 
