@@ -103,9 +103,7 @@ def load_correspondences(path: str | Path) -> Correspondences:
     vertices, points = _vertices(document, path), document.get("points")
     good = isinstance(points, list) and len(points) == len(vertices) and all(map(_is_point, points))
     if not good:
-        raise FileFormatError(
-            f"{path}: found no {len(vertices)} points of three finite numbers, expected a point a pair"
-        )
+        raise FileFormatError(f"{path}: found no {len(vertices)} points under 'points', expected three numbers a pair")
     values = torch.tensor(points, dtype=torch.float64).reshape(-1, 3)
     return Correspondences(vertices, values, _labels(document, path), _fingerprint(document, path))
 

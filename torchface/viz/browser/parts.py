@@ -125,7 +125,7 @@ def _components(mesh: Mesh) -> Tensor:
 def _color_classes(colors: Tensor) -> tuple[Tensor, Tensor]:
     """A class (F,) and the palette (K,3): k-means from colours that lie far from each other."""
     points = colors.double().numpy()
-    centres = [points.mean(0)]
+    centres = [points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]]
     while len(centres) < _MOST_COLORS:
         distance = np.min([np.linalg.norm(points - centre, axis=1) for centre in centres], axis=0)
         if distance.max(initial=0.0) < _SAME_COLOR:

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchface.io.gltf.primitives import decode_srgb
 from torchface.mesh import Mesh
 
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -42,7 +43,7 @@ class Skin:
             self._vertex_of, indices = torch.arange(len(mesh.vertices)), mesh.faces
             colors = torch.tensor([[0.8] * 3]).expand(len(mesh.vertices), 3) if mesh.colors is None else mesh.colors
             # glTF wants vertex colours linear, the mesh holds them as a picture does.
-            look = colors.clamp(0, 1).float().pow(2.2).numpy()
+            look = decode_srgb(colors.clamp(0, 1).float().numpy())
             self._image = b""
         self._look, self._indices = look, indices.numpy().astype(np.uint32)
 

@@ -199,7 +199,7 @@ class RigViewer:
             with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS):
                 for row in rows:
                     name = self.rig.names[row]
-                    slider = gui.add_slider(name, low[row], high[row], 0.001, 0.0)
+                    slider = gui.add_slider(name, low[row], high[row], 0.01, 0.0)
                     slider.precision = 3
                     sliders[name] = self._shared(slider, partial(self._set, name))
         return sliders

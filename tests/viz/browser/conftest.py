@@ -1,0 +1,85 @@
+"""A small rig, and a headless Chromium that skips visibly where there is none."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+_SWITCHES = (
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--window-size=1280,900",
+)
+
+
+def ball(subdivisions: int, radius: float, centre: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertices and triangles of a round thing, as a mesher that is not ours makes them."""
+    sphere = trimesh.creation.icosphere(subdivisions, radius)
+    vertices = torch.tensor(sphere.vertices, dtype=torch.float32) + torch.tensor(centre)
+    return vertices, torch.tensor(sphere.faces, dtype=torch.int64)
+
+
+@pytest.fixture(scope="session")
+def two_balls() -> Mesh:
+    """A large ball (a head) and a small one in front of it (a nose), millimetres; symmetric in x."""
+    head, head_faces = ball(4, 90.0, (0.0, 0.0, 0.0))
+    nose, nose_faces = ball(2, 15.0, (0.0, 0.0, 110.0))
+    return Mesh(torch.cat([head, nose]), torch.cat([head_faces, nose_faces + len(head)]))
+
+
+@pytest.fixture(scope="session")
+def ball_rig(two_balls: Mesh) -> BlendshapeRig:
+    """Shapes that move the head's left, right and lower side; ``noseSneerLeft`` moves the nose alone."""
+    vertices = two_balls.vertices
+    x, y, _ = vertices.unbind(1)
+    on_nose = torch.arange(len(vertices)) >= 2562
+    up, out = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
+    masks = {
+        "jawOpen": (torch.relu(-y - 20) * ~on_nose, -up),
+        "mouthSmileLeft": (torch.relu(x - 20) * ~on_nose, up),
+        "mouthSmileRight": (torch.relu(-x - 20) * ~on_nose, up),
+        "browInnerUp": (torch.relu(y - 20) * ~on_nose, out),
+        "noseSneerLeft": (5.0 * on_nose, out),
+        "cheekPuff": (torch.relu(x.abs() - 40) * ~on_nose, out),
+        "eyeBlinkLeft": (0.2 * torch.relu(x - 30) * ~on_nose, out),
+        "tongueOut": (8.0 * on_nose, out),
+    }
+    deltas = torch.stack([amount[:, None] * way for amount, way in masks.values()])
+    return BlendshapeRig(two_balls, deltas, tuple(masks))
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A driver of Debian's Chromium, without the network."""
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if browser is None or driver is None:
+        pytest.skip("chromium or chromedriver not found; on Debian: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    profile: Path = tmp_path_factory.mktemp("profile")
+    for switch in (*_SWITCHES, f"--user-data-dir={profile}"):
+        options.add_argument(switch)
+    environment = {**os.environ, "SE_OFFLINE": "true"}
+    service = webdriver.ChromeService(executable_path=driver, env=environment)
+    running = webdriver.Chrome(options=options, service=service)
+    yield running
+    running.quit()

@@ -1,0 +1,205 @@
+"""The pages as a user meets them: Chromium renders them, a slider is dragged, the head is clicked on."""
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.viz.browser.landmark_sets import free_set
+from torchface.viz.browser.page import SCALE
+from torchface.viz.browser.picker import Picker
+from torchface.viz.browser.viewer import RigViewer
+
+pytestmark = pytest.mark.browser
+
+_VERTICES = """
+const node = window.__viserMutable && window.__viserMutable.nodeRefFromName[arguments[0]];
+let found = null;
+if (node) node.traverse(x => { if (x.isMesh && found === null && x.geometry.attributes.position)
+    found = [x.geometry.attributes.position.version, Array.from(x.geometry.attributes.position.array)]; });
+return found;
+"""
+_PROJECT = """
+const view = window.__viserMutable, camera = view.camera, box = view.canvas.getBoundingClientRect();
+const node = view.nodeRefFromName[arguments[0]];
+camera.updateMatrixWorld(); node.updateWorldMatrix(true, false);
+const p = node.position.clone().set(...arguments[1]).applyMatrix4(node.matrixWorld).project(camera);
+return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
+"""
+_THUMB = """
+const label = [...document.querySelectorAll('label')].find(e => e.textContent.trim() === arguments[0]);
+return label ? document.getElementById(label.getAttribute('for')).querySelector('[role=slider]') : null;
+"""
+
+
+def until(found: Callable[[], Any], seconds: float = 30.0) -> Any:
+    """Waits for something true, and returns it."""
+    end = time.monotonic() + seconds
+    while not (value := found()):
+        assert time.monotonic() < end, "the page did not get there in time"
+        time.sleep(0.05)
+    return value
+
+
+def shown(chromium: Any, node: str) -> tuple[int, Tensor]:
+    """How often the browser was given a mesh, and its vertices (V,3) as they lie in its memory."""
+    version, flat = until(lambda: chromium.execute_script(_VERTICES, node))
+    return version, torch.tensor(flat).reshape(-1, 3)
+
+
+def picture(chromium: Any) -> np.ndarray:
+    """The left part of the page, which is the scene."""
+    whole = np.asarray(Image.open(io.BytesIO(chromium.get_screenshot_as_png())).convert("RGB"), dtype=float)
+    return whole[200:, : whole.shape[1] // 2]
+
+
+def thumb(chromium: Any, name: str) -> Any:
+    """The knob of a slider, rolled into view."""
+    element = until(lambda: chromium.execute_script(_THUMB, name))
+    chromium.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
+    return element
+
+
+@pytest.fixture(scope="module")
+def viewer(chromium: Any, ball_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigViewer]:
+    ramp = torch.linspace(0, 1, 240)[:, None, None]
+    take = Take(60.0, weights=Track(("jawOpen",), ramp))
+    opened = RigViewer(ball_rig, take, tmp_path_factory.mktemp("out") / "edited.csv", label="two balls", port=0)
+    chromium.get(opened.url)
+    shown(chromium, "/head/part0")
+    yield opened
+    chromium.get("about:blank")
+    opened.stop()
+
+
+def test_the_page_loads_with_head_panel_and_a_slider_a_shape(chromium: Any, viewer: RigViewer) -> None:
+    until(lambda: "two balls" in chromium.find_element("tag name", "body").text)
+    _, vertices = shown(chromium, "/head/part0")
+    torch.testing.assert_close(vertices, viewer.rig.vertices[:2562])
+    words = until(lambda: t if "Jaw" in (t := chromium.find_element("tag name", "body").text) else "")
+    for word in ("Timeline", "Editing", "Active shapes", "Brows", "Eyes", "Jaw", "Mouth", "Cheeks", "Nose", "Other"):
+        assert word in words
+    for name in ("browInnerUp", "eyeBlinkLeft", "jawOpen", "mouthSmileLeft", "mouthSmileRight"):
+        thumb(chromium, name)
+    middle = picture(chromium)
+    assert middle.std() > 15  # the head is drawn: background alone is a soft gradient
+
+
+def test_a_slider_moves_the_mesh_that_the_browser_shows(chromium: Any, viewer: RigViewer) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    before = picture(chromium)
+    nose_version, nose = shown(chromium, "/head/part1")
+    thumb(chromium, "mouthSmileLeft").send_keys(Keys.ARROW_RIGHT * 40)
+    until(lambda: abs(float(viewer.editor.pose[1]) - 0.40) < 1e-6)
+    expected = viewer.rig(torch.tensor([[0, 0.4, 0.4, 0, 0, 0, 0, 0]]))[0, :2562]  # symmetric: the right one too
+    until(lambda: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
+    twin = thumb(chromium, "mouthSmileRight")
+    until(lambda: float(twin.get_attribute("aria-valuenow")) == 0.4)
+    assert shown(chromium, "/head/part1")[0] == nose_version  # what did not move was not sent
+    assert torch.equal(shown(chromium, "/head/part1")[1], nose)
+    until(lambda: np.abs(picture(chromium) - before).max() > 40)
+    until(lambda: "mouthSmileLeft" in chromium.find_element("tag name", "body").text)
+
+
+def test_reset_and_save_are_buttons_of_the_page(chromium: Any, viewer: RigViewer) -> None:
+    viewer.set_weight("jawOpen", 0.5)
+    assert viewer.editor.edited
+    button = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Save weights')]"))[0]
+    chromium.execute_script("arguments[0].click()", button)
+    until(viewer.out.exists)
+    until(lambda: viewer.out.name in chromium.find_element("tag name", "body").text)
+    reset = chromium.find_elements("xpath", "//button[contains(., 'Reset all')]")[0]
+    chromium.execute_script("arguments[0].click()", reset)
+    until(lambda: not viewer.editor.edited)
+    until(lambda: (shown(chromium, "/head/part0")[1] - viewer.rig.vertices[:2562]).abs().max() < 1e-4)
+
+
+def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) -> None:
+    play = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Play')]"))[0]
+    chromium.execute_script("arguments[0].click()", play)
+    chin = int(viewer.rig.vertices[:2562, 1].argmin())
+    seen: list[float] = []
+
+    def moved() -> bool:
+        height = float(shown(chromium, "/head/part0")[1][chin, 1])
+        seen.extend([height] if not seen or seen[-1] != height else [])
+        return len(seen) >= 4
+
+    until(moved)
+    assert seen[:3] == sorted(seen[:3], reverse=True)  # the jaw opens along the ramp
+    pause = until(lambda: chromium.find_elements("xpath", "//button[contains(., 'Pause')]"))[0]
+    chromium.execute_script("arguments[0].click()", pause)
+    until(lambda: not viewer.playback.playing)
+    expected = viewer.rig(viewer.editor.pose[None])[0, :2562]
+    until(lambda: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
+    until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.editor.frame))
+
+
+@pytest.fixture
+def picker(chromium: Any, two_balls: Mesh, tmp_path) -> Iterator[Picker]:
+    scan = two_balls.with_vertices(two_balls.vertices * 1.1 + torch.tensor([400.0, 30.0, -50.0]))
+    marks = free_set(["left ear", "right ear", "chin"])
+    opened = Picker(two_balls, scan, tmp_path / "picks", marks, "landmarks", "picking", port=0)
+    chromium.get(opened.url)
+    shown(chromium, "/head/part0")
+    shown(chromium, "/scan/part0")
+    yield opened
+    chromium.get("about:blank")
+    opened.stop()
+
+
+def click_on(chromium: Any, node: str, point: Tensor) -> None:
+    """A real click at the pixel under which a point of the node (its own units) lies."""
+    from selenium.webdriver import ActionChains
+
+    x, y = chromium.execute_script(_PROJECT, node, [float(c) * SCALE for c in point])
+    ActionChains(chromium).move_by_offset(round(x), round(y)).click().perform()
+    ActionChains(chromium).move_by_offset(-round(x), -round(y)).perform()
+
+
+def front_vertices(mesh: Mesh) -> list[int]:
+    """Two vertices of the large ball that face the camera and lie beside the small one."""
+    wanted = torch.tensor([[45.0, 35.0, 70.0], [-50.0, -30.0, 68.0]])
+    return torch.cdist(wanted, mesh.vertices[:2562]).argmin(1).tolist()
+
+
+def test_a_click_picks_the_vertex_under_the_cursor(chromium: Any, picker: Picker, two_balls: Mesh) -> None:
+    time.sleep(1.0)  # the camera glides to its place
+    first, second = front_vertices(two_balls)
+    click_on(chromium, "/head/part0", two_balls.vertices[first])
+    until(lambda: picker.session.picks.landmarks[0] is not None)
+    assert picker.session.picks.landmarks == (first, None, None)
+    click_on(chromium, "/head/part0", two_balls.vertices[second])
+    until(lambda: picker.session.picks.landmarks[1] is not None)
+    assert picker.session.picks.landmarks == (first, second, None)
+    until(lambda: "2 of 3" in chromium.find_element("tag name", "body").text)
+    until(lambda: chromium.execute_script("return '/picks/landmarks' in window.__viserSceneTree.getState()"))
+    undo = chromium.find_elements("xpath", "//button[contains(., 'Undo')]")[0]
+    chromium.execute_script("arguments[0].click()", undo)
+    until(lambda: picker.session.picks.landmarks == (first, None, None))
+
+
+def test_clicks_on_head_and_scan_make_a_pair(chromium: Any, picker: Picker, two_balls: Mesh) -> None:
+    time.sleep(1.0)
+    picker._mode.value = "correspondences"
+    vertex, other = front_vertices(two_balls)
+    scan = picker.session.scan
+    assert scan is not None
+    click_on(chromium, "/head/part0", two_balls.vertices[vertex])
+    until(lambda: picker.session.picks.waiting == vertex)
+    click_on(chromium, "/scan/part0", scan.vertices[other])
+    until(lambda: picker.session.picks.pairs)
+    pairs = picker.session.correspondences()
+    assert pairs.vertices.tolist() == [vertex]
+    # A pixel is about 1 mm here; the scan's own space, not the page's.
+    assert (pairs.points[0] - scan.vertices[other].double()).norm() < 2.0

@@ -1,0 +1,108 @@
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.cli.pick import pick
+from torchface.cli.view import view
+from torchface.errors import MissingExtraError, NameMismatchError, ValueRangeError
+from torchface.io import load_take
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.viz.browser.viewer import RigViewer
+
+on_linux = pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux who listens at which address")
+
+
+@pytest.fixture
+def viewer(ball_rig: BlendshapeRig, tmp_path) -> Iterator[RigViewer]:
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    opened = RigViewer(ball_rig, out=tmp_path / "edited.csv", port=0)
+    yield opened
+    opened.stop()
+
+
+def listening_addresses(port: int) -> set[str]:
+    """Addresses on which anything listens at this port, as the kernel says."""
+    found = set()
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        for line in Path(table).read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            place, number = address.split(":")
+            if state == "0A" and int(number, 16) == port:
+                found.add(place)
+    return found
+
+
+def test_without_viser_the_extra_is_named_before_anything_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for command in (view, pick):
+        with pytest.raises(MissingExtraError, match=r"pip install torchface\[viewer\]"):
+            command(Path("no_such_rig.glb"))
+
+
+@on_linux
+def test_the_page_listens_on_the_loopback_address_and_nowhere_else(viewer: RigViewer) -> None:
+    port = viewer.server.get_port()
+    assert viewer.url == f"http://127.0.0.1:{port}"
+    loopback = "".join(f"{byte:02X}" for byte in reversed((127, 0, 0, 1)))
+    assert listening_addresses(port) == {loopback}
+
+
+@on_linux
+def test_another_address_of_this_machine_is_refused(viewer: RigViewer) -> None:
+    port = viewer.server.get_port()
+    with closing(socket.create_connection(("127.0.0.1", port), timeout=5)):
+        pass
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.2", port), timeout=5)
+
+
+def test_a_page_cannot_open_a_tunnel_to_the_outside(viewer: RigViewer) -> None:
+    assert viewer.server.request_share_url() is None
+    assert viewer.server._share_tunnel is None
+
+
+def test_it_says_nothing_on_standard_output(ball_rig: BlendshapeRig, capfd: pytest.CaptureFixture) -> None:
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    opened = RigViewer(ball_rig, port=0)
+    opened.stop()
+    assert capfd.readouterr().out == ""
+
+
+def test_only_the_pieces_that_moved_are_sent(viewer: RigViewer) -> None:
+    assert viewer.set_weight("jawOpen", 0.5) == 1  # the head, not the nose
+    assert viewer.set_weight("jawOpen", 0.5) == 0
+    assert viewer.set_weight("noseSneerLeft", 1.0) == 1
+    viewer.editor.rest()
+    assert viewer.show_frame(0) == 2
+
+
+def test_edited_weights_are_saved_for_the_frames_they_were_made_in(ball_rig: BlendshapeRig, tmp_path) -> None:
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    weights = torch.rand(30, 2, 1, generator=torch.Generator().manual_seed(0))
+    take = Take(30.0, weights=Track(("jawOpen", "browInnerUp"), weights))
+    opened = RigViewer(ball_rig, take, tmp_path / "new" / "edited.csv", port=0)
+    try:
+        opened.editor.spread = 0
+        opened.show_frame(12)
+        opened.set_weight("mouthSmileLeft", 0.625)
+        found = load_take(opened.save())
+    finally:
+        opened.stop()
+    assert found.fps == pytest.approx(30.0)
+    expected = ball_rig.weights_from(take.weights)
+    expected[12, [1, 2]] = 0.625  # symmetric
+    assert found.weights.names == ball_rig.names
+    torch.testing.assert_close(found.weights.values[..., 0], expected)
+
+
+def test_a_take_that_cannot_be_played_is_refused(ball_rig: BlendshapeRig) -> None:
+    with pytest.raises(ValueRangeError, match="no weights"):
+        RigViewer(ball_rig, Take(60.0, markers=Track(("a",), torch.zeros(2, 1, 3))), port=0)
+    with pytest.raises(NameMismatchError, match="wiggleEars"):
+        RigViewer(ball_rig, Take(60.0, weights=Track(("wiggleEars",), torch.zeros(2, 1, 1))), port=0)
