@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
+from torchface.geometry.normal_maps import DetailMaps
 from torchface.geometry.operators import vertex_normals
 from torchface.io.files import millimetres_per
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.container import write_document
+from torchface.io.gltf.detail import write_detail
 from torchface.io.gltf.extras import write_extras
 from torchface.io.gltf.primitives import decode_srgb
 from torchface.io.images import encode_png
@@ -45,7 +47,7 @@ class ShapeMatch:
     unused: tuple[str, ...]
 
 
-def save_rig(rig: BlendshapeRig, path: str | Path) -> None:
+def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
     """Writes a rig as ``.glb`` in metres.
 
     Vertices are split where texture coordinates differ, as glTF wants it; the attribute ``_VERTEX_ID`` and
@@ -55,12 +57,14 @@ def save_rig(rig: BlendshapeRig, path: str | Path) -> None:
     Args:
         rig: the rig.
         path: the file; it appears only when it is complete.
+        detail: wrinkle maps of its shapes; see ``torchface.io.gltf.detail``.
 
     Raises:
         FileFormatError: the folder cannot be written to.
-        TopologyError: the mesh has no triangle.
+        TopologyError: the mesh has no triangle, or wrinkle maps and no texture coordinates.
+        NameMismatchError: a wrinkle map belongs to no shape of the rig.
     """
-    _write(path, rig.neutral, rig.deltas, rig.names, None)
+    _write(path, rig.neutral, rig.deltas, rig.names, None, detail)
 
 
 def save_gltf_mesh(mesh: Mesh, path: str | Path) -> None:
@@ -68,19 +72,20 @@ def save_gltf_mesh(mesh: Mesh, path: str | Path) -> None:
     _write(path, mesh, torch.zeros(0, *mesh.vertices.shape), (), None)
 
 
-def save_animation(rig: BlendshapeRig, take: Take, path: str | Path) -> ShapeMatch:
+def save_animation(rig: BlendshapeRig, take: Take, path: str | Path, detail: DetailMaps | None = None) -> ShapeMatch:
     """Writes a rig as ``.glb`` with the take's weights as its animation, a key a frame, linear between.
 
     Args:
         rig: the rig.
         take: with ``weights``; names are matched by ``shape_names.mapping``.
         path: the file; it appears only when it is complete.
+        detail: wrinkle maps of the rig's shapes; see ``torchface.io.gltf.detail``.
 
     Returns:
         ``ShapeMatch(driven, missing, unused)``.
 
     Raises:
-        NameMismatchError: no channel drives any shape.
+        NameMismatchError: no channel drives any shape, or a wrinkle map belongs to none.
         ValueRangeError: the take has no weights or no frame, or a weight is NaN.
         FileFormatError: the folder cannot be written to.
     """
@@ -102,7 +107,7 @@ def save_animation(rig: BlendshapeRig, take: Take, path: str | Path) -> ShapeMat
             f"rig's {len(rig.names)} shapes ({', '.join(rig.names[:5])}, ...)"
         )
     times = torch.arange(len(values), dtype=torch.float64) / take.fps
-    _write(path, rig.neutral, rig.deltas, rig.names, (times.float(), values @ matrix.T))
+    _write(path, rig.neutral, rig.deltas, rig.names, (times.float(), values @ matrix.T), detail)
     by_shape, by_channel = drives.any(1).tolist(), drives.any(0).tolist()
     return ShapeMatch(
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if is_driven),
@@ -112,7 +117,12 @@ def save_animation(rig: BlendshapeRig, take: Take, path: str | Path) -> ShapeMat
 
 
 def _write(
-    path: str | Path, mesh: Mesh, deltas: Tensor, names: tuple[str, ...], keys: tuple[Tensor, Tensor] | None
+    path: str | Path,
+    mesh: Mesh,
+    deltas: Tensor,
+    names: tuple[str, ...],
+    keys: tuple[Tensor, Tensor] | None,
+    detail: DetailMaps | None = None,
 ) -> None:
     if len(mesh.faces) == 0:
         raise TopologyError(f"{path}: the mesh has no triangle; glTF needs one")
@@ -126,7 +136,7 @@ def _write(
     extras: dict[str, Any] = {"torchface": write_extras(mesh)}
     body: dict[str, Any] = {"name": "face", "primitives": [primitive], "extras": extras}
     if names:
-        primitive["targets"] = [{"POSITION": _target(delta, vertex_of, buffers)} for delta in deltas.detach().cpu()]
+        primitive["targets"] = [{"POSITION": _target(delta, vertex_of, buffers)} for delta in _rows(deltas)]
         body["weights"] = [0.0] * len(names)
         extras["targetNames"] = list(names)
     root: dict[str, Any] = {
@@ -137,6 +147,8 @@ def _write(
         "meshes": [body],
         **_skin(mesh, buffers),
     }
+    if detail is not None:
+        write_detail(detail, mesh, names, root, buffers)
     if keys is not None:
         root["animations"] = [_animation(*keys, buffers)]
     root |= {"accessors": buffers.accessors, "bufferViews": buffers.views}
@@ -166,7 +178,7 @@ def _attributes(
     normals = vertex_normals(mesh.vertices.detach().cpu().double(), mesh.faces.cpu())
     normals[normals.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)  # loose, or without area
     attributes = {
-        "POSITION": buffers.vertices(_metres(mesh.vertices)[vertex_of]),
+        "POSITION": buffers.vertices(_metres(mesh.vertices.detach().cpu().float().numpy())[vertex_of]),
         "NORMAL": buffers.vertices(normals.float().numpy()[vertex_of]),
     }
     if mesh.uvs is not None and uv_of is not None:
@@ -180,13 +192,17 @@ def _attributes(
     return attributes
 
 
-def _target(delta: Tensor, vertex_of: NDArray[np.int64], buffers: BufferWriter) -> int:
-    still = delta.norm(dim=1, keepdim=True) < STILL
-    return buffers.deltas(_metres(torch.where(still, torch.zeros_like(delta), delta))[vertex_of])
+def _rows(deltas: Tensor) -> NDArray[np.float32]:
+    return deltas.detach().cpu().float().numpy()
 
 
-def _metres(millimetres: Tensor) -> NDArray[np.float32]:
-    return (millimetres.detach().cpu().double() / millimetres_per("m")).float().numpy()
+def _target(delta: NDArray[np.float32], vertex_of: NDArray[np.int64], buffers: BufferWriter) -> int:
+    moves = np.einsum("ij,ij->i", delta, delta) >= STILL * STILL
+    return buffers.deltas(_metres(delta * moves[:, None])[vertex_of])
+
+
+def _metres(millimetres: NDArray[np.float32]) -> NDArray[np.float32]:
+    return (millimetres / np.float64(millimetres_per("m"))).astype(np.float32)
 
 
 def _skin(mesh: Mesh, buffers: BufferWriter) -> dict[str, Any]:
