@@ -1,25 +1,30 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
-from torchface.io.gltf import ShapeMatch, save_animation, save_rig
+from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save_rig
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
-from torchface.io.images import load_image, save_image
+from torchface.io.images import load_image, save_image, save_image16
 from torchface.io.meshes import load_mesh, save_mesh
+from torchface.io.normal_maps import load_normal_map, save_normal_map
 from torchface.io.rigs import load_obj_folder, load_rig
 from torchface.io.takes import load_take, save_take
 
 __all__ = [
     "IdentityModes",
     "ShapeMatch",
+    "load_detail_maps",
     "load_ict_facekit",
     "load_identity_modes",
     "load_image",
     "load_mesh",
+    "load_normal_map",
     "load_obj_folder",
     "load_rig",
     "load_take",
     "save_animation",
     "save_image",
+    "save_image16",
     "save_mesh",
+    "save_normal_map",
     "save_rig",
     "save_take",
 ]

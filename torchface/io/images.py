@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError
 from torchface.io.files import read_file, write_file
+from torchface.io.png16 import encode_png16, from_steps, holds_png16, read_png16
 
 _PIXELS_ALWAYS = 4096 * 4096
 _PIXELS_PER_BYTE = 100
@@ -31,6 +32,11 @@ def load_image(path: str | Path) -> Tensor:
 def save_image(image: Tensor, path: str | Path) -> None:
     """Writes (3,H,W) in [0,1] as PNG."""
     write_file(path, encode_png(image))
+
+
+def save_image16(image: Tensor, path: str | Path) -> None:
+    """Writes (3,H,W) in [0,1] as PNG of 16 bits a channel."""
+    write_file(path, encode_png16(image))
 
 
 def decode_image(data: bytes, source: str) -> Tensor:
@@ -52,6 +58,9 @@ def decode_image(data: bytes, source: str) -> Tensor:
                         f"{source}: found an image of {image.width} x {image.height} pixels in {len(data)} bytes, "
                         f"expected at most {max(_PIXELS_ALWAYS, _PIXELS_PER_BYTE * len(data))} pixels"
                     )
+                if holds_png16(image):
+                    with Image.open(io.BytesIO(data), formats=_FORMATS) as again:
+                        return from_steps(read_png16(image, again))
                 array = np.array(image.convert("RGB"))
     # Pillow's decoders let most kinds of errors escape on broken bytes; whatever they are, it is no image.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, KeyError, EOFError, ArithmeticError) as error:

@@ -189,8 +189,8 @@ def _automatic(mesh: Mesh, target: _Target, scale: bool) -> ScanAlignment:
     if best.near < _FOUND or best.overlap < _LEAST_OVERLAP:
         raise AlignmentError(
             f"scan: no pose found by itself that lays it on the mesh (best: {best.near:.0%} of the overlap within "
-            f"{_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise seen from "
-            "outside, or at least three correspondences"
+            f"{_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise seen "
+            "from outside, or at least three correspondences"
         )
     return _result(_iterate(samples, target, best, 40, scale) if scale else best)
 

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.errors import ShapeError, TopologyError
 from torchface.geometry.camera import Camera
 from torchface.geometry.operators import vertex_normals
+from torchface.geometry.tangent_space import from_tangent_space, tangent_space
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 
@@ -50,6 +52,7 @@ def render(
     lighting: Lighting = DEFAULT_LIGHTING,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     samples: int = 2,
+    normal_map: Tensor | None = None,
 ) -> Tensor:
     """A picture of a mesh.
 
@@ -60,9 +63,14 @@ def render(
         lighting: which lights.
         background: colour where no ray hits.
         samples: rays a pixel side.
+        normal_map: unit vectors in the mesh's tangent space, (3,h,w); see ``blend_normal_maps`` for several.
 
     Returns:
         An image (3,H,W) in [0,1], float32.
+
+    Raises:
+        ShapeError: the normal map is not (3,h,w).
+        TopologyError: a normal map is given and the mesh has no texture coordinates.
     """
     origins, directions = camera.rays(samples)
     height, width = directions.shape[:2]
@@ -74,12 +82,17 @@ def render(
     if seen.any():
         triangle, barycentric = hits.triangle[seen], hits.barycentric[seen]
         points = origins[seen] + hits.distance[seen, None] * directions[seen]
-        normals = vertex_normals(mesh.vertices.double(), mesh.faces)[mesh.faces[triangle]]
-        normals = torch.nn.functional.normalize((normals * barycentric[..., None]).sum(1), dim=-1)
+        smooth = vertex_normals(mesh.vertices.double(), mesh.faces)
+        normals = (smooth[mesh.faces[triangle]] * barycentric[..., None]).sum(1)
+        normals = torch.nn.functional.normalize(normals, dim=-1)
+        detailed = normals
+        if normal_map is not None:
+            detailed = _mapped_normals(mesh, smooth, normal_map, triangle, barycentric)
         # A surface seen from behind (inside of the mouth, a cut border) is lit as if it faced the viewer.
-        normals = torch.where((normals * directions[seen]).sum(-1, keepdim=True) > 0, -normals, normals)
+        behind = (normals * directions[seen]).sum(-1, keepdim=True) > 0
+        normals, detailed = torch.where(behind, -normals, normals), torch.where(behind, -detailed, detailed)
         albedo = _albedo(mesh, colors, triangle, barycentric)
-        image[seen] = _shade(caster, camera, lighting, points, normals, directions[seen], albedo)
+        image[seen] = _shade(caster, camera, lighting, points, normals, detailed, directions[seen], albedo)
     image = image.reshape(height // samples, samples, width // samples, samples, 3).mean((1, 3))
     return image.permute(2, 0, 1).clamp(0, 1).contiguous()
 
@@ -94,6 +107,16 @@ def _albedo(mesh: Mesh, colors: Tensor | None, triangle: Tensor, barycentric: Te
     return (colors[mesh.faces[triangle]].float() * barycentric[..., None]).sum(1)
 
 
+def _mapped_normals(mesh: Mesh, smooth: Tensor, normal_map: Tensor, triangle: Tensor, barycentric: Tensor) -> Tensor:
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("render: found a normal map for a mesh without texture coordinates, expected uvs")
+    if normal_map.ndim != 3 or normal_map.shape[0] != 3:
+        raise ShapeError(f"normal_map: found {tuple(normal_map.shape)}, expected (3,h,w)")
+    space = tangent_space(mesh.vertices.double(), mesh.faces, mesh.uvs.double(), mesh.uv_faces, smooth)
+    uv = (mesh.uvs[mesh.uv_faces[triangle]].float() * barycentric[..., None]).sum(1)
+    return from_tangent_space(space.frames(triangle, barycentric), sample_texture(normal_map, uv).double())
+
+
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     """Colours (R,3) of an image (3,H,W) at texture coordinates (R,2), bilinear, clamped at the border."""
     grid = torch.stack([uv[:, 0] * 2 - 1, 1 - uv[:, 1] * 2], dim=-1).float()
@@ -104,12 +127,20 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
 
 
 def _shade(
-    caster: RayCaster, camera: Camera, lighting: Lighting, points: Tensor, normals: Tensor, ways: Tensor, albedo: Tensor
+    caster: RayCaster,
+    camera: Camera,
+    lighting: Lighting,
+    points: Tensor,
+    smooth: Tensor,
+    normals: Tensor,
+    ways: Tensor,
+    albedo: Tensor,
 ) -> Tensor:
     right, down, forward = camera.rotation.double()
     light = torch.full((len(points),), lighting.ambient, dtype=torch.float64)
     if lighting.occlusion_rays:
-        light = light * _openness(caster, points, normals, lighting)
+        # About the smooth normal: half the rays about one that a map has tilted would start into the skin.
+        light = light * _openness(caster, points, smooth, lighting)
     highlight = torch.zeros_like(light)
     for (x, y, z), strength in lighting.lights:
         toward = torch.nn.functional.normalize(x * right - y * down - z * forward, dim=0)

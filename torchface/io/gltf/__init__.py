@@ -1,6 +1,15 @@
 """glTF 2.0 with morph targets, read from whoever wrote it and written for whoever reads it."""
 
+from torchface.io.gltf.detail import load_detail_maps
 from torchface.io.gltf.reading import read_gltf_mesh, read_gltf_rig
 from torchface.io.gltf.writing import ShapeMatch, save_animation, save_gltf_mesh, save_rig
 
-__all__ = ["ShapeMatch", "read_gltf_mesh", "read_gltf_rig", "save_animation", "save_gltf_mesh", "save_rig"]
+__all__ = [
+    "ShapeMatch",
+    "load_detail_maps",
+    "read_gltf_mesh",
+    "read_gltf_rig",
+    "save_animation",
+    "save_gltf_mesh",
+    "save_rig",
+]

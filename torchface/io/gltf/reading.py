@@ -91,7 +91,7 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     for piece in pieces:
         deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
         first += len(piece.vertices)
-    return _join(pieces, None if picture is None else _texture(document, picture)), deltas, names
+    return _join(pieces, None if picture is None else read_texture(document, picture)), deltas, names
 
 
 def _piece(document: Document, instance: Instance, part: Part, scale: float) -> _Piece:
@@ -156,7 +156,7 @@ def _starts(counts: list[int]) -> list[int]:
     return [0, *accumulate(counts[:-1])]
 
 
-def _texture(document: Document, index: int) -> Tensor | None:
+def read_texture(document: Document, index: int) -> Tensor | None:
     """The picture of a texture; none where only an extension has it."""
     place = f"textures[{index}]"
     texture = document.item("textures", index, place)
