@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +174,16 @@ def test_a_mutated_file_is_read_or_refused(tmp_path: Path) -> None:
     save_image16(torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0)), tmp_path / "good.png")
     report = check_reader(load_image, [tmp_path / "good.png"], ".png")
     assert report.refused > 0
+
+
+def test_a_mirrored_texture_splits_the_vertices_between_its_halves_and_they_come_back_as_one(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    mesh = rig.neutral
+    across = (mesh.vertices[:, 0].abs() / 60, mesh.vertices[:, 1] / 100 + 0.5)  # both halves show the same picture
+    folded = replace(mesh, uvs=torch.stack(across, dim=1), uv_faces=mesh.faces)
+    save_rig(BlendshapeRig(folded, rig.deltas, rig.names), tmp_path / "a.glb", detail())
+    again = load_rig(tmp_path / "a.glb").neutral
+    assert torch.equal(again.faces, mesh.faces)
+    torch.testing.assert_close(again.vertices, mesh.vertices, atol=1e-4, rtol=0)
+    assert again.uvs is not None
+    torch.testing.assert_close(again.uvs[again.uv_faces], folded.uvs[folded.uv_faces])

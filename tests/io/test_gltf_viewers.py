@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ import pytest
 import torch
 from rig_samples import quad_sheet, sheet_rig, sheet_take
 
+from torchface.geometry.normal_maps import DetailMaps
+from torchface.geometry.operators import vertex_normals
+from torchface.geometry.tangent_space import tangent_space
 from torchface.io import load_rig, save_animation, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -85,6 +89,48 @@ def test_an_animation_is_valid_and_plays_in_three(node: str, tmp_path: Path) -> 
     assert seen["animations"] == [{"duration": pytest.approx(1.0), "tracks": 1}]
     middle = take.weights.values[30, :, 0]
     assert seen["halfway"] == pytest.approx([float(middle[2]), float(middle[0]), 0.0], abs=1e-4)
+
+
+def test_wrinkle_maps_are_valid_and_three_shows_the_neutrals(node: str, tmp_path: Path) -> None:
+    rig = sheet_rig()
+    maps = torch.nn.functional.normalize(torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0)), dim=1)
+    save_rig(rig, tmp_path / "rig.glb", DetailMaps(rig.names[:2], maps[:2], maps[2]))
+    assert_valid(node, tmp_path / "rig.glb")
+    seen = run(node, "load.mjs", tmp_path / "rig.glb")["meshes"][0]
+    assert seen["normalMapped"]
+    assert "tangent" in seen["attributes"]
+    assert [entry["shape"] for entry in seen["extras"]["wrinkleMaps"]] == list(rig.names[:2])
+
+
+def assert_tangents_are_mikktspaces(node: str, folder: Path, mesh: Mesh) -> None:
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    points, uvs = mesh.vertices.double(), mesh.uvs.double()
+    normals = vertex_normals(points, mesh.faces)
+    space = tangent_space(points, mesh.faces, uvs, mesh.uv_faces, normals)
+    upper_left = torch.stack([uvs[:, 0], 1 - uvs[:, 1]], dim=1)
+    rows = {"positions": points[mesh.faces], "normals": normals[mesh.faces], "uvs": upper_left[mesh.uv_faces]}
+    (folder / "corners.json").write_text(json.dumps({name: row.flatten().tolist() for name, row in rows.items()}))
+    expected = torch.tensor(run(node, "tangents.mjs", folder / "corners.json")).view(-1, 3, 4).double()
+    cosine = (space.tangents[space.tangent_faces] * expected[..., :3]).sum(-1)
+    assert float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max()) < 0.1
+    # Its sign is about texture coordinates whose origin is at the upper left, glTF's the other way.
+    assert torch.equal(space.signs[space.tangent_faces], -expected[..., 3])
+
+
+def test_tangents_are_the_ones_that_viewers_compute(node: str, tmp_path: Path) -> None:
+    mesh = quad_sheet()
+    bent = mesh.with_vertices(
+        mesh.vertices + torch.randn(mesh.vertices.shape, generator=torch.Generator().manual_seed(0))
+    )
+    assert_tangents_are_mikktspaces(node, tmp_path, bent)
+    assert mesh.uvs is not None
+    assert_tangents_are_mikktspaces(node, tmp_path, replace(bent, uvs=(mesh.uvs - 0.5).abs() + 0.1 * mesh.uvs))
+
+
+@pytest.mark.real
+def test_tangents_of_a_real_face_are_the_ones_that_viewers_compute(node: str, tmp_path: Path, ict_folder: Path) -> None:
+    assert_tangents_are_mikktspaces(node, tmp_path, load_rig(ict_folder, part="face").neutral)
 
 
 @pytest.mark.real

@@ -35,6 +35,8 @@ gltf.scene.traverse((object) => {
     indices: Array.from(object.geometry.index.array),
     positions,
     textured: object.material.map !== null,
+    normalMapped: object.material.normalMap !== null,
+    extras: object.userData.torchface ?? object.geometry.userData.torchface ?? null,
   });
 });
 

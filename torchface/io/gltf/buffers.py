@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _COMPONENT = {"<u2": 5123, "<u4": 5125, "<f4": 5126}
-_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 class BufferWriter:

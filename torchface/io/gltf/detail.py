@@ -1,8 +1,8 @@
 """Wrinkle maps in a ``.glb``: the neutral's as the material's normal texture, where every viewer shows it; the shapes'
 as further textures, which ``mesh.extras.torchface.wrinkleMaps`` lists as ``{"shape": name, "texture": index}``.
 
-Viewers compute tangents themselves by MikkTSpace's rule from the file's normals, which are the ones that maps are baked
-about. Pictures have 8 bits a channel, as viewers show them.
+With the neutral's map come the tangents of ``torchface.geometry.tangent_space``, which are MikkTSpace's; the file's
+normals are the ones that maps are baked about. Pictures have 8 bits a channel, as viewers show them.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, TopologyError
 from torchface.geometry.normal_maps import DetailMaps, decode_normals, encode_normals
+from torchface.geometry.operators import vertex_normals
+from torchface.geometry.tangent_space import tangent_space
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.reading import read_texture
@@ -50,6 +54,21 @@ def write_detail(
         for name, one in zip(detail.names, detail.maps, strict=True)
     ]
     root["meshes"][0]["extras"]["torchface"][_LIST] = listed
+
+
+def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
+    """glTF's tangents at each triangle's corners, (F,3,4); the last number is the bitangent's sign.
+
+    Raises:
+        TopologyError: the mesh has no texture coordinates.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+    points, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    normals = vertex_normals(points, faces)
+    space = tangent_space(points, faces, mesh.uvs.detach().cpu().double(), mesh.uv_faces.cpu(), normals)
+    rows = torch.cat([space.tangents, space.signs[:, None]], dim=1)[space.tangent_faces]
+    return rows.float().numpy()
 
 
 def _add_texture(normals: Tensor, name: str, root: dict[str, Any], buffers: BufferWriter) -> int:

@@ -17,7 +17,7 @@ from torchface.geometry.operators import vertex_normals
 from torchface.io.files import millimetres_per
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.container import write_document
-from torchface.io.gltf.detail import write_detail
+from torchface.io.gltf.detail import corner_tangents, write_detail
 from torchface.io.gltf.extras import write_extras
 from torchface.io.gltf.primitives import decode_srgb
 from torchface.io.images import encode_png
@@ -127,9 +127,15 @@ def _write(
     if len(mesh.faces) == 0:
         raise TopologyError(f"{path}: the mesh has no triangle; glTF needs one")
     buffers = BufferWriter()
-    vertex_of, uv_of, triangles = _split(mesh)
+    tangents = None if detail is None or detail.neutral is None else corner_tangents(mesh)
+    vertex_of, uv_of, triangles = _split(mesh, None if tangents is None else tangents[..., 3] < 0)
+    attributes = _attributes(mesh, vertex_of, uv_of, buffers)
+    if tangents is not None:
+        rows = np.tile(np.array([1, 0, 0, 1], np.float32), (len(vertex_of), 1))
+        rows[triangles] = tangents
+        attributes["TANGENT"] = buffers.vertices(rows)
     primitive: dict[str, Any] = {
-        "attributes": _attributes(mesh, vertex_of, uv_of, buffers),
+        "attributes": attributes,
         "indices": buffers.triangles(triangles),
         "material": 0,
     }
@@ -155,8 +161,14 @@ def _write(
     write_document(path, root, buffers.data)
 
 
-def _split(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64] | None, NDArray[np.int64]]:
+def _split(
+    mesh: Mesh, mirrored: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64] | None, NDArray[np.int64]]:
     """One row for each pair of vertex and texture coordinate that occurs.
+
+    Args:
+        mesh: the mesh.
+        mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
 
     Returns:
         The vertex (C,) and row of ``uvs`` (C,) of each, in the order of the coordinates, then vertices that no face
@@ -166,8 +178,10 @@ def _split(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64] | None, NDA
     faces = mesh.faces.cpu().numpy()
     if mesh.uvs is None or mesh.uv_faces is None:
         return np.arange(count), None, faces
-    pairs, triangles = np.unique(mesh.uv_faces.cpu().numpy() * count + faces, return_inverse=True)
-    vertex_of, uv_of = pairs % count, pairs // count
+    keys = mesh.uv_faces.cpu().numpy() * count + faces
+    sided = keys * 2 if mirrored is None else keys * 2 + mirrored
+    pairs, triangles = np.unique(sided, return_inverse=True)
+    vertex_of, uv_of = pairs // 2 % count, pairs // 2 // count
     loose = np.setdiff1d(np.arange(count), vertex_of)
     return np.append(vertex_of, loose), np.append(uv_of, np.zeros_like(loose)), triangles.reshape(-1, 3)
 
