@@ -15,7 +15,8 @@ def view(
     port: int = 8080,
     quiet: bool = False,
 ) -> None:
-    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, saving edited weights.
+    """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, wrinkle maps,
+    saving edited weights.
 
     The page is at 127.0.0.1 and no other machine can open it. Needs the extra: pip install torchface[viewer].
 
@@ -27,7 +28,7 @@ def view(
         port: The first port to try.
         quiet: Show no progress.
     """
-    from torchface.io import load_rig, load_take
+    from torchface.io import load_detail_maps, load_rig, load_take
     from torchface.viz.browser.page import import_viser
     from torchface.viz.browser.viewer import RigViewer
 
@@ -37,12 +38,13 @@ def view(
     with steps(quiet) as step:
         step("reading the rig")
         loaded = load_rig(rig, part=part)
+        detail = load_detail_maps(rig) if rig.suffix.lower() == ".glb" else None
         take = None
         if weights is not None:
             step("reading the take")
             take = load_take(weights)
         step("opening the page")
-        viewer = RigViewer(loaded, take, out, rig.stem, port)
+        viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
     console.print("Open this page; Ctrl+C ends.")
     print(viewer.url, flush=True)
     try:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.io import load_mesh
+from torchface.io import load_detail_maps, load_mesh
 from torchface.mesh import Annotations, Mesh
 from torchface.viz.browser.listing import pick_list, shape_list
 from torchface.viz.browser.parts import split_parts, triangle_texture
@@ -59,7 +59,7 @@ def test_the_skin_is_a_glb_that_another_reader_opens(two_balls: Mesh, tmp_path) 
     mesh = painted(two_balls)
     moved = mesh.vertices + torch.tensor([0.0, 5.0, 0.0])
     path = tmp_path / "skin.glb"
-    path.write_bytes(Skin.of(mesh).glb(moved))
+    path.write_bytes(Skin(mesh).glb(moved))
     found = trimesh.load(path, force="mesh", process=False)
     corners = torch.tensor(found.vertices[found.faces], dtype=torch.float32)
     torch.testing.assert_close(corners, moved[mesh.faces])
@@ -69,14 +69,26 @@ def test_the_skin_is_a_glb_that_another_reader_opens(two_balls: Mesh, tmp_path) 
     torch.testing.assert_close(uvs, mesh.uvs[mesh.uv_faces])
 
 
-def test_vertex_colours_make_a_skin_and_clay_makes_none(two_balls: Mesh, tmp_path) -> None:
-    assert Skin.of(two_balls) is None
+def test_vertex_colours_come_back_from_the_skin(two_balls: Mesh, tmp_path) -> None:
     colors = torch.rand(len(two_balls.vertices), 3, generator=torch.Generator().manual_seed(0))
     path = tmp_path / "skin.glb"
-    path.write_bytes(Skin.of(replace(two_balls, colors=colors)).glb(two_balls.vertices))
+    path.write_bytes(Skin(replace(two_balls, colors=colors)).glb(two_balls.vertices))
     found = load_mesh(path, unit="mm")
     corners = two_balls.faces[:, :1]
     torch.testing.assert_close(found.colors[found.faces[:, :1]], colors[corners], atol=1e-5, rtol=0)
+
+
+def test_wrinkles_are_the_skins_normal_texture(two_balls: Mesh, tmp_path) -> None:
+    mesh = painted(two_balls)
+    direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.4, 1.0]), dim=0)
+    path = tmp_path / "skin.glb"
+    path.write_bytes(Skin(mesh).glb(mesh.vertices, direction[:, None, None].expand(3, 32, 32)))
+    found = load_detail_maps(path)
+    assert found.names == ()
+    assert found.neutral.shape == (3, 32, 32)
+    assert (found.neutral - direction[:, None, None]).abs().max() < 0.01  # eight bits
+    path.write_bytes(Skin(mesh).glb(mesh.vertices))
+    assert load_detail_maps(path) is None
 
 
 def test_names_from_files_cannot_become_markup() -> None:

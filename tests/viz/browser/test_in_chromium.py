@@ -3,6 +3,7 @@
 import io
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -143,6 +144,31 @@ def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) ->
     expected = viewer.rig(viewer.editor.pose[None])[0, :2562]
     until(lambda: (shown(chromium, "/head/part0")[1] - expected).abs().max() < 1e-4)
     until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.editor.frame))
+
+
+def test_the_skin_comes_off_in_motion_and_back_on_at_rest(chromium: Any, ball_rig: BlendshapeRig) -> None:
+    mesh = ball_rig.neutral
+    colors = (mesh.vertices - mesh.vertices.amin(0)) / (mesh.vertices.amax(0) - mesh.vertices.amin(0))
+    rig = BlendshapeRig(replace(mesh, colors=colors), ball_rig.deltas, ball_rig.names)
+    opened = RigViewer(rig, port=0)
+    try:
+        chromium.get(opened.url)
+        visible = "return (n => n ? n.visible : null)(window.__viserMutable?.nodeRefFromName['/head/skin'])"
+        until(lambda: chromium.execute_script(visible) is True)
+
+        def dragged_bare() -> bool:
+            opened.set_weight("jawOpen", time.monotonic() % 1.0)
+            return chromium.execute_script(visible) is False
+
+        until(dragged_bare)
+        expected = opened.rig(opened.editor.pose[None])[0]
+        until(lambda: chromium.execute_script(visible) is True)
+        until(lambda: (shown(chromium, "/head/skin")[1] - expected).abs().max() < 1e-3)
+        opened.head.wear_skin(False)
+        until(lambda: chromium.execute_script(visible) is False)
+    finally:
+        chromium.get("about:blank")
+        opened.stop()
 
 
 @pytest.fixture

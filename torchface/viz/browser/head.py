@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,15 +33,23 @@ class HeadOnPage:
         mesh: what to show, millimetres.
         name: of its nodes.
         offset: where to, millimetres.
+        wrinkles: gives the normal map (3,H,W) of the moment, or nothing; asked when the head has come to rest.
     """
 
     def __init__(
-        self, server: viser.ViserServer, mesh: Mesh, name: str, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self,
+        server: viser.ViserServer,
+        mesh: Mesh,
+        name: str,
+        offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        wrinkles: Callable[[], Tensor | None] | None = None,
     ) -> None:
         self._server = server
         self._parts = split_parts(mesh)
         self._vertices = mesh.vertices.detach().cpu().float()
-        self._skin = Skin.of(mesh)
+        self._wrinkles = wrinkles if mesh.uvs is not None else None
+        worn = (mesh.texture is not None and mesh.uvs is not None) or mesh.colors is not None
+        self._skin = Skin(mesh) if worn or self._wrinkles is not None else None
         self._skin_shown = False
         self._skin_enabled = True
         place = SCALE * np.array(offset)
@@ -64,7 +73,7 @@ class HeadOnPage:
             held = place + SCALE * (1 - _SKIN_SCALE) * centre.double().numpy()
             self._skin_node = server.scene.add_glb(
                 f"/{name}/skin",
-                self._skin.glb(self._vertices),
+                self._glb(self._skin),
                 scale=SCALE * _SKIN_SCALE,  # a hair larger about its centre, so that it covers the pieces
                 position=held,
                 cast_shadow=False,
@@ -79,7 +88,7 @@ class HeadOnPage:
 
     @property
     def has_skin(self) -> bool:
-        """Whether the mesh brought a texture or vertex colours."""
+        """Whether the mesh brought a texture, vertex colours or wrinkle maps."""
         return self._skin is not None
 
     @property
@@ -111,9 +120,16 @@ class HeadOnPage:
         if self.settled or self._skin_node is None or self._skin is None:
             return
         with self._server.atomic():
-            self._skin_node.glb_data = self._skin.glb(self._vertices)
+            self._skin_node.glb_data = self._glb(self._skin)
             self._skin_node.visible = True
         self._skin_shown = True
+
+    def _glb(self, skin: Skin) -> bytes:
+        return skin.glb(self._vertices, None if self._wrinkles is None else self._wrinkles())
+
+    def refresh_skin(self) -> None:
+        """Takes the skin off, so that the next :meth:`settle` puts a new one on."""
+        self._skin_shown = False
 
     def wear_skin(self, enabled: bool) -> None:
         """Allows or forbids the skin."""

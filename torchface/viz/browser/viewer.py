@@ -9,8 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.geometry.normal_maps import DetailMaps
 from torchface.io import save_take
+from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.viz.browser.editing import WeightEditor
@@ -39,6 +43,7 @@ class RigViewer:
         rig: what moves.
         take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
         out: where *Save* writes; a path that the page shows and cannot change.
+        detail: wrinkle maps of the rig's shapes, shown while the head rests.
         label: heads the panel.
         port: the first to try, 0 for any.
 
@@ -53,6 +58,7 @@ class RigViewer:
         rig: BlendshapeRig,
         take: Take | None = None,
         out: str | Path = "edited_weights.csv",
+        detail: DetailMaps | None = None,
         label: str = "torchface",
         port: int = 8080,
     ) -> None:
@@ -67,7 +73,8 @@ class RigViewer:
         self._moved_at = self._panel_at = float("-inf")
         self._panel_due = False
         self.server = start_server(label, port)
-        self.head = HeadOnPage(self.server, self._posed(), "head")
+        self._detail, self._wrinkled = detail, detail is not None
+        self.head = HeadOnPage(self.server, self._posed(), "head", wrinkles=self._wrinkles if detail else None)
         frame_camera(self.server, rig.neutral)
         if self.take is not None:
             self._add_timeline()
@@ -115,11 +122,20 @@ class RigViewer:
             save_take(self.editor.to_take(self.take), self.out)
         return self.out
 
-    def _posed(self) -> Any:
+    def _posed(self) -> Mesh:
         return self.rig.neutral.with_vertices(self._vertices())
 
-    def _vertices(self) -> Any:
+    def _vertices(self) -> Tensor:
         return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
+
+    def _wrinkles(self) -> Tensor | None:
+        if self._detail is None or not self._wrinkled:
+            return None
+        return self._detail.blend(self.rig.names, self.editor.pose)
+
+    def _show_wrinkles(self, shown: bool) -> None:
+        self._wrinkled = bool(shown)
+        self.head.refresh_skin()
 
     def _show(self) -> int:
         sent = self.head.show(self._vertices())
@@ -179,14 +195,13 @@ class RigViewer:
             if self.head.has_skin:
                 skin = gui.add_checkbox("Texture at rest", True, hint="In motion the head shows in plain colours")
                 self._shared(skin, self.head.wear_skin)
-            actions: dict[str, Callable[[], None]] = {"Neutral": self.editor.rest, "Reset": self.editor.reset}
+            if self._detail is not None:
+                self._shared(gui.add_checkbox("Wrinkles", True), self._show_wrinkles)
+            actions: dict[str, Callable[[], None]] = {"Reset": self.editor.reset}
             if self.take is not None:
-                actions = {
-                    "Neutral": self.editor.rest,
-                    "Reset frame": self.editor.reset_frame,
-                    "Reset all": self.editor.reset,
-                }
-            buttons = gui.add_button_group("Pose", tuple(actions))
+                actions = {"Neutral": self.editor.rest, "Reset frame": self.editor.reset_frame}
+                actions["Reset all"] = self.editor.reset
+            buttons: Any = gui.add_button_group("Pose", tuple(actions))
             buttons.on_click(lambda event: self._edit(actions[event.target.value]))
             save = gui.add_button("Save weights", icon=icon("DEVICE_FLOPPY"), hint=f"Writes {self.out}")
             save.on_click(self._save_clicked)
