@@ -30,8 +30,8 @@ class SparseCholesky:
     Source: CHOLMOD (Chen, Davis, Hager, Rajamanickam 2008), by way of cholespy.
 
     Example:
-        >>> solver = SparseCholesky(sparse.diags_array([2.0, 4.0]))
-        >>> solver.solve(np.array([2.0, 2.0])).tolist()
+        >>> solver = SparseCholesky(sparse.diags_array([4.0, 16.0]))
+        >>> solver.solve(np.array([4.0, 8.0])).tolist()
         [1.0, 0.5]
     """
 
