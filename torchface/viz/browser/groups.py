@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from torchface.shape_names import mirror
@@ -37,3 +38,15 @@ def grouped(names: Sequence[str]) -> dict[str, list[int]]:
         order.setdefault(twin)
     members = {group: [row for row in order if group_of(names[row]) == group] for group in GROUPS}
     return {group: rows for group, rows in members.items() if rows}
+
+
+def label_of(name: str) -> str:
+    """A shape's name as it fits beside its slider, inside its group: without the group, sides as one letter.
+
+    Example:
+        >>> [label_of(name) for name in ("mouthLowerDownRight", "browInnerUp_L", "jawLeft", "jawOpen", "tongueOut")]
+        ['LowerDown R', 'InnerUp L', 'Left', 'Open', 'tongueOut']
+    """
+    prefix = next((prefix for prefix in _PREFIXES if name.lower().startswith(prefix)), "")
+    rest = name[len(prefix) :].lstrip("_") or name
+    return re.sub(r"(?<=.)(?:_|(?<=[a-z])(?=[LR]))(L|R)(?:eft|ight)?$", r" \1", rest)

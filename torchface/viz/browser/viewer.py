@@ -18,7 +18,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.viz.browser.editing import WeightEditor
-from torchface.viz.browser.groups import grouped
+from torchface.viz.browser.groups import grouped, label_of
 from torchface.viz.browser.head import HeadOnPage
 from torchface.viz.browser.inputs import SharedInput
 from torchface.viz.browser.listing import caption, shape_list
@@ -214,7 +214,7 @@ class RigViewer:
             with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS):
                 for row in rows:
                     name = self.rig.names[row]
-                    slider = gui.add_slider(name, low[row], high[row], 0.01, 0.0)
+                    slider = gui.add_slider(label_of(name), low[row], high[row], 0.01, 0.0, hint=name)
                     slider.precision = 3
                     sliders[name] = self._shared(slider, partial(self._set, name))
         return sliders

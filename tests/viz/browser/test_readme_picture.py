@@ -1,0 +1,60 @@
+"""Takes the picture of the viewer that the README shows:
+``TORCHFACE_PICTURES=docs/images pytest tests/viz/browser/test_readme_picture.py``
+"""
+
+import io
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
+from torchface.synthetic.performance import GESTURES, perform
+from torchface.viz.browser.viewer import RigViewer
+
+FOLDER = os.environ.get("TORCHFACE_PICTURES")
+_CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+
+
+def shoot(chromium: Any, rig: BlendshapeRig, path: Path) -> None:
+    """The viewer with a take loaded and a surprised smile dialled in, as a PNG."""
+    take = perform(600, torch.Generator().manual_seed(1))
+    viewer = RigViewer(rig, take, "performance_edited.csv", label="performer.glb", port=0)
+    try:
+        viewer.show_frame(240)
+        viewer.editor.rest()
+        dialled = {**GESTURES["smile"], "browInnerUp": 0.6, "jawOpen": 0.25}
+        weights = mapping(tuple(dialled), rig.names) @ torch.tensor(list(dialled.values()))
+        for row in weights.nonzero()[:, 0].tolist():
+            viewer.set_weight(rig.names[row], float(weights[row]))
+        chromium.set_window_size(1280, 900)
+        chromium.get(viewer.url)
+        drawn = "return Object.keys(window.__viserSceneTree?.getState() ?? {}).some(n => n.startsWith('/head/'))"
+        end = time.monotonic() + 60
+        while not chromium.execute_script(drawn) and time.monotonic() < end:
+            time.sleep(0.2)
+        time.sleep(6)  # the skin goes on at rest, and a software renderer takes its time
+        chromium.execute_script(_CLOSE)
+        time.sleep(2)
+        picture = Image.open(io.BytesIO(chromium.get_screenshot_as_png())).convert("RGB")
+    finally:
+        chromium.get("about:blank")
+        viewer.stop()
+    picture.save(path, optimize=True)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(FOLDER is None, reason="set TORCHFACE_PICTURES to the folder that the README's pictures lie in")
+def test_the_picture_is_small_enough_for_a_readme(chromium: Any) -> None:
+    from torchface.synthetic import performer
+
+    assert FOLDER is not None
+    path = Path(FOLDER) / "viewer.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shoot(chromium, performer(), path)
+    assert path.stat().st_size < 400_000
