@@ -16,8 +16,11 @@ from torchface.optim.box_problem import BoxProblem
 
 # Numbers in the matrices factored at once: 2 MB of float64 stay in a CPU's cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**18, "other": 2**25}
-_STEP_LENGTHS = 10
-# Added to the scaled diagonal (all ones) so that semidefinite blocks factor; raised a thousandfold where they do not.
+_STEP_LENGTHS, _BLOCKED_TRIES = 10, 8
+# Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in the directions
+# that only rounding fills, and the term fades as fast as the solution comes near.
+_DAMPING = 1e-5
+# The least of it, so that semidefinite blocks factor; raised a thousandfold where they do not.
 _RIDGE = 1e-13
 _RIDGE_TRIES = 5
 
@@ -41,7 +44,7 @@ def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, itera
             here = x[rows]
             gradient = part.gradient(here)
             residual = part.residual(here, gradient)
-            open_ = residual > part.rounding(here).clamp(min=tolerance)
+            open_ = part.unsolved(here, tolerance, residual)
             if not bool(open_.any()):
                 break
             if not bool(open_.all()):
@@ -55,48 +58,66 @@ def _step(problem: BoxProblem, x: Tensor, gradient: Tensor, residual: Tensor) ->
     # A variable closer to its bound than the residual counts as at it, else the search path could collapse.
     near = residual.clamp(max=1e-3)[:, None]
     held = ((x - problem.lower <= near) & (gradient > 0)) | ((problem.upper - x <= near) & (gradient < 0))
-    newton = solve_free(problem.H, problem.diagonal, ~held, -gradient)
+    damping = _DAMPING * residual.clamp(max=1)
+    newton = solve_free(problem.H, problem.diagonal, ~held, -gradient, damping)
     direction = torch.where(held, -gradient / problem.diagonal, newton)
-    # The full step is right nearly always; only the others pay for the search.
+    # The full step is right nearly always; only the others pay for more.
     full = problem.clip(x + direction)
     moved = full - x
-    # q(x + m) - q(x) = m'(g + Hm/2) without the cancellation of two objectives.
-    change = (moved * (gradient + 0.5 * problem.curvature(moved))).sum(-1)
     promised = (gradient * moved).sum(-1)
-    worse = change > 0.1 * promised
+    worse = problem.change(moved, gradient) > 0.1 * promised
     if bool(worse.any()):
-        full[worse] = _search(problem.rows(worse), x[worse], gradient[worse], direction[worse])
+        full[worse] = _careful_step(
+            problem.rows(worse), x[worse], gradient[worse], held[worse], near[worse], damping[worse]
+        )
     return full
 
 
-def _search(problem: BoxProblem, x: Tensor, gradient: Tensor, direction: Tensor) -> Tensor:
-    """The best of halved steps and of a diagonal step, each clipped to the box."""
+def _careful_step(
+    problem: BoxProblem, x: Tensor, gradient: Tensor, held: Tensor, near: Tensor, damping: Tensor
+) -> Tensor:
+    """A step that a bound at hand cannot stop: what the direction would push out is held too, and solved again."""
+    at_lower, at_upper = x - problem.lower <= near, problem.upper - x <= near
+    direction = solve_free(problem.H, problem.diagonal, ~held, -gradient, damping)
+    for _ in range(_BLOCKED_TRIES):
+        blocked = ~held & ((at_lower & (direction < 0)) | (at_upper & (direction > 0)))
+        some = blocked.any(-1)
+        if not bool(some.any()):
+            break
+        held = held | blocked
+        part = problem.rows(some)
+        direction[some] = solve_free(part.H, part.diagonal, ~held[some], -gradient[some], damping[some])
+    room = torch.where(direction < 0, x - problem.lower, problem.upper - x)
+    reach = torch.where(direction == 0, torch.inf, room / direction.abs()).amin(-1, keepdim=True).clamp(max=1)
+    direction = torch.where(held, -gradient / problem.diagonal, direction)
+    # The best of the way to the first bound, of halved steps bent along the box, and of a step that always descends.
+    trials = [x + reach * direction, *(x + 0.5**halvings * direction for halvings in range(_STEP_LENGTHS))]
     best = problem.clip(x - gradient / problem.diagonal / len(problem.lower))
-    moved = best - x
-    least = (moved * (gradient + 0.5 * problem.curvature(moved))).sum(-1)
-    for halvings in range(_STEP_LENGTHS):
-        trial = problem.clip(x + 0.5**halvings * direction)
-        moved = trial - x
-        change = (moved * (gradient + 0.5 * problem.curvature(moved))).sum(-1)
+    least = problem.change(best - x, gradient)
+    for trial in trials:
+        trial = problem.clip(trial)
+        change = problem.change(trial - x, gradient)
         better = change < least
         best = torch.where(better[:, None], trial, best)
         least = torch.where(better, change, least)
     return best
 
 
-def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor) -> Tensor:
-    r"""Solves :math:`H_{FF} x_F = b_F` with :math:`x = 0` elsewhere.
+def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping: Tensor | None = None) -> Tensor:
+    r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` with :math:`x = 0` elsewhere.
 
     Args:
         H: (N,N) or (B,N,N), positive semidefinite, float64.
         diagonal: the metric in which it is scaled, (N,) or (B,N).
         free: which variables take part, (B,N) bool.
         right: :math:`b`, (B,N).
+        damping: :math:`\delta`, (B,); none if absent.
     """
     scale = torch.where(free, diagonal.rsqrt(), 0.0)
     scaled = H * scale[:, :, None] * scale[:, None, :]
     entry = scaled.diagonal(dim1=-2, dim2=-1)
-    entry += torch.where(free, _RIDGE, 1.0)
+    ridged = _RIDGE if damping is None else damping[:, None].clamp(min=_RIDGE)
+    entry += torch.where(free, ridged, 1.0)
     right = (right * scale)[..., None]
     factor, info = torch.linalg.cholesky_ex(scaled)
     ridge = _RIDGE

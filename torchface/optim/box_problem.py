@@ -52,15 +52,24 @@ class BoxProblem:
         """:math:`\\tfrac12 x^\\top H x + f^\\top x`, (B,)."""
         return (x * (0.5 * self.curvature(x) + self.f)).sum(-1)
 
+    def change(self, moved: Tensor, gradient: Tensor) -> Tensor:
+        """What a move m from a point of gradient g adds to the objective, without the cancellation of two of them."""
+        return (moved * (gradient + 0.5 * self.curvature(moved))).sum(-1)
+
     def residual(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
         """:math:`\\max_i |x - clip(x - (Hx+f)/diag H)|_i / (1 + |x_i|)`, (B,); zero only at the optimum."""
         gradient = self.gradient(x) if gradient is None else gradient
         return ((x - self.clip(x - gradient / self.diagonal)).abs() / (1 + x.abs())).amax(-1)
 
-    def rounding(self, x: Tensor) -> Tensor:
-        """What rounding alone can leave of the residual at x, (B,)."""
+    def unsolved(self, x: Tensor, tolerance: float, residual: Tensor | None = None) -> Tensor:
+        """Where the residual exceeds both the tolerance and what rounding alone can leave of it, (B,) bool."""
+        residual = self.residual(x) if residual is None else residual
+        open_ = residual > tolerance
+        if not bool(open_.any()):
+            return open_
         sums = BoxProblem(self.H.abs(), self.f.abs(), self.lower, self.upper, self.diagonal).gradient(x.abs())
-        return 4 * torch.finfo(x.dtype).eps * (sums / self.diagonal / (1 + x.abs())).amax(-1)
+        rounding = 4 * torch.finfo(x.dtype).eps * (sums / self.diagonal / (1 + x.abs())).amax(-1)
+        return open_ & (residual > rounding)
 
 
 def metric(H: Tensor) -> Tensor:

@@ -11,10 +11,13 @@ from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 
-# Steps of splitting between looks at the residual; what is still open after the last goes to Newton steps.
-# Beyond six digits splitting takes longer than one factorisation a problem, so there Newton follows at once.
+# Steps of splitting between looks at the residual. A coarse solve ends in the first rounds nearly always; a fine one
+# needs more digits than splitting gives quickly, so Newton steps follow the first round at once. Either may need the
+# later rounds where H is singular or close to it: splitting brings such problems near enough for Newton steps.
 _ROUNDS_COARSE, _ROUNDS_FINE = (60, 40, 40), (60,)
+_ROUNDS_LATER = (100, 200, 400, 800, 1600)
 _COARSE = 1e-7
+_NEWTON_STEPS, _LAST_NEWTON_STEPS = 8, 100
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
@@ -122,19 +125,23 @@ def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None,
     rounds = _ROUNDS_COARSE if tolerance >= _COARSE else _ROUNDS_FINE
     state = start_splitting(problem, start)
     x = state.z.clone()
-    open_ = torch.arange(len(x), device=x.device)
+    rows = torch.arange(len(x), device=x.device)
     part = problem
-    for steps in (*rounds, None):
-        still = (part.residual(state.z) > tolerance).nonzero()[:, 0]
+    plan = [(0, 0), *((steps, 0) for steps in rounds[:-1]), (rounds[-1], _NEWTON_STEPS)]
+    plan += [(steps, _NEWTON_STEPS) for steps in _ROUNDS_LATER]
+    plan[-1] = (_ROUNDS_LATER[-1], _LAST_NEWTON_STEPS)
+    for steps, newton_steps in plan:
+        state = splitting_steps(part, factors, state, steps)
+        found = state.z
+        if newton_steps:
+            found = projected_newton(part, found, tolerance, newton_steps)
+        x[rows] = found
+        still = part.unsolved(found, tolerance).nonzero()[:, 0]
         if not len(still):
             return x
-        if len(still) < len(open_):
-            open_, part, state, factors = open_[still], part.rows(still), state.rows(still), factors.rows(still)
-        if steps is not None:
-            state = splitting_steps(part, factors, state, steps)
-            x[open_] = state.z
-    x[open_] = projected_newton(part, state.z, tolerance)
-    _check_bounded(part, x[open_])
+        if len(still) < len(rows):
+            rows, part, state, factors = rows[still], part.rows(still), state.rows(still), factors.rows(still)
+    _check_bounded(part, x[rows])
     return x
 
 
