@@ -183,11 +183,19 @@ class _Surface:
     caster: RayCaster
     faces: Tensor
     normals: Tensor
+    low: Tensor
+    high: Tensor
 
     @staticmethod
     def of(vertices: Tensor, faces: Tensor, alignment: Similarity) -> _Surface:
         moved = alignment.apply(vertices[None])[0]
-        return _Surface(RayCaster(moved, faces), faces, vertex_normals(moved, faces).float())
+        used = moved[faces.flatten().unique()]
+        normals = vertex_normals(moved, faces).float()
+        return _Surface(RayCaster(moved, faces), faces, normals, used.amin(0), used.amax(0))
+
+    def may_reach(self, points: Tensor, distance: float) -> Tensor:
+        """Whether points (R,3) are so near to the surface's bounding box that a ray of a length could hit, (R,)."""
+        return ((points >= self.low - distance) & (points <= self.high + distance)).all(-1)
 
     def hits(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (R,) and smooth unit normal (R,3), zero for a miss."""
@@ -206,16 +214,17 @@ def _cast_all(
     offsets = torch.full((count,), torch.inf)
     opposed = torch.zeros(())
     for start in range(0, count, _BATCH):  # batches bound the memory
-        piece = slice(start, start + _BATCH)
-        triangles, barycentric = texels.triangles[piece], texels.barycentric[piece]
-        points = interpolate(vertices, space.faces[triangles], barycentric)
-        frames = space.frames(triangles, barycentric)
+        piece = torch.arange(start, min(start + _BATCH, count))
+        points = interpolate(vertices, space.faces[texels.triangles[piece]], texels.barycentric[piece])
+        near = scan.may_reach(points, reach)
+        piece, points = piece[near], points[near]
+        frames = space.frames(texels.triangles[piece], texels.barycentric[piece])
         ways = torch.nn.functional.normalize(frames[..., 2], dim=-1)
         offset, hit_normals, back = _nearest_hits(points, ways, scan, reach, cosine)
         local = to_tangent_space(frames, hit_normals.double())
         good = torch.isfinite(offset) & (local[:, 2] > 0)
-        normals[piece][good] = local[good].float()
-        offsets[piece][good] = offset[good].float()
+        normals[piece[good]] = local[good].float()
+        offsets[piece[good]] = offset[good].float()
         opposed += back.sum()
     return normals, offsets, opposed / count
 
