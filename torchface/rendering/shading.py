@@ -37,7 +37,7 @@ class Lighting:
         ((0.30, 0.60, -0.75), 0.25),
     )
     ambient: float = 0.38
-    occlusion_rays: int = 24
+    occlusion_rays: int = 12
     occlusion_reach: float = 60.0
     gloss: float = 0.10
 

@@ -22,7 +22,7 @@ from torchface.take import Take, Track
 def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75.0) -> Attachment:
     """Markers spread over the skin that moves, denser where it moves more, as a make-up artist would set them.
 
-    The spots are vertices of the largest connected part that some shape moves by at least half a millimetre, that
+    The spots are vertices of the largest connected part that some shape moves by at least a millimetre, that
     face the viewer and that nothing hides. The next spot is always the one farthest from those set, distance
     weighted by the square root of how far the vertex moves; the result is deterministic.
 
@@ -43,7 +43,7 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
     faces = mesh.faces.cpu()
     amplitude = rig.deltas.double().norm(dim=-1).amax(0).cpu()
     part = components(faces, len(vertices))
-    allowed = (part == part[faces.flatten()].mode().values) & (amplitude > 0.5)
+    allowed = (part == part[faces.flatten()].mode().values) & (amplitude > 1.0)
     normals = vertex_normals(vertices, faces)
     allowed &= normals[:, 2] > math.cos(math.radians(visible_from))
     allowed &= ~RayCaster(vertices, faces).occluded(

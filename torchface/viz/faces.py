@@ -20,16 +20,14 @@ FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 
 def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
     """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh."""
-    points = mesh.vertices
-    room = 1.15
+    points, room, shift = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
-        points, room = mesh.vertices[mesh.annotations.landmarks], 1.75
+        # Landmarks end at the brows: leave room for the forehead, and turn about a point inside the head.
+        points, room, shift = mesh.vertices[mesh.annotations.landmarks], 1.5, (0.0, 0.12, -0.12)
     elif mesh.annotations is not None and "face" in mesh.annotations.regions:
         points, room = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
-    centre = (low + high) / 2
-    if room == 1.75:  # landmarks end at the brows: leave room for the forehead, and turn about the head's middle
-        centre = centre + torch.tensor([0.0, 0.12, -0.25]).to(centre) * float(high[1] - low[1])
+    centre = (low + high) / 2 + torch.tensor(shift).to(low) * float(high[1] - low[1])
     span = room * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) * height / width))
     return look_at(centre, yaw, pitch, span=span, width=width, height=height)
 

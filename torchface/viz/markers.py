@@ -23,6 +23,8 @@ def marker_views(markers: Tensor, on_mesh: Tensor, title: str = "") -> Tensor:
         axes.scatter(*on_mesh[:, columns].T, marker="x", s=22, color="#1f5fa8", label="mesh", linewidths=1)
         axes.scatter(*markers[seen][:, columns].T, marker="+", s=28, color="#c8321e", label="marker", linewidths=1)
         axes.set(title=name, xlabel="mm", aspect="equal")
-    axes.legend(loc="upper right", frameon=False)
+        if name == "side":  # the face looks to the left, as in a profile from the viewer's right
+            axes.invert_xaxis()
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center", frameon=False)
     figure.suptitle(f"{title} mean distance {float(error.mean()):.2f} mm, {int((~seen).sum())} not seen".strip())
     return from_figure(figure)
