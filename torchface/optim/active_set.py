@@ -17,7 +17,7 @@ from torchface.optim.box_problem import BoxProblem
 # Numbers in the matrices factored at once: 2 MB of float64 stay in a CPU's cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**18, "other": 2**25}
 _STEP_LENGTHS, _BLOCKED_TRIES = 10, 8
-# Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in the directions
+# Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in directions
 # that only rounding fills, and the term fades as fast as the solution comes near.
 _DAMPING = 1e-5
 # The least of it, so that semidefinite blocks factor; raised a thousandfold where they do not.

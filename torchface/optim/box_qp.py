@@ -18,6 +18,8 @@ _ROUNDS_COARSE, _ROUNDS_FINE = (60, 40, 40), (60,)
 _ROUNDS_LATER = (100, 200, 400, 800, 1600)
 _COARSE = 1e-7
 _NEWTON_STEPS, _LAST_NEWTON_STEPS = 8, 100
+# A solution this many times farther than each variable alone would go has no bound to stop it.
+_RUN_AWAY = 1e9
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
@@ -138,10 +140,10 @@ def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None,
         x[rows] = found
         still = part.unsolved(found, tolerance).nonzero()[:, 0]
         if not len(still):
-            return x
+            break
         if len(still) < len(rows):
             rows, part, state, factors = rows[still], part.rows(still), state.rows(still), factors.rows(still)
-    _check_bounded(part, x[rows])
+    _check_bounded(problem, x)
     return x
 
 
@@ -211,7 +213,8 @@ def _check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
 def _check_bounded(problem: BoxProblem, x: Tensor) -> None:
     if torch.isfinite(problem.lower).all() and torch.isfinite(problem.upper).all():
         return
-    lost = (problem.residual(x) > 1e-3) | (x.abs().amax(-1) > 1e12)
+    scale = 1 + (problem.f / problem.diagonal).abs().amax(-1)
+    lost = x.abs().amax(-1) > _RUN_AWAY * scale
     if lost.any():
         raise ValueRangeError(
             f"box_qp: the objective of {int(lost.sum())} problems has no minimum: H is singular, bounds infinite"

@@ -106,7 +106,7 @@ def observability(solver: MarkerSolver, noise: float = 0.1) -> Observability:
     confusions = []
     for row in reversed(range(int((moves >= noise).sum()), shapes)):
         confusion = _confusion(directions[row], float(moves[row]), solver.names)
-        if len(confusion.names) > 1:
+        if len(confusion.names) > 1 or confusion.names[0] not in unseen:
             confusions.append(confusion)
     condition = float(values[0] / values[-1]) if rank == shapes else float("inf")
     return Observability(

@@ -1,0 +1,83 @@
+"""The pieces of the exact end: masked solves, Newton steps, the fixed point of splitting."""
+
+from __future__ import annotations
+
+import torch
+
+from torchface.optim.active_set import projected_newton, solve_free
+from torchface.optim.box_problem import BoxProblem, metric
+from torchface.optim.splitting import prepare_splitting, splitting_steps, start_splitting
+
+
+def problem(variables: int = 12, problems: int = 30, seed: int = 0) -> BoxProblem:
+    generator = torch.Generator().manual_seed(seed)
+    A = torch.randn(2 * variables, variables, generator=generator, dtype=torch.float64)
+    f = 5 * torch.randn(problems, variables, generator=generator, dtype=torch.float64)
+    H = (
+        A.T
+        @ A
+        * torch.logspace(-2, 2, variables, dtype=torch.float64)
+        .sqrt()
+        .outer(torch.logspace(-2, 2, variables, dtype=torch.float64).sqrt())
+    )
+    zeros, ones = f.new_zeros(variables), f.new_ones(variables)
+    return BoxProblem.of(H, f, zeros, ones)
+
+
+def test_a_masked_solve_is_the_solve_of_the_block() -> None:
+    given = problem()
+    free = torch.rand(30, 12, generator=torch.Generator().manual_seed(1)) < 0.6
+    solved = solve_free(given.H, given.diagonal, free, given.f)
+    for row in range(30):
+        ids = free[row].nonzero()[:, 0]
+        block = torch.linalg.solve(given.H[ids][:, ids], given.f[row, ids])
+        torch.testing.assert_close(solved[row, ids], block, rtol=1e-8, atol=1e-10)
+        assert (solved[row][~free[row]] == 0).all()
+
+
+def test_damping_adds_to_the_metric() -> None:
+    given = problem()
+    free = torch.ones(30, 12, dtype=torch.bool)
+    damping = torch.linspace(0.1, 2, 30, dtype=torch.float64)
+    solved = solve_free(given.H, given.diagonal, free, given.f, damping)
+    lifted = given.H + torch.diag_embed(damping[:, None] * metric(given.H))
+    torch.testing.assert_close(solved, torch.linalg.solve(lifted, given.f), rtol=1e-8, atol=1e-10)
+
+
+def test_newton_steps_reach_the_optimum_from_anywhere() -> None:
+    given = problem(problems=300)
+    start = torch.rand(300, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    x = projected_newton(given, start, 1e-11)
+    assert given.residual(x).max() <= 1e-10
+    other = projected_newton(given, 1 - start, 1e-11)
+    torch.testing.assert_close(x, other, rtol=0, atol=1e-8)
+
+
+def test_newton_steps_never_raise_the_objective() -> None:
+    given = problem(problems=300, seed=4)
+    x = torch.rand(300, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    for _ in range(4):
+        following = projected_newton(given, x, 1e-11, iterations=1)
+        assert (given.objective(following) <= given.objective(x) + 1e-9).all()
+        x = following
+
+
+def test_the_optimum_is_where_splitting_rests() -> None:
+    given = problem()
+    factors = prepare_splitting(given.H)
+    state = splitting_steps(given, factors, start_splitting(given, None), 2000)
+    assert given.residual(state.z).max() <= 1e-10
+    again = splitting_steps(given, factors, state, 1)
+    torch.testing.assert_close(again.z, state.z, rtol=0, atol=1e-11)
+    torch.testing.assert_close(again.t, state.t, rtol=0, atol=1e-9)
+
+
+def test_splitting_with_an_h_each_is_splitting_of_each() -> None:
+    given = problem()
+    H = given.H * torch.linspace(0.5, 2, 30, dtype=torch.float64)[:, None, None]
+    many = BoxProblem.of(H, given.f, given.lower, given.upper)
+    together = splitting_steps(many, prepare_splitting(H), start_splitting(many, None), 7).z
+    for row in (0, 13, 29):
+        one = BoxProblem.of(H[row], given.f[row : row + 1], given.lower, given.upper)
+        alone = splitting_steps(one, prepare_splitting(H[row]), start_splitting(one, None), 7).z
+        torch.testing.assert_close(together[row : row + 1], alone, rtol=0, atol=1e-12)
