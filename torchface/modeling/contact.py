@@ -30,11 +30,10 @@ class ContactPairs:
 class ContactFinder:
     """Finds the vertices of a surface that meet in a given pose.
 
-    Two vertices meet when they are within reach, their normals oppose and no short path of edges joins them; each
-    keeps its nearest partner, and those whose nearest partner it is. Only vertices of one connected part meet: what
-    else lies close, such as teeth in gums, is attached and not in contact. Where the mesh names its contacts, partners
-    are sought among those: one from the first column, one from the second, whichever lie opposite each other in the
-    pose.
+    Two vertices meet when they are within reach, their normals oppose and no short path of edges joins them. Only
+    vertices of one connected part meet: what else lies close, such as teeth in gums, is attached and not in contact.
+    Where the mesh names its contacts, partners are sought among those: one from the first column, one from the second,
+    whichever lie opposite each other in the pose.
 
     Args:
         neutral: the mesh at rest.
@@ -56,7 +55,9 @@ class ContactFinder:
         ring = (link + link.T + sparse.eye_array(count, dtype=np.int32)).tocsr()
         self._rings = {1: ring, 2: (ring @ ring).astype(bool).astype(np.int32)}
 
-    def find(self, vertices: Tensor, reach: float, moving: Tensor | None = None, rings: int = 2) -> ContactPairs:
+    def find(
+        self, vertices: Tensor, reach: float, moving: Tensor | None = None, rings: int = 2, nearest: bool = True
+    ) -> ContactPairs:
         """The pairs in contact in a pose.
 
         Args:
@@ -64,6 +65,7 @@ class ContactFinder:
             reach: how far apart vertices in contact may be, millimetres.
             moving: mask (V,); pairs of which neither end moves are left out.
             rings: 1 or 2; vertices that a path of 2 or 4 edges joins do not meet.
+            nearest: keep of each vertex's partners only the nearest, and those whose nearest partner it is.
         """
         vertices = vertices.detach().double().cpu()
         points, pool = vertices.numpy(), self._pool
@@ -90,7 +92,7 @@ class ContactFinder:
             apart = np.asarray(ring[i].multiply(ring[j]).sum(1)).ravel() == 0
             i, j = i[apart], j[apart]
         distance = np.linalg.norm(points[i] - points[j], axis=1)
-        chosen = _nearest_partner(i, distance) | _nearest_partner(j, distance)
+        chosen = _nearest_partner(i, distance) | _nearest_partner(j, distance) if nearest else slice(None)
         return _pairs(np.stack([i[chosen], j[chosen]], axis=1), np.square(1 - np.square(distance[chosen] / reach)))
 
 

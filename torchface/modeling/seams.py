@@ -63,6 +63,8 @@ def find_seams(rig: BlendshapeRig, moving: Tensor) -> Seams:
         for delta, moved in zip(deltas, moving.cpu(), strict=True)
     ]
     is_closed = _closed_at_rest(neutral.faces.cpu(), len(vertices), rest.pairs, [pose.pairs for pose in posed])
+    # Lips slide: a vertex is held to every one near it, up to the corners of the mouth.
+    rest = finder.find(vertices, REST_REACH, rings=1, nearest=False)
     closed = rest.pairs[is_closed[rest.pairs].all(1)]
     closing = []
     for pose in posed:
