@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.tangent_space import from_tangent_space, tangent_space
-from torchface.geometry.uv_raster import rasterise_uvs
-from torchface.mesh import Mesh
+from torchface.geometry.uv_raster import interpolate, rasterise_uvs
+from torchface.io import load_rig
+from torchface.mesh import Mesh, submesh
 from torchface.modeling.detail import NormalMap, bake_normal_map, detail_maps, dilate
 from torchface.modeling.scan_alignment import align_scan
 
@@ -192,6 +195,50 @@ def test_a_turned_texture_turns_the_map_but_not_the_normals_it_stands_for(face: 
         turned = replace(face, uvs=uvs)
         baked = bake_normal_map(turned, forehead, 2048, alignment=still())
         assert error_degrees(turned, baked)[0].median() < 3
+
+
+@pytest.mark.real
+def test_wrinkles_planted_on_a_real_head_come_back_across_its_texture(ict_folder: Path) -> None:
+    neutral = load_rig(ict_folder, part="face").neutral
+    mesh = neutral.with_vertices(neutral.vertices.double())
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    smooth = vertex_normals(mesh.vertices, mesh.faces)
+    brow = mesh.vertices[mesh.landmarks[17:27]].mean(0)
+
+    def relief(points: Tensor) -> Tensor:
+        x, y, _ = (points - brow).unbind(-1)
+        folds = torch.stack([y - level - 3 * torch.sin(x / 14) for level in (18.0, 26, 34)]) / (WIDTH / 2)
+        depth = torch.where(folds.abs() < 1, torch.cos(math.pi / 2 * folds.clamp(-1, 1)) ** 2, 0.0).sum(0)
+        return -DEPTH * depth * torch.exp(-((x / 38) ** 4))
+
+    offset = mesh.vertices - brow
+    part = submesh(mesh, (offset[:, 1] > 0) & (offset[:, 1] < 50) & (offset[:, 2] > -50))
+    points, faces = part.mesh.vertices.numpy(), part.mesh.faces.numpy()
+    attributes = {"normal": smooth[part.vertex_ids].numpy()}
+    for _ in range(3):
+        points, faces, attributes = trimesh.remesh.subdivide(points, faces, vertex_attributes=attributes)
+    dense = torch.from_numpy(points)
+    ways = torch.nn.functional.normalize(torch.from_numpy(attributes["normal"]), dim=1)
+    scan = Mesh(dense + relief(dense)[:, None] * ways, torch.from_numpy(faces).long())
+    baked = bake_normal_map(mesh, scan, 2048, alignment=still())
+
+    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, 2048, 2048)
+    hit = baked.hit.flatten()[texels.texels].nonzero()[::20, 0]
+    triangles, barycentric = texels.triangles[hit], texels.barycentric[hit]
+    frames = tangent_space(mesh.vertices, mesh.faces, mesh.uvs.double(), mesh.uv_faces, smooth).frames(
+        triangles, barycentric
+    )
+    way = torch.nn.functional.normalize(frames[..., 2], dim=-1)
+    at = interpolate(mesh.vertices, mesh.faces[triangles], barycentric).requires_grad_()
+    (slope,) = torch.autograd.grad(relief(at).sum(), at)
+    truth = torch.nn.functional.normalize(way - slope + way * (slope * way).sum(-1, keepdim=True), dim=-1)
+    shown = from_tangent_space(frames, baked.normals.flatten(1)[:, texels.texels[hit]].T.double())
+    turn = torch.rad2deg(torch.acos((truth * way).sum(-1).clamp(-1, 1)))
+    error = torch.rad2deg(torch.acos((truth * shown).sum(-1).clamp(-1, 1)))[turn > 8]
+    assert len(error) > 500
+    assert turn[turn > 8].median() > 12
+    assert error.median() < 5
 
 
 def test_dilation_takes_the_nearest_chart_texel() -> None:
