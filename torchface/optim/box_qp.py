@@ -18,8 +18,9 @@ _ROUNDS_COARSE, _ROUNDS_FINE = (60, 40, 40), (60,)
 _ROUNDS_LATER = (100, 200, 400, 800, 1600)
 _COARSE = 1e-7
 _NEWTON_STEPS, _LAST_NEWTON_STEPS = 8, 100
-# A solution this many times farther than each variable alone would go has no bound to stop it.
-_RUN_AWAY = 1e9
+# The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
+# variable alone would go, or where the residual itself is still this share of that way.
+_RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
@@ -214,7 +215,8 @@ def _check_bounded(problem: BoxProblem, x: Tensor) -> None:
     if torch.isfinite(problem.lower).all() and torch.isfinite(problem.upper).all():
         return
     scale = 1 + (problem.f / problem.diagonal).abs().amax(-1)
-    lost = x.abs().amax(-1) > _RUN_AWAY * scale
+    step = x - problem.clip(x - problem.gradient(x) / problem.diagonal)
+    lost = (x.abs().amax(-1) > _RUN_AWAY * scale) | (step.abs().amax(-1) > _STILL_MOVING * scale)
     if lost.any():
         raise ValueRangeError(
             f"box_qp: the objective of {int(lost.sum())} problems has no minimum: H is singular, bounds infinite"
