@@ -1,0 +1,161 @@
+"""The template as it deforms: its stiffness, its levels, and one stage of Algorithm 1 after the other."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.geometry.operators import triangle_cross
+from torchface.geometry.proximity import SurfaceIndex
+from torchface.registration.correspondence import Correspondences, correspondences, evenly_spread, exposed_vertices
+from torchface.registration.linear_step import Data, LinearStep
+from torchface.registration.record import StageRecord
+from torchface.registration.schedule import Level, Schedule, Stage
+from torchface.registration.stiffness import identity_maps, linked_edges, positions, stiffness_rows
+from torchface.registration.subspace import Subspace, all_maps, graph, translations
+
+_AREA_OF_ONE = 10.0
+_MOST_ATTEMPTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkPull:
+    """Template vertices (L,) int64 and where they belong, (L,3) float64."""
+
+    vertices: Tensor
+    points: Tensor
+
+
+class Deformer:
+    """A template on its way to a scan.
+
+    Args:
+        vertices: the template laid on the scan, (V,3) float64.
+        faces: its triangles.
+        scan: the surface.
+        landmarks: what is known of where vertices belong; none of them is needed.
+        schedule: of its constants; the stages are given one by one to ``run``.
+    """
+
+    def __init__(
+        self, vertices: Tensor, faces: Tensor, scan: SurfaceIndex, landmarks: LandmarkPull, schedule: Schedule
+    ) -> None:
+        self.rest, self.faces, self._scan, self._landmarks = vertices, faces, scan, landmarks
+        self._schedule = schedule
+        self.maps = identity_maps(vertices)
+        self.exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
+        self._rest_cross = triangle_cross(vertices, faces)
+        # A correspondence stands for its share of the surface, so that the stiffness means the same at any resolution.
+        self._area = float(self._rest_cross.norm(dim=-1).sum()) / 2
+        self._folded = torch.zeros(len(vertices), dtype=torch.bool)
+
+    @property
+    def current(self) -> Tensor:
+        """Where the vertices are, (V,3) float64."""
+        return positions(self.maps)
+
+    @cached_property
+    def _stiffness(self) -> sparse.csr_array:
+        return stiffness_rows(self.rest, self.faces, self._schedule.gradient_length)
+
+    @cached_property
+    def _graph(self) -> Subspace:
+        pairs = linked_edges(self.rest, self.faces)
+        return graph(self.rest.numpy(), pairs, self._stiffness, self._schedule.nodes)
+
+    @cached_property
+    def _spaces(self) -> dict[Level, Subspace]:
+        return {Level.TRANSLATIONS: translations(self._stiffness), Level.VERTICES: all_maps(self._stiffness)}
+
+    def run(self, stage: Stage, number: int) -> StageRecord:
+        """One stage: correspondences and linear steps in turn, until ‖ΔX‖ < ε.
+
+        Where triangles turn over, as in an ear that hair covers, the correspondences and landmarks around them are
+        dropped from here on and the stage starts again.
+
+        Raises:
+            ValueRangeError: no correspondence stands the tests.
+        """
+        begin, start = time.perf_counter(), self.maps
+        space = self._graph if stage.level is Level.GRAPH else self._spaces[stage.level]
+        vertices = self.exposed
+        if stage.samples is not None:
+            vertices = evenly_spread(self.rest, vertices, stage.samples)
+        record = self._attempt(stage, number, space, vertices)
+        for circle in range(1, _MOST_ATTEMPTS):  # in widening circles, until nothing turns over
+            folded = self.folded_triangles()
+            if not folded.any():
+                break
+            around = torch.zeros(len(self.rest), dtype=torch.bool)
+            around[self.faces[folded].flatten()] = True
+            for _ in range(circle):
+                around[self.faces[around[self.faces].any(-1)].flatten()] = True
+            self._folded |= around
+            self.maps = start
+            record = self._attempt(stage, number, space, vertices)
+        return replace(record, seconds=time.perf_counter() - begin)
+
+    def _attempt(self, stage: Stage, number: int, space: Subspace, vertices: Tensor) -> StageRecord:
+        held = ~self._folded[self._landmarks.vertices]
+        pull = LandmarkPull(self._landmarks.vertices[held], self._landmarks.points[held])
+        step = LinearStep(
+            space,
+            vertices.numpy(),
+            pull.vertices.numpy(),
+            stage.stiffness,
+            stage.landmark_weight,
+            self._schedule.sliding,
+        )
+        energies, moved, made = [], float("inf"), 0
+        while made < stage.iterations and moved >= stage.tolerance:
+            found = self._correspondences(vertices, stage)
+            data = self._data(found, pull)
+            before, place = step.energy(self.maps, data), self.current
+            self.maps = step.minimise(self.maps, data)
+            energies.append((before, step.energy(self.maps, data)))
+            moved = float((self.current - place).norm(dim=-1).mean())
+            made += 1
+        used = (found.weights > 0) & ~self._folded[vertices]
+        return StageRecord(
+            f"{number} {stage.level.value}",
+            stage.stiffness,
+            made,
+            moved,
+            float(found.distance[used].mean()),
+            self._landmark_distance(),
+            int(used.sum()),
+            {**found.dropped, "fold": int((self._folded[vertices] & (found.weights > 0)).sum())},
+            tuple(energies),
+            0.0,
+        )
+
+    def folded_triangles(self) -> Tensor:
+        """Mask (F,) of the triangles that have turned by more than 90° since the template was laid on the scan."""
+        return (triangle_cross(self.current, self.faces) * self._rest_cross).sum(-1) < 0
+
+    def _correspondences(self, vertices: Tensor, stage: Stage) -> Correspondences:
+        found = correspondences(
+            self.current, self.faces, vertices, self._scan, stage.reach, self._schedule.largest_angle
+        )
+        if not (found.weights > 0).any():
+            reasons = ", ".join(f"{count} for {reason}" for reason, count in found.dropped.items())
+            raise ValueRangeError(
+                f"register: none of {len(vertices)} correspondences stands the tests (dropped: {reasons}); "
+                "expected the scan to show the template's face where the landmarks or its shape lay it"
+            )
+        return found
+
+    def _data(self, found: Correspondences, pull: LandmarkPull) -> Data:
+        share = self._area / _AREA_OF_ONE / max(len(found.vertices), 1)
+        weights = (share * found.weights).masked_fill(self._folded[found.vertices], 0.0)
+        return Data(found.points.numpy(), found.normals.numpy(), weights.numpy(), pull.points.numpy())
+
+    def _landmark_distance(self) -> float:
+        left = self.current[self._landmarks.vertices] - self._landmarks.points
+        return float(left.square().sum(-1).mean().sqrt())

@@ -1,0 +1,223 @@
+"""A template bent onto a raw scan: the scan's face in the template's topology."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+from torchface.geometry.alignment import Similarity
+from torchface.geometry.operators import vertex_normals
+from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
+from torchface.mesh import Mesh
+from torchface.registration.correspondence import evenly_spread, exposed_vertices
+from torchface.registration.deformer import Deformer, LandmarkPull
+from torchface.registration.preparation import (
+    Landmarks,
+    PreparedScan,
+    check_landmarks,
+    check_template,
+    prepare_scan,
+)
+from torchface.registration.record import RegistrationRecord
+from torchface.registration.rigid import Samples, ScanPoints, find_pose, rigid_icp
+from torchface.registration.schedule import DEFAULT_SCHEDULE, Schedule
+from torchface.registration.texture import ScanColors, has_colors, resampled_texture, vertex_colors
+
+_RIGID_SAMPLES = 1500
+_RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
+_NEAR = 3.0
+
+Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
+"""Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
+space to the other's; gives template vertex ids and scan points, or nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A template registered to a scan.
+
+    Args:
+        mesh: the scan's face in the template's topology, in the scan's place, with the scan's colours.
+        pose: the similarity that first laid the template on the scan, a batch of one.
+        distance: of each vertex to the scan, (V,) float64, millimetres.
+        matched: which vertices' places the scan tells, (V,) bool; the others follow their neighbours.
+        record: what was done.
+    """
+
+    mesh: Mesh
+    pose: Similarity
+    distance: Tensor
+    matched: Tensor
+    record: RegistrationRecord
+
+
+def register(
+    template: Mesh,
+    scan: Mesh,
+    landmarks: Landmarks | None = None,
+    *,
+    detector: Detector | None = None,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+    texture_size: int = 1024,
+    progress: Callable[[str], None] | None = None,
+) -> Registration:
+    r"""The scan's face in the template's topology, by non-rigid iterated closest points.
+
+    .. math:: E(X) = \lVert \alpha (M \otimes G) X \rVert^2 + \lVert W (D X - U) \rVert^2
+        + \lVert \beta (D_L X - U_L) \rVert^2
+
+    A similarity lays the template on the scan, by landmarks where there are any, else by its shape alone, in any
+    pose. Rigid iterated closest points settle it. Then the template bends: for stiffness :math:`\alpha` falling in
+    steps, correspondences and the best affine maps X are found in turn until the vertices rest. All in float64 on
+    the CPU; the same input gives the same result.
+
+    Args:
+        template: a face, millimetres. Only what faces outward looks for the scan; parts that share no vertex with it
+            (eyeballs, teeth) follow the rest.
+        scan: millimetres; any topology and pose, with holes, hair, collar, crumbs, either side out.
+        landmarks: template vertex ids (L,) int64 and scan points (L,3); at least three, NaN rows are skipped.
+        detector: asked for landmarks where none are given, once the template lies on the scan.
+        schedule: which steps, see ``Schedule``.
+        texture_size: texels a side of the texture that is made where the scan has colours and the template
+            texture coordinates; 0 makes none.
+        progress: called with a line before each step.
+
+    Returns:
+        ``Registration(mesh, pose, distance (V,), matched (V,), record)``.
+
+    Raises:
+        ShapeError: landmarks of the wrong shape, or fewer than three that can be used.
+        TopologyError: an empty or tiny mesh, or a landmark on no vertex of the template.
+        ValueRangeError: another unit than millimetres, landmarks on a line, or a scan that does not show the face.
+        AlignmentError: the landmarks do not fit, or no pose is found without them.
+
+    Source: Amberg, Romdhani, Vetter 2007; thesis 3.2.3, equation 7 and Algorithm 1.
+    """
+    begin, say = time.perf_counter(), progress or (lambda line: None)
+    if texture_size < 0 or texture_size > 16384:
+        raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")
+    check_template(template)
+    say("checking the scan")
+    prepared = prepare_scan(scan, template)
+    say("laying the template on the scan")
+    start = _start(template, scan, prepared, landmarks, detector, schedule)
+    deformer = Deformer(
+        start.pose.apply(template.vertices.detach().cpu().double())[0],
+        template.faces.cpu(),
+        start.surface,
+        start.pull,
+        schedule,
+    )
+    start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
+    stages = []
+    for number, stage in enumerate(schedule.stages, 1):
+        say(f"bending, stage {number} of {len(schedule.stages)}")
+        stages.append(deformer.run(stage, number))
+    say("measuring")
+    nearest = start.surface.nearest(deformer.current)
+    matched = _matched(deformer, start.surface, nearest, schedule)
+    vertices = deformer.current.to(template.vertices)
+    mesh = replace(template, vertices=vertices, colors=None, texture=None)
+    notes = [*start.notes, *_final_notes(template, scan, deformer, texture_size)]
+    if has_colors(scan):
+        say("resampling the scan's colours")
+        mesh = _colored(mesh, ScanColors(scan, *_surface_parts(start.prepared)), nearest, matched, texture_size)
+    record = RegistrationRecord(
+        start.by,
+        start_distance,
+        tuple(stages),
+        tuple(notes),
+        float(nearest.distance[matched].median()) if matched.any() else float("nan"),
+        float(matched.double().mean()),
+        time.perf_counter() - begin,
+    )
+    device = template.vertices.device
+    return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    by: str
+    pose: Similarity
+    pull: LandmarkPull
+    prepared: PreparedScan
+    surface: SurfaceIndex
+    notes: tuple[str, ...]
+
+
+def _start(
+    template: Mesh,
+    scan: Mesh,
+    prepared: PreparedScan,
+    landmarks: Landmarks | None,
+    detector: Detector | None,
+    schedule: Schedule,
+) -> _Start:
+    """The pose, by landmarks or shape, and the scan with its outside out."""
+    vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
+    exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
+    samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
+    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), []
+    if landmarks is None:
+        by = "shape"
+        pose = find_pose(samples, ScanPoints(prepared.vertices, prepared.faces)).pose
+        if detector is not None:
+            laid = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
+            landmarks = detector(laid, scan, pose)
+            by = "detected landmarks" if landmarks is not None else by
+    if landmarks is None:
+        pull = LandmarkPull(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3, dtype=torch.float64))
+        return _Start(by, pose, pull, prepared, surface, prepared.notes)
+    (ids, points), pose, note = check_landmarks(landmarks, template, surface)
+    notes += [note] if note else []
+    if _faces_away(samples, surface, pose):
+        prepared = prepared.turned()
+        surface = SurfaceIndex(prepared.vertices, prepared.faces)
+    targets = ScanPoints(prepared.vertices, prepared.faces)
+    pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
+    return _Start(by, pose, LandmarkPull(ids, points), prepared, surface, (*prepared.notes, *notes))
+
+
+def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
+    """Whether most normals of the scan oppose the template's where both are near each other."""
+    found = surface.among_nearest_samples(pose.apply(samples.points)[0])
+    agree = (surface.normals_at(found) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
+    near = found.distance <= found.distance.median()
+    return float(agree[near].mean()) < 0
+
+
+def _matched(deformer: Deformer, surface: SurfaceIndex, nearest: SurfacePoints, schedule: Schedule) -> Tensor:
+    exposed = torch.zeros(len(deformer.rest), dtype=torch.bool)
+    exposed[deformer.exposed] = True
+    own = vertex_normals(deformer.current, deformer.faces)
+    cosine = torch.cos(torch.deg2rad(torch.tensor(schedule.largest_angle, dtype=torch.float64)))
+    alike = (own * surface.normals_at(nearest)).sum(-1) >= cosine
+    return exposed & alike & ~surface.on_border(nearest) & (nearest.distance <= _NEAR)
+
+
+def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: int) -> list[str]:
+    notes = []
+    folded = int(deformer.folded_triangles().sum())
+    if folded:
+        notes.append(f"{folded} triangles of the result are turned over")
+    if not has_colors(scan):
+        notes.append("the scan has neither a texture with coordinates nor vertex colours; the result has no colours")
+    elif template.uvs is None and texture_size:
+        notes.append("the template has no texture coordinates; the scan's colours are on the vertices only")
+    return notes
+
+
+def _surface_parts(prepared: PreparedScan) -> tuple[Tensor, Tensor, Tensor]:
+    return prepared.vertices, prepared.faces, prepared.face_ids
+
+
+def _colored(mesh: Mesh, source: ScanColors, nearest: SurfacePoints, matched: Tensor, size: int) -> Mesh:
+    colors = vertex_colors(source, nearest, matched)
+    texture = resampled_texture(mesh, colors, source, size) if size and mesh.uvs is not None else None
+    device = mesh.vertices.device
+    return replace(mesh, colors=colors.to(device), texture=None if texture is None else texture.to(device))

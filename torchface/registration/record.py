@@ -1,0 +1,75 @@
+"""What a registration tells about itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One stage.
+
+    Args:
+        stage: its number and what was free to move, for example ``"3 graph"``.
+        stiffness: :math:`\\alpha`.
+        iterations: linear steps made.
+        moved: mean motion of a vertex in the last of them, millimetres.
+        distance: mean distance of the correspondences that were used, millimetres.
+        landmark_distance: root mean square, millimetres; NaN without landmarks.
+        used: correspondences that were used.
+        dropped: correspondences refused, by reason: ``distance``, ``border``, ``normal``, and ``fold`` where a
+            triangle would have turned over.
+        energies: cost before and after each linear step, its correspondences held.
+        seconds: wall-clock.
+    """
+
+    stage: str
+    stiffness: float
+    iterations: int
+    moved: float
+    distance: float
+    landmark_distance: float
+    used: int
+    dropped: dict[str, int]
+    energies: tuple[tuple[float, float], ...]
+    seconds: float = field(compare=False)
+
+
+@dataclass(frozen=True)
+class RegistrationRecord:
+    """A whole registration.
+
+    Args:
+        start: how the template came to lie on the scan: ``"landmarks"``, ``"detected landmarks"`` or ``"shape"``.
+        start_distance: median distance from template to scan after that, millimetres.
+        stages: in order.
+        notes: what was found in the input and what was done about it, for people to read.
+        median_distance: of the exposed vertices that found the scan, to it, millimetres.
+        matched: share of the template's vertices whose place the scan tells; the others follow their neighbours.
+        seconds: wall-clock.
+    """
+
+    start: str
+    start_distance: float
+    stages: tuple[StageRecord, ...]
+    notes: tuple[str, ...]
+    median_distance: float
+    matched: float
+    seconds: float = field(compare=False)
+
+    def __str__(self) -> str:
+        lines = [f"start by {self.start}: median {self.start_distance:.2f} mm from the scan"]
+        lines += [_line(stage) for stage in self.stages]
+        lines.append(
+            f"median {self.median_distance:.3f} mm from the scan where {self.matched:.0%} of the vertices lie on it, "
+            f"{self.seconds:.1f} s"
+        )
+        return "\n".join(lines + [f"note: {note}" for note in self.notes])
+
+
+def _line(stage: StageRecord) -> str:
+    dropped = ", ".join(f"{count} {reason}" for reason, count in stage.dropped.items() if count) or "none"
+    return (
+        f"{stage.stage:>16}  stiffness {stage.stiffness:6.2f}  {stage.iterations} steps  {stage.distance:6.3f} mm  "
+        f"landmarks {stage.landmark_distance:5.2f} mm  used {stage.used}, dropped {dropped}  {stage.seconds:.2f} s"
+    )

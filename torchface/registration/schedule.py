@@ -1,0 +1,96 @@
+"""What a registration does in which order, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from torchface.errors import ValueRangeError
+
+
+class Level(Enum):
+    """What is free to move in a stage; the cost function is the same."""
+
+    GRAPH = "graph"
+    """An affine map a node of a coarse graph; the vertices blend their nodes' maps."""
+    TRANSLATIONS = "translations"
+    """A translation a vertex on top of the affine maps so far."""
+    VERTICES = "vertices"
+    """An affine map a vertex: Amberg's system whole, the slowest."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One value of the stiffness, held until the vertices come to rest.
+
+    Args:
+        level: what is free to move.
+        stiffness: :math:`\\alpha`; against data of one per 10 mm² of surface.
+        landmark_weight: :math:`\\beta`.
+        reach: millimetres; a correspondence further away is dropped, and one at half of it counts a quarter.
+        samples: how many vertices of the template look for a correspondence; all of them if absent.
+        iterations: at most.
+        tolerance: :math:`\\varepsilon`, millimetres; the stage ends when the vertices move less on average.
+    """
+
+    level: Level
+    stiffness: float
+    landmark_weight: float
+    reach: float
+    samples: int | None = None
+    iterations: int = 3
+    tolerance: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (self.stiffness > 0 and self.landmark_weight >= 0 and self.reach > 0 and self.iterations > 0):
+            raise ValueRangeError(f"stage: found {self}, expected positive stiffness, reach and iterations")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A whole registration.
+
+    Args:
+        stages: in order; stiffness falls, the weight of the landmarks with it.
+        nodes: of the coarse graph.
+        gradient_length: :math:`g` of :math:`G`, millimetres: how much a change of the linear part from vertex to
+            vertex costs beside a change of the translation.
+        sliding: :math:`\\rho`, the weight of a correspondence along the surface beside 1 across it.
+        largest_angle: between the normals of a correspondence, degrees.
+        opening: millimetres within which nothing may stand before a vertex that looks for a correspondence; what lies
+            behind lips, lids and in nostrils follows its neighbours.
+    """
+
+    stages: tuple[Stage, ...]
+    nodes: int = 300
+    gradient_length: float = 10.0
+    sliding: float = 0.01
+    largest_angle: float = 60.0
+    opening: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not self.stages or self.nodes < 1 or self.gradient_length <= 0 or not 0 < self.sliding <= 1:
+            raise ValueRangeError(f"schedule: found {self}, expected stages, nodes, a length, sliding in (0,1]")
+
+
+DEFAULT_SCHEDULE = Schedule(
+    (
+        Stage(Level.GRAPH, 30.0, 10.0, 30.0, samples=2000, iterations=4),
+        Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=2000, iterations=3),
+        Stage(Level.GRAPH, 2.0, 4.0, 12.0, samples=2000, iterations=2),
+        Stage(Level.GRAPH, 0.5, 1.0, 8.0, samples=2000, iterations=2),
+        Stage(Level.TRANSLATIONS, 0.3, 0.3, 5.0, iterations=2),
+    )
+)
+"""For heads of any resolution."""
+
+FULL_SCHEDULE = Schedule(
+    (
+        Stage(Level.VERTICES, 30.0, 10.0, 30.0, iterations=4),
+        Stage(Level.VERTICES, 8.0, 8.0, 20.0),
+        Stage(Level.VERTICES, 2.0, 4.0, 12.0, iterations=2),
+        Stage(Level.VERTICES, 0.5, 1.0, 8.0, iterations=2),
+        Stage(Level.VERTICES, 0.3, 0.3, 5.0, iterations=2),
+    )
+)
+"""An affine map a vertex from start to end, as in the paper: slower, and the measure for the default."""

@@ -1,0 +1,133 @@
+"""A scan's colours on the registered mesh: one a vertex, and a texture in the template's layout."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.errors import TopologyError
+from torchface.geometry.operators import vertex_normals
+from torchface.geometry.proximity import SurfacePoints
+from torchface.geometry.uv_raster import TexelMap, interpolate, rasterise_uvs
+from torchface.mesh import Mesh
+from torchface.rendering.raycast import RayCaster
+from torchface.rendering.shading import sample_texture
+
+_REACH = 5.0
+_LARGEST_ANGLE = 75.0
+_SEAM = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ScanColors:
+    """Where a scan's colours are looked up.
+
+    Args:
+        scan: the scan as it came, with a texture or vertex colours.
+        faces: triangles of ``vertices`` that are registered to, (F',3), the right side out.
+        vertices: (V',3).
+        face_ids: the scan's own row of each, (F',).
+    """
+
+    scan: Mesh
+    vertices: Tensor
+    faces: Tensor
+    face_ids: Tensor
+
+    def at(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
+        """Colours (Q,3) at barycentric coordinates (Q,3) of rows (Q,) of ``faces``."""
+        rows, barycentric = self.face_ids[triangle], self._own_order(triangle, barycentric)
+        scan = self.scan
+        if scan.texture is not None and scan.uvs is not None and scan.uv_faces is not None:
+            uv = interpolate(scan.uvs.cpu().double(), scan.uv_faces.cpu()[rows], barycentric)
+            return sample_texture(scan.texture.cpu(), uv)
+        assert scan.colors is not None
+        return interpolate(scan.colors.cpu().double(), scan.faces.cpu()[rows], barycentric).float()
+
+    def _own_order(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
+        """Barycentric coordinates in the order of the scan's own corners: turned triangles have them backwards."""
+        corner = self.scan.vertices.cpu().double()[self.scan.faces.cpu()[self.face_ids[:1], 0]]
+        same = torch.equal(corner, self.vertices[self.faces[:1, 0]])
+        return barycentric if same else barycentric.flip(1)
+
+
+def has_colors(scan: Mesh) -> bool:
+    """Whether a scan brings a texture that its coordinates reach, or vertex colours."""
+    return scan.colors is not None or (scan.texture is not None and scan.uvs is not None)
+
+
+def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -> Tensor:
+    """Colours (V,3) of the registered mesh's vertices; one that the scan does not show has its nearest neighbour's.
+
+    Args:
+        source: the scan.
+        nearest: of each vertex.
+        trusted: which vertices lie on the scan, (V,) bool.
+    """
+    colors = source.at(nearest.triangle, nearest.barycentric)
+    if trusted.any() and not trusted.all():
+        known = nearest.points[trusted]
+        _, row = cKDTree(known.numpy()).query(nearest.points[~trusted].numpy())
+        colors[~trusted] = colors[trusted][torch.from_numpy(row)]
+    return colors.clamp(0, 1)
+
+
+def resampled_texture(mesh: Mesh, colors: Tensor, source: ScanColors, size: int) -> Tensor:
+    """A texture (3,size,size) in the mesh's own layout.
+
+    From each texel's place on the registered mesh a ray goes out and one in along the normal; the nearer hit within
+    5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do. Charts are
+    widened by four texels, so that no background shows at their seams.
+
+    Args:
+        mesh: registered, with texture coordinates.
+        colors: of its vertices, (V,3).
+        source: the scan.
+        size: texels a side.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("mesh: found no texture coordinates, expected some to lay a texture out in")
+    texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
+    faces, vertices = mesh.faces.cpu(), mesh.vertices.detach().cpu().double()
+    points = texels.interpolate(vertices, faces)
+    normals = torch.nn.functional.normalize(texels.interpolate(vertex_normals(vertices, faces), faces), dim=-1)
+    values = texels.interpolate(colors.double(), faces).float()
+    triangle, barycentric, found = _along_normals(source, points, normals)
+    values[found] = source.at(triangle[found], barycentric[found])
+    return _widened(values.clamp(0, 1), texels)
+
+
+def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    caster = RayCaster(source.vertices, source.faces)
+    surface = vertex_normals(source.vertices, source.faces)
+    best = torch.full((len(points),), _REACH, dtype=torch.float64)
+    triangle = torch.full((len(points),), -1, dtype=torch.int64)
+    barycentric = torch.zeros(len(points), 3, dtype=torch.float64)
+    for way in (normals, -normals):
+        hits = caster.cast(points, way)
+        there = interpolate(surface, source.faces[hits.triangle.clamp(min=0)], hits.barycentric.double())
+        alike = (there * normals).sum(-1) > math.cos(math.radians(_LARGEST_ANGLE)) * there.norm(dim=-1)
+        better = (hits.triangle >= 0) & alike & (hits.distance < best)
+        best = torch.where(better, hits.distance, best)
+        triangle = torch.where(better, hits.triangle, triangle)
+        barycentric = torch.where(better[:, None], hits.barycentric.double(), barycentric)
+    return triangle, barycentric, triangle >= 0
+
+
+def _widened(values: Tensor, texels: TexelMap) -> Tensor:
+    """The texels laid out (3,H,W); around the charts the mean of the neighbours that have a colour, ring by ring."""
+    image = torch.zeros(3, texels.height * texels.width)
+    image[:, texels.texels] = values.T
+    image = image.reshape(1, 3, texels.height, texels.width)
+    known = texels.mask()[None, None].float()
+    background = values.mean(0).reshape(1, 3, 1, 1) if len(values) else torch.zeros(1, 3, 1, 1)
+    for _ in range(_SEAM):  # a ring of texels a turn
+        count = torch.nn.functional.avg_pool2d(known, 3, 1, 1, count_include_pad=True)
+        mean = torch.nn.functional.avg_pool2d(image * known, 3, 1, 1) / count.clamp(min=1e-6)
+        image = torch.where(known > 0, image, torch.where(count > 0, mean, image))
+        known = (count > 1e-6).float()
+    return torch.where(known > 0, image, background)[0].contiguous()
