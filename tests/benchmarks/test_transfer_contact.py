@@ -123,13 +123,18 @@ def posed(rig: BlendshapeRig, weights: list[float]) -> Tensor:
 
 
 def flipped(template: BlendshapeRig, rig: BlendshapeRig, shape: int) -> int:
-    """Triangles whose normal in the shape opposes the one that the template's gradient gives them."""
+    """Triangles whose normal in the shape opposes both the one at rest and the one that the template's gradient gives.
+
+    A lid may turn by more than a right angle in the template's blink; a sliver in its corner may also turn by less.
+    """
     faces = rig.neutral.faces
     gradients = deformation_gradients(template.vertices, template.vertices + template.deltas[shape], faces)
     cofactors = torch.linalg.inv(gradients).transpose(-1, -2)
     wanted = (cofactors @ triangle_normals(rig.vertices, faces)[..., None])[..., 0]
     wanted = wanted * torch.linalg.det(gradients).sign()[:, None]
-    return int(((wanted * triangle_normals(rig.vertices + rig.deltas[shape], faces)).sum(-1) < 0).sum())
+    found = triangle_normals(rig.vertices + rig.deltas[shape], faces)
+    at_rest = triangle_normals(rig.vertices, faces)
+    return int((((wanted * found).sum(-1) < 0) & ((at_rest * found).sum(-1) < 0)).sum())
 
 
 @pytest.fixture(scope="module")
