@@ -30,7 +30,7 @@ lint: $(VENV)/.installed-lint
 	$(VENV)/bin/lint-imports
 
 demo: $(STAMP)
-	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template $(TEMPLATE)) $(if $(TAKE),--take $(TAKE))
+	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template $(TEMPLATE)) $(if $(TAKE),--take $(TAKE)) $(if $(TARGET),--target $(TARGET))
 
 clean:
 	rm -rf $(VENV) out

@@ -6,7 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import settings
+
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -41,3 +45,21 @@ def ict_folder(data: Path) -> Path:
 def performances(data: Path) -> list[Path]:
     """Real Live Link Face takes."""
     return sorted((data / "performances").glob("*.csv"))
+
+
+@pytest.fixture(scope="session")
+def dome_rig() -> BlendshapeRig:
+    """A dome that bulges here and there: 100 mm wide, four shapes; the lowest rows never move."""
+    side = 25
+    y, x = torch.meshgrid(torch.linspace(-50, 50, side), torch.linspace(-50, 50, side), indexing="ij")
+    vertices = torch.stack([x, y, 60 - (x**2 + y**2) / 100], dim=-1).reshape(-1, 3)
+    corner = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1)
+    quads = torch.stack([corner, corner + 1, corner + side + 1, corner + side], dim=1)
+    centres = torch.tensor([[-25.0, 25], [25, 25], [0, 0], [0, 35]])
+    bulge = torch.exp(-((vertices[None, :, :2] - centres[:, None]) ** 2).sum(-1) / 400) * (vertices[:, 1] > -35)
+    direction = torch.tensor([[0.0, 2, 6], [0, 3, 5], [4, 0, 3], [0, -5, 2]])
+    return BlendshapeRig(
+        Mesh.from_polygons(vertices, quads),
+        bulge[..., None] * direction[:, None],
+        ["jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight"],
+    )

@@ -5,21 +5,8 @@ import torch
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.alignment import similarity_transform
-from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
-
-
-def dome_rig(side: int = 25) -> BlendshapeRig:
-    """A dome that bulges here and there: 100 mm wide, four shapes; the lowest rows never move."""
-    y, x = torch.meshgrid(torch.linspace(-50, 50, side), torch.linspace(-50, 50, side), indexing="ij")
-    vertices = torch.stack([x, y, 60 - (x**2 + y**2) / 100], dim=-1).reshape(-1, 3)
-    corner = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1)
-    quads = torch.stack([corner, corner + 1, corner + side + 1, corner + side], dim=1)
-    centres = torch.tensor([[-25.0, 25], [25, 25], [0, 0], [0, 35]])
-    bulge = torch.exp(-((vertices[None, :, :2] - centres[:, None]) ** 2).sum(-1) / 400) * (vertices[:, 1] > -35)
-    direction = torch.tensor([[0.0, 2, 6], [0, 3, 5], [4, 0, 3], [0, -5, 2]])
-    return BlendshapeRig(Mesh.from_polygons(vertices, quads), bulge[..., None] * direction[:, None], list("abcd"))
 
 
 def moving(frames: int, shapes: int = 4) -> torch.Tensor:
@@ -27,8 +14,8 @@ def moving(frames: int, shapes: int = 4) -> torch.Tensor:
     return 0.5 + 0.5 * torch.sin(torch.arange(frames)[:, None] / 20 + phase)
 
 
-def test_markers_are_placed_apart_on_visible_skin_that_moves() -> None:
-    rig = dome_rig()
+def test_markers_are_placed_apart_on_visible_skin_that_moves(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 40)
     points = attachment.on(rig.neutral.faces, rig.vertices)
     distances = torch.cdist(points, points) + 1e9 * torch.eye(40)
@@ -40,8 +27,8 @@ def test_markers_are_placed_apart_on_visible_skin_that_moves() -> None:
         place_markers(rig, 5000)
 
 
-def test_without_flaws_the_take_is_the_attachment_on_the_moving_rig() -> None:
-    rig = dome_rig()
+def test_without_flaws_the_take_is_the_attachment_on_the_moving_rig(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 20)
     weights = moving(50)
     recording = record(rig, attachment, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0))
@@ -50,8 +37,8 @@ def test_without_flaws_the_take_is_the_attachment_on_the_moving_rig() -> None:
     torch.testing.assert_close(recording.take.markers.values, expected, atol=1e-4, rtol=0)
 
 
-def test_noise_gaps_and_missing_samples_have_the_size_asked_for() -> None:
-    rig = dome_rig()
+def test_noise_gaps_and_missing_samples_have_the_size_asked_for(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 40)
     flaws = StageFlaws(noise=0.3, missing=0.1, gaps=6, gap_seconds=0.5)
     recording = record(rig, attachment, moving(3600), torch.Generator().manual_seed(0), flaws)
@@ -63,8 +50,8 @@ def test_noise_gaps_and_missing_samples_have_the_size_asked_for() -> None:
     assert 0.1 < share < 0.1 + 6 * 0.5 / 60  # stretches are up to half a second, six a minute
 
 
-def test_slip_is_the_rigid_motion_that_comes_back_with_it() -> None:
-    rig = dome_rig()
+def test_slip_is_the_rigid_motion_that_comes_back_with_it(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 30)
     flaws = StageFlaws(noise=0, slip_translation=10, slip_rotation=4)
     recording = record(rig, attachment, moving(600), torch.Generator().manual_seed(3), flaws)
@@ -76,8 +63,8 @@ def test_slip_is_the_rigid_motion_that_comes_back_with_it() -> None:
     assert 4 <= float(angle.max()) < 4 * 3**0.5 + 0.1
 
 
-def test_swapped_labels_are_the_ones_reported() -> None:
-    rig = dome_rig()
+def test_swapped_labels_are_the_ones_reported(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 30)
     recording = record(rig, attachment, moving(1800), torch.Generator().manual_seed(4), StageFlaws(noise=0, swaps=12))
     assert len(recording.swaps) == 6
@@ -89,8 +76,8 @@ def test_swapped_labels_are_the_ones_reported() -> None:
     torch.testing.assert_close(repaired, recording.markers)
 
 
-def test_standoff_lifts_markers_along_the_normal() -> None:
-    rig = dome_rig()
+def test_standoff_lifts_markers_along_the_normal(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 30)
     weights = moving(20)
     on_skin = record(rig, attachment, weights, torch.Generator(), StageFlaws(noise=0)).markers
@@ -99,8 +86,8 @@ def test_standoff_lifts_markers_along_the_normal() -> None:
     assert (lifted - on_skin)[..., 2].min() > 0
 
 
-def test_same_seed_same_take_and_bad_settings_are_named() -> None:
-    rig = dome_rig()
+def test_same_seed_same_take_and_bad_settings_are_named(dome_rig: BlendshapeRig) -> None:
+    rig = dome_rig
     attachment = place_markers(rig, 10)
     takes = [record(rig, attachment, moving(9), torch.Generator().manual_seed(7)).take for _ in range(2)]
     assert takes[0].markers is not None

@@ -1,0 +1,51 @@
+"""The ``torchface`` command; one file a subcommand."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+import tyro
+
+from torchface.cli.demo import demo
+from torchface.cli.export import EXPORTS
+from torchface.cli.info import info
+from torchface.cli.pick import pick
+from torchface.cli.progress import console
+from torchface.cli.render import render
+from torchface.cli.solve import solve
+from torchface.cli.transfer import transfer
+from torchface.cli.view import view
+from torchface.errors import TorchfaceError
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "transfer": transfer,
+    "solve": solve,
+    "render": render,
+    "info": info,
+    "view": view,
+    "pick": pick,
+}
+DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship them as ONNX and glTF."
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs one command; an error that the user can mend ends with its message and exit status 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        if words[:1] == ["export"]:
+            tyro.extras.subcommand_cli_from_dict(
+                EXPORTS, prog="torchface export", description="Write an ONNX graph.", args=words[1:]
+            )
+        else:
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS | {"export": _export_help}, prog="torchface", description=DESCRIPTION, args=words
+            )
+    except TorchfaceError as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        raise SystemExit(2) from None
+
+
+def _export_help() -> None:
+    """Write an ONNX graph: `torchface export solver --help`."""

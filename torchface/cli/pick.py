@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from tyro.conf import Positional
+
 from torchface.cli.progress import console, steps
 
 
 def pick(
-    mesh: Path,
-    scan: Path | None = None,
+    mesh: Positional[Path],
+    scan: Positional[Path | None] = None,
     out: Path = Path("picks"),
     mode: Literal["landmarks", "markers", "correspondences"] = "landmarks",
     landmarks: Literal["68", "12"] = "68",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tyro.conf import Positional
+
 from torchface.cli.progress import console, steps
 
 
 def view(
-    rig: Path,
-    weights: Path | None = None,
+    rig: Positional[Path],
+    weights: Positional[Path | None] = None,
     out: Path | None = None,
     part: str | None = None,
     port: int = 8080,

@@ -43,10 +43,12 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
     faces = mesh.faces.cpu()
     amplitude = rig.deltas.double().norm(dim=-1).amax(0).cpu()
     part = components(faces, len(vertices))
-    allowed = (part == part[faces.flatten()].mode().values) & (amplitude > 1.0)
+    skin = part == part[faces.flatten()].mode().values
+    allowed = skin & (amplitude > 1.0)
     normals = vertex_normals(vertices, faces)
     allowed &= normals[:, 2] > math.cos(math.radians(visible_from))
-    allowed &= ~RayCaster(vertices, faces).occluded(
+    # Lashes and the film over the eye, parts of their own, hide no marker.
+    allowed &= ~RayCaster(vertices, faces[skin[faces[:, 0]]]).occluded(
         vertices + 0.1 * normals, torch.tensor([0.0, 0, 1]).double().expand_as(vertices)
     )
     if mesh.annotations is not None:

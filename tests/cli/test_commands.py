@@ -1,0 +1,122 @@
+"""Commands do on disk what the library does in memory, and say clearly what is wrong."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.capture import MarkerSolver
+from torchface.cli import COMMANDS, main
+from torchface.cli.export import EXPORTS
+from torchface.geometry.alignment import Similarity
+from torchface.io import load_rig, load_take, save_mesh, save_rig, save_take
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
+from torchface.take import Take, Track
+
+
+@pytest.fixture
+def shoot(dome_rig: BlendshapeRig, tmp_path: Path) -> Path:
+    """A folder with a rig, an attachment and a take with gaps."""
+    attachment = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(40)[:, None] / 7 + torch.arange(4))
+    weights[0] = 0
+    flaws = StageFlaws(noise=0.05, missing=0.1)
+    recording = record(dome_rig, attachment, weights, torch.Generator().manual_seed(0), flaws)
+    save_rig(dome_rig, tmp_path / "rig.glb")
+    attachment.save(tmp_path / "attachment.json")
+    save_take(recording.take, tmp_path / "take.c3d")
+    torch.save(weights, tmp_path / "true.pt")
+    return tmp_path
+
+
+def run(*words: str | Path) -> None:
+    main([str(word) for word in words])
+
+
+def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: BlendshapeRig) -> None:
+    out = shoot / "new folder" / "weights.csv"
+    run("solve", shoot / "rig.glb", shoot / "take.c3d", "--attachment", shoot / "attachment.json", "--out", out)
+    written = load_take(out).weights
+    assert written is not None
+    found = dome_rig.weights_from(written).float()
+    torch.testing.assert_close(found, torch.load(shoot / "true.pt", weights_only=True), atol=0.06, rtol=0)
+    rig = load_rig(shoot / "rig.glb")
+    solved = MarkerSolver(rig, place_markers(dome_rig, 30)).solve_take(load_take(shoot / "take.c3d")).weights
+    assert solved is not None
+    torch.testing.assert_close(found, solved.values[..., 0].float(), atol=1e-5, rtol=0)
+
+
+def test_solve_with_a_neutral_frame_undoes_the_space_of_the_take(shoot: Path, dome_rig: BlendshapeRig) -> None:
+    take = load_take(shoot / "take.c3d")
+    assert take.markers is not None
+    angle = torch.tensor(0.7)
+    rotation = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]])
+    space = Similarity(torch.tensor([1.1]), rotation[None], torch.tensor([[100.0, -900, 40]]))
+    moved = Track(take.markers.names, space.apply(take.markers.values))
+    save_take(Take(take.fps, markers=moved), shoot / "moved.c3d")
+    out = shoot / "weights.csv"
+    common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
+    run("solve", shoot / "rig.glb", shoot / "moved.c3d", *common, "--neutral-frame", "0")
+    written = load_take(out).weights
+    assert written is not None
+    true = torch.load(shoot / "true.pt", weights_only=True)
+    torch.testing.assert_close(dome_rig.weights_from(written).float(), true, atol=0.08, rtol=0)
+
+
+def test_transfer_onto_the_own_neutral_writes_the_same_rig(shoot: Path, dome_rig: BlendshapeRig) -> None:
+    save_mesh(dome_rig.neutral, shoot / "neutral.obj")
+    run("transfer", shoot / "rig.glb", shoot / "neutral.obj", "--out", shoot / "actor.glb")
+    torch.testing.assert_close(load_rig(shoot / "actor.glb").deltas, dome_rig.deltas, atol=5e-3, rtol=0)
+
+
+def test_render_and_info_and_export(shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run("render", shoot / "rig.glb", "--out", shoot / "a.png", "--height", "60", "--weights", "jawOpen=1", "--yaw", "0")
+    run("render", shoot / "rig.glb", "--out", shoot / "b.png", "--height", "60", "--yaw", "0")
+    assert (shoot / "a.png").read_bytes() != (shoot / "b.png").read_bytes()
+    run("info", shoot / "rig.glb", "--attachment", shoot / "attachment.json")
+    run("info", shoot / "take.c3d")
+    told = capsys.readouterr().err
+    for fact in ("625", "jawOpen", "30 markers see 4 of 4", "40 at 60"):
+        assert fact in told
+    out = shoot / "solver.onnx"
+    run("export", "solver", "--rig", shoot / "rig.glb", "--attachment", shoot / "attachment.json", "--out", out)
+    assert out.is_file()
+    run("info", out)
+    assert "markers (" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("info", "nothing.glb"), "nothing.glb"),
+        (("info", "nothing.xyz"), "found the ending '.xyz'"),
+        (("render", "rig.glb", "--weights", "jawOpen"), "expected NAME=NUMBER"),
+        (("solve", "rig.glb", "rig.glb", "--attachment", "attachment.json"), "rig.glb"),
+        (("demo", "--template", "rig.glb", "--quiet"), "expected a target"),
+        (("export", "solver", "--rig", "rig.glb", "--attachment", "take.c3d", "--out", "x.onnx"), "take.c3d"),
+    ],
+)
+def test_mistakes_end_with_a_message_and_status_2(
+    shoot: Path,
+    words: tuple[str, ...],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(shoot)
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert "error:" in told
+    assert message in told.replace("\n", " ")
+
+
+def test_every_command_explains_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]:
+        with pytest.raises(SystemExit) as ended:
+            main([*words, "--help"])
+        assert ended.value.code == 0
+        told = capsys.readouterr().out
+        assert len(told) > 500, words

@@ -1,0 +1,48 @@
+"""``torchface demo``: the main job from end to end, with a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+
+from torchface.cli.progress import console, steps
+
+
+def demo(
+    template: Path | None = None,
+    take: Path | None = None,
+    target: Path | None = None,
+    out: Path = Path("out/demo"),
+    seed: int = 1,
+    markers: int = 100,
+    quiet: bool = False,
+) -> None:
+    """Run the main job from end to end and open the result in a browser: OUT/index.html.
+
+    A template rig is transferred to a new head; the head's true rig plays a take on a marker stage (noise, gaps); the
+    take is written as C3D, solved with the transferred rig, and compared with the truth. Without arguments
+    everything is the embedded performer's and nothing else is needed.
+
+    Args:
+        template: Rig to transfer: a .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        take: Weight take that moves the head, such as a Live Link Face CSV.
+        target: Neutral mesh with the template's topology; ICT-FaceKit's folder needs none (a random head is drawn).
+        out: Folder for the report, rig, take, weights, animation and solver.
+        seed: Decides the random head, the noise and the gaps.
+        markers: How many markers the head wears.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.demo import run_demo, scene_from
+    from torchface.workflows.demo_page import result_rows, write_demo_page
+
+    with steps(quiet) as step:
+        step("preparing head and take")
+        scene = scene_from(template, take, target, seed)
+        result = run_demo(scene, out, seed, markers, progress=step)
+        page = write_demo_page(result, out, step)
+    table = Table(title=scene.title, show_header=False)
+    for row in [*result_rows(result), *result.solver.rows()]:
+        table.add_row(*row)
+    console.print(table)
+    print(page)

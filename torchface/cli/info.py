@@ -1,0 +1,26 @@
+"""``torchface info``: what a file holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+from tyro.conf import Positional
+
+from torchface.cli.progress import console
+
+
+def info(path: Positional[Path], attachment: Path | None = None, part: str | None = None) -> None:
+    """Say what a file holds: a rig, mesh, take, attachment or solver.
+
+    Args:
+        path: A .glb, .obj, .ply, .stl, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's folder.
+        attachment: Report which shapes of the rig these markers tell apart.
+        part: Look at this region of the rig only, such as face.
+    """
+    from torchface.workflows.describe import describe
+
+    table = Table(title=str(path), show_header=False)
+    for row in describe(path, attachment, part):
+        table.add_row(*row)
+    console.print(table)

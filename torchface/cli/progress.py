@@ -1,0 +1,34 @@
+"""What a command shows while it works: one line a step, with a spinner and the time it has taken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+console = Console(stderr=True)
+
+
+@contextmanager
+def steps(quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Gives a function that names the step just begun; shows nothing when quiet."""
+    if quiet:
+        yield lambda line: None
+        return
+    columns = (SpinnerColumn(finished_text="[green]✓"), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        current: list = []
+
+        def finish() -> None:
+            for task in current:
+                progress.update(task, completed=1)
+            current.clear()
+
+        def begin(line: str) -> None:
+            finish()
+            current.append(progress.add_task(line, total=1))
+
+        yield begin
+        finish()

@@ -1,0 +1,49 @@
+"""``torchface render``: pictures of a mesh or a rig in a pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from torchface.cli.progress import steps
+
+
+def render(
+    path: Positional[Path],
+    out: Path = Path("out/render.png"),
+    weights: tuple[str, ...] = (),
+    take: Path | None = None,
+    frame: int = 0,
+    yaw: tuple[float, ...] = (0.0, 35.0, 90.0),
+    height: int = 640,
+    clay: bool = False,
+    part: str | None = None,
+    quiet: bool = False,
+) -> None:
+    """Render a mesh or rig from several sides into one picture, by ray casting; no graphics driver is needed.
+
+    Args:
+        path: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        out: The .png or .jpg to write.
+        weights: Pose of a rig, such as jawOpen=0.5 mouthSmileLeft=1.
+        take: Pose of a rig from a weight take instead.
+        frame: Which frame of the take.
+        yaw: Directions to look from, degrees; 0 is the front, 90 the viewer's right.
+        height: Of the picture, pixels.
+        clay: Leave texture and vertex colours out.
+        part: Keep this region only, such as face.
+        quiet: Show no progress.
+    """
+    from torchface.rendering.compositing import save_picture
+    from torchface.viz.faces import clay_colors, face_views
+    from torchface.workflows.pose import load_posed, pose_weights
+
+    with steps(quiet) as step:
+        step("reading")
+        posed = load_posed(path, pose_weights(weights), take, frame, part)
+        step("rendering")
+        colors = clay_colors(posed.mesh) if clay else None
+        picture = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
+        save_picture(picture, out)
+    print(out)

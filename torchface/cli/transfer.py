@@ -1,0 +1,46 @@
+"""``torchface transfer``: a template's shapes on another head."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from torchface.cli.progress import console, steps
+
+
+def transfer(
+    template: Positional[Path],
+    neutral: Positional[Path],
+    out: Path,
+    part: str | None = None,
+    unit: str | None = None,
+    quiet: bool = False,
+) -> None:
+    """Give a neutral head the shapes of a template rig and write the rig as .glb.
+
+    By deformation transfer: each shape's local stretch and turn is carried over, lids and lips keep touching.
+
+    Args:
+        template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        neutral: The new head: a mesh with the template's topology (.obj, .ply, .glb).
+        out: The .glb to write.
+        part: Keep this region of the template only, such as face; the neutral then has this part's topology.
+        unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
+        quiet: Show no progress.
+    """
+    from torchface.io import load_mesh, load_rig, save_rig
+    from torchface.modeling.transfer import transfer_with_report
+
+    with steps(quiet) as step:
+        step("reading the template")
+        source = load_rig(template, part=part)
+        step("transferring")
+        transferred = transfer_with_report(source, load_mesh(neutral, unit=unit))
+        step("writing the rig")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        save_rig(transferred.rig, out)
+    console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
+    if summary := transferred.report.summary():
+        console.print(summary)
+    print(out)
