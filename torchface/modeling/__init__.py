@@ -2,5 +2,17 @@
 
 from torchface.modeling.detail import BakeStatistics, NormalMap, bake_normal_map, detail_maps
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
+from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
 
-__all__ = ["BakeStatistics", "NormalMap", "ScanAlignment", "align_scan", "bake_normal_map", "detail_maps"]
+__all__ = [
+    "BakeStatistics",
+    "NormalMap",
+    "ScanAlignment",
+    "TransferReport",
+    "TransferredRig",
+    "align_scan",
+    "bake_normal_map",
+    "detail_maps",
+    "transfer_deformation",
+    "transfer_with_report",
+]
