@@ -2,6 +2,7 @@ import json
 
 import pytest
 import torch
+from mutation import check_reader
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.io.picks import (
@@ -89,3 +90,13 @@ def test_what_is_no_picks_file_is_refused(content: bytes, tmp_path) -> None:
     path.write_bytes(content)
     with pytest.raises(FileFormatError):
         load_landmarks(path)
+
+
+def test_mutated_landmarks_are_read_or_refused(tmp_path) -> None:
+    save_landmarks(LandmarkVertices(torch.tensor([2, 0]), ("nose", "chin"), "3-abc"), tmp_path / "l.json")
+    check_reader(load_landmarks, [tmp_path / "l.json"], ".json")
+
+
+def test_mutated_correspondences_are_read_or_refused(tmp_path) -> None:
+    save_correspondences(Correspondences(torch.tensor([1, 2]), torch.eye(3)[:2], ("a", "b")), tmp_path / "c.json")
+    check_reader(load_correspondences, [tmp_path / "c.json"], ".json")
