@@ -9,8 +9,12 @@ import pytest
 import torch
 from hypothesis import settings
 
+from torchface.attachment import Attachment
+from torchface.io import load_rig, load_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
+from torchface.synthetic.marker_stage import place_markers
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -45,6 +49,21 @@ def ict_folder(data: Path) -> Path:
 def performances(data: Path) -> list[Path]:
     """Real Live Link Face takes."""
     return sorted((data / "performances").glob("*.csv"))
+
+
+@pytest.fixture(scope="session")
+def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[BlendshapeRig, Attachment, list[torch.Tensor]]:
+    """A real rig's face (53 shapes), 100 markers on it, and the real takes as its weights, (T,53) each.
+
+    The markers come best first, so the first 50 are a layout of their own.
+    """
+    rig = load_rig(ict_folder, part="face")
+    weights = []
+    for path in performances:
+        track = load_take(path).weights
+        assert track is not None
+        weights.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
+    return rig, place_markers(rig, 100), weights
 
 
 @pytest.fixture(scope="session")
