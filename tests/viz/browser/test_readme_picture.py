@@ -28,7 +28,13 @@ def shoot(chromium: Any, rig: BlendshapeRig, path: Path) -> None:
     try:
         viewer.show_frame(240)
         viewer.editor.rest()
-        dialled = {**GESTURES["smile"], "browInnerUp": 0.6, "jawOpen": 0.25}
+        dialled = {
+            **GESTURES["smile"],
+            "browInnerUp": 0.4,
+            "jawOpen": 0.15,
+            "cheekSquintLeft": 0.2,
+            "cheekSquintRight": 0.2,
+        }
         weights = mapping(tuple(dialled), rig.names) @ torch.tensor(list(dialled.values()))
         for row in weights.nonzero()[:, 0].tolist():
             viewer.set_weight(rig.names[row], float(weights[row]))
