@@ -37,7 +37,7 @@ class Lighting:
         ((0.30, 0.60, -0.75), 0.25),
     )
     ambient: float = 0.38
-    occlusion_rays: int = 12
+    occlusion_rays: int = 8
     occlusion_reach: float = 60.0
     gloss: float = 0.10
 
@@ -156,16 +156,15 @@ def _openness(caster: RayCaster, points: Tensor, normals: Tensor, lighting: Ligh
     """The share of the hemisphere over each point (R,) that is free within reach."""
     count = lighting.occlusion_rays
     generator = torch.Generator().manual_seed(0)
-    turn = torch.rand(len(points), generator=generator, dtype=torch.float64) * 2 * math.pi
-    helper = torch.where(normals[:, :1].abs() > 0.9, torch.tensor([[0.0, 1, 0]]), torch.tensor([[1.0, 0, 0]])).double()
+    turn = torch.rand(len(points), 1, generator=generator) * 2 * math.pi
+    starts, normals = points + 0.05 * normals, normals.float()
+    helper = torch.where(normals[:, :1].abs() > 0.9, torch.tensor([[0.0, 1, 0]]), torch.tensor([[1.0, 0, 0]]))
     side = torch.nn.functional.normalize(torch.linalg.cross(normals, helper), dim=-1)
     other = torch.linalg.cross(normals, side)
-    free = torch.zeros(len(points), dtype=torch.float64)
-    starts = points + 0.05 * normals
+    free = torch.zeros(len(points))
     for i in range(count):  # a loop over rays, each a batch over pixels: all at once would take gigabytes
         height = math.sqrt((i + 0.5) / count)
         angle = turn + i * 2.399963
-        across = math.sqrt(1 - height**2)
-        way = across * (angle.cos()[:, None] * side + angle.sin()[:, None] * other) + height * normals
-        free += (caster.cast(starts, way).distance / lighting.occlusion_reach).clamp(0, 1)
-    return free / count
+        way = height * normals + math.sqrt(1 - height**2) * (angle.cos() * side + angle.sin() * other)
+        free += caster.distances(starts, way, lighting.occlusion_reach)
+    return free.double() / (count * lighting.occlusion_reach)
