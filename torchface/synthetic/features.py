@@ -50,8 +50,8 @@ def eye_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     """Rings (16,32,3): skin over the orbit, upper crease, lid edge, inner lid, a socket behind the eyeball."""
     rim = _lid_rim()
     share = torch.tensor([0.0, 0.22, 0.42, 0.58, 0.71, 0.81, 0.89, 0.95, 1.0]).double()[:, None, None]
-    frontal = border[:, :2] * (1 - share) + rim * share
-    skin = onto_form(frontal[1:].reshape(-1, 2)).view(EYE_RIM, 32, 3)
+    edge = onto_form(torch.cat([rim, torch.full((32, 1), 78.0, dtype=rim.dtype)], dim=1))
+    skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(EYE_RIM, 32, 3)
     centre = torch.tensor(EYE_CENTRE).double()
     # The fold over the upper lid: a furrow with an overhang above it, strongest in the middle of the lid.
     above, _ = lid_order()
@@ -111,8 +111,8 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     red[lower] = torch.stack([x * 1.035, _pchip(s, knots, [-76.6, -76.6, -76.4, -75.2, -72.2, -69.2, -67.8])], 1)
     red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-58.9, -58.4, -57.9, -59.4, -62.6, -65.6, -67.1])], 1)
     share = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0]).double()[:, None, None]
-    frontal = border[:, :2] * (1 - share) + red * share
-    skin = onto_form(frontal[1:].reshape(-1, 2)).view(MOUTH_BORDER, 27, 3)
+    edge = onto_form(torch.cat([red, 92 - 0.02 * red[:, :1] ** 2], dim=1))
+    skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(MOUTH_BORDER, 27, 3)
     is_upper = torch.arange(27) < HALF_LIP
     spread = torch.zeros(27, dtype=torch.float64)
     spread[upper], spread[lower] = s, s
@@ -157,15 +157,15 @@ def _philtrum(points: Tensor) -> Tensor:
 
 
 def nostril_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
-    """Rings (6,14,3): the nose's underside, the nostril's edge, a tube going up inside."""
+    """Rings (6,12,3): the nose's underside, the nostril's edge, a tube going up inside."""
     del onto_form
     # An oval that points from the wing's base to the tip, in the plane of the nose's underside.
-    centre = torch.tensor([7.0, -42.5, 96.0]).double()
+    centre = torch.tensor([7.6, -43.0, 97.0]).double()
     along = torch.nn.functional.normalize(torch.tensor([-0.50, -0.02, 0.86]).double(), dim=0)
     across = torch.nn.functional.normalize(torch.tensor([0.85, 0.15, 0.50]).double(), dim=0)
     middle = border.mean(0)
     angle = torch.atan2((border - middle) @ along, (border - middle) @ across)
-    edge = centre + 2.9 * angle.cos()[:, None] * across + 5.0 * angle.sin()[:, None] * along
+    edge = centre + 2.7 * angle.cos()[:, None] * across + 4.8 * angle.sin()[:, None] * along
     edge = project(edge, 4)
     between = project(0.5 * border + 0.5 * edge, 3)
     between = between + 0.5 * gradient(between)
@@ -183,7 +183,7 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     upward = torch.tensor([0.0, math.cos(lean), -math.sin(lean)]).double()
     forward = torch.tensor([0.0, math.sin(lean), math.cos(lean)]).double()
     outward = torch.tensor([1.0, 0.0, 0.0]).double()
-    centre = torch.tensor([0.0, -13.0, -8.0]).double() + border[:, 0].mean() * outward
+    centre = torch.tensor([0.0, -13.0, -8.0]).double()
     offset = border - border.mean(0)
     angle = torch.atan2(offset @ upward / 1.7, offset @ forward)
     sine, cosine = angle.sin(), angle.cos()
@@ -191,7 +191,7 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     tall = torch.where(sine > 0, 31.0, 31.0) * sine
     wide = 17.5 * cosine * (1 + 0.22 * sine) - 1.5 * sine
     lobe = (-sine - 0.45).clamp(min=0) / 0.55
-    rim = 15.0 * back * (1 - 0.45 * lobe) + 4 * (1 - back) * (sine.abs() > 0.5) * sine.abs()
+    rim = 19.0 * back * (1 - 0.45 * lobe) + 3.0 * (1 - back)
     hollow = 1 - lobe
     rings = [border]
     base = border @ outward  # the head under the ear

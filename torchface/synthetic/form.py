@@ -44,40 +44,43 @@ def _blend_head() -> tuple[Ellipsoid | RoundCone, ...]:
     x, y, z = EYE_CENTRE
     lid = EYE_RADIUS + LID_THICKNESS
     return (
-        # Skull.
+        # Skull and face.
         Ellipsoid((0, 38, -16), (75, 74, 79), 1),
-        Ellipsoid((0, 42, 26), (60, 58, 66), 25),
-        Ellipsoid((0, -5, 18), (64, 70, 66), 25),
+        Ellipsoid((0, 45, 26), (62, 60, 66), 40),
+        Ellipsoid((0, -5, 18), (63, 72, 64), 40),
         # Neck, and the muscle that runs from behind the ear to the throat.
-        RoundCone((0, -60, -26), (0, -200, -34), 50, 55, 22),
-        RoundCone((0, -20, -50), (0, -120, -52), 34, 30, 30),
-        RoundCone((54, -50, -18), (18, -190, 14), 13, 11, 18),
-        # Lower face: muzzle, jaw from chin to angle to joint, cheek.
-        Ellipsoid((0, -62, 51), (38, 44, 40), 18),
-        RoundCone((13, -98, 70), (44, -72, 14), 12, 13, 14),
-        RoundCone((44, -72, 14), (57, -18, 8), 12.5, 10, 16),
-        Ellipsoid((33, -54, 42), (27, 34, 28), 20),
-        Ellipsoid((0, -100, 74), (17, 13, 15.5), 12),
+        RoundCone((0, -70, -14), (0, -200, -36), 46, 52, 30),
+        RoundCone((0, -10, -46), (0, -130, -52), 36, 36, 40),
+        RoundCone((48, -50, -20), (16, -190, 12), 9, 10, 26),
+        # Upper jaw, muzzle, lower jaw from chin to angle to joint, chewing muscle, cheek.
+        Ellipsoid((0, -32, 45), (44, 42, 41), 25),
+        Ellipsoid((0, -64, 51), (35, 40, 40), 24),
+        RoundCone((13, -98, 70), (38, -74, 14), 12, 13, 22),
+        RoundCone((38, -74, 14), (54, -18, 8), 12.0, 9, 22),
+        Ellipsoid((40, -50, 24), (14, 32, 28), 24),
+        Ellipsoid((32, -48, 42), (27, 36, 32), 26),
+        Ellipsoid((0, -100, 73.5), (18, 14, 15.5), 16),
         # Cheekbone from beside the nose to the ear; brow ridge.
-        RoundCone((36, -24, 66), (56, -16, 44), 12, 9, 18),
-        RoundCone((56, -16, 44), (64, -10, 14), 8.5, 5.5, 14),
-        RoundCone((7, 13, 85), (30, 18, 80), 8, 8, 12),
-        RoundCone((30, 18, 80), (50, 8, 61), 8, 7, 12),
-        Ellipsoid((0, 20, 82), (18, 14, 12), 14),
+        RoundCone((35, -22, 60), (54, -14, 42), 13.5, 10.5, 26),
+        RoundCone((54, -14, 42), (61, -8, 12), 9.0, 6.5, 24),
+        RoundCone((8, 16, 79), (28, 20, 77), 9, 10, 22),
+        RoundCone((28, 19, 77), (49, 10, 58), 10, 9, 20),
+        Ellipsoid((0, 18, 80), (18, 16, 14), 18),
         # Orbit, then the lids over the eyeball.
-        Ellipsoid((x - 1.5, y + 1.0, 87), (17, 12.5, 13.5), 11, cut=True),
-        Ellipsoid((17, 1, 90), (7, 10, 9), 8, cut=True),
-        Ellipsoid((x, y, z), (lid + 0.6, lid, lid), 4.5),
+        Ellipsoid((x - 1.5, y + 0.5, 88.5), (17.5, 11.5, 12.5), 20, cut=True),
+        Ellipsoid((17, 0, 91), (6.5, 9, 8), 16, cut=True),
+        Ellipsoid((x, y, z), (lid + 0.8, lid, lid), 7),
         # Temple.
-        Ellipsoid((74, 22, 52), (14, 26, 22), 16, cut=True),
-        # Nose: bridge, tip, wings, the partition between the nostrils.
-        RoundCone((0, 10, 79), (0, -14, 92), 7.5, 7.0, 9),
-        RoundCone((0, -10, 90), (0, -33, 101.5), 7.0, 9.4, 7),
-        Ellipsoid((4, -33.5, 102.5), (7.5, 7.5, 8.2), 4),
-        Ellipsoid((10.6, -36.8, 93.5), (6.6, 6.6, 9.5), 4),
-        RoundCone((0, -39.0, 101), (0, -43, 90), 4.0, 5.0, 4),
-        # Groove between nose and lip, hollow above the chin.
-        Ellipsoid((0, -86, 98), (22, 7, 12.5), 9, cut=True),
+        Ellipsoid((79, 24, 54), (14, 26, 22), 26, cut=True),
+        # Nose: bridge, sides, tip, wings, the partition between the nostrils.
+        RoundCone((0, 10, 78), (0, -14, 91), 8.0, 7.2, 12),
+        RoundCone((0, -10, 90), (0, -33, 101.5), 7.2, 9.0, 9),
+        RoundCone((4, -4, 81), (8.5, -33, 89), 5, 8, 9),
+        Ellipsoid((3.8, -33.5, 102.8), (7.2, 7.2, 8.0), 6),
+        Ellipsoid((11.4, -36.6, 93.0), (5.8, 6.6, 9.0), 4),
+        RoundCone((0, -38.5, 101.5), (0, -43, 91), 3.8, 5.0, 6),
+        # Hollow above the chin.
+        Ellipsoid((0, -86.5, 99), (24, 7, 12.5), 13, cut=True),
     )
 
 

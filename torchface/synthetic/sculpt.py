@@ -39,14 +39,14 @@ _ROWS = np.array([
     (8, 18.5, 18.5, 18.0, 92, -8, -95, 0, 0, 0),
     (14, -16.0, -17.0, -19.0, 90, -6, -86, 0, 0, -8),
     (18, -31.0, -33.0, -42.0, 92, -6, -76, 0, 0, -8),
-    (22, -46.0, -49.0, -62.0, 92, -6, -70, 0, 0, -5),
+    (22, -47.5, -49.5, -62.0, 92, -6, -70, 0, 0, -5),
     (28, -86.0, -71.0, -94.0, 90, -4, -70, 0, 0, 0),
     (31, -102.0, -80.0, -110.0, 88, -4, -72, -10, -5, 0),
     (33, -112.0, -88.0, -120.0, 80, -6, -74, -50, -30, 0),
     (34, -115.0, -95.0, -126.0, 71, -10, -76, -75, -40, 0),
     (36, -119.0, -111.0, -138.0, 50, -18, -80, -70, -15, 0),
-    (38, -130.0, -128.0, -150.0, 37, -22, -84, -25, 0, 0),
-    (43, -178.0, -178.0, -186.0, 32, -28, -92, 0, 0, 0),
+    (38, -128.0, -126.0, -146.0, 35, -22, -84, -25, 0, 0),
+    (43, -164.0, -164.0, -170.0, 30, -28, -90, 0, 0, 0),
 ])  # fmt: skip
 
 # Frontal distance from the midline (mm) of a few columns on a few rows.
@@ -67,17 +67,15 @@ _COLUMN_AT = np.array([
 ])  # fmt: skip
 _EAR_SPAN = (86.0, 110.0)  # azimuth of the ear's block, degrees
 
-# How rows bend round the nose at the midline: row, height, depth, tilt of the ray.
-_NOSE_ROWS = np.array([
-    (14, 0, 0, 0),
-    (16, 0, 6, 0),
-    (18, 0.0, 15, 0),
-    (19, 2.0, 18, -5),
-    (20, -2.0, 18, -40),
-    (21, -4.5, 10, -75),
-    (22, 1.0, 0, -25),
-    (23, 0.0, 0, 0),
-])  # fmt: skip
+# Where rows pass over the nose's lower half: row, then a point (x, y, z) on each of the columns below; the form decides.
+_NOSE_COLUMNS = np.array([0, 1, 3, 5, 6])
+_NOSE_ROWS = {
+    17: ((0, -29.5, 110.0), (2.8, -29.5, 109.5), (8.6, -29.5, 104.0), (14.5, -30.5, 92.0), (17.5, -31.0, 86.0)),
+    18: ((0, -34.5, 112.5), (2.9, -34.5, 112.0), (9.2, -35.0, 106.0), (15.8, -34.5, 95.0), (18.2, -34.5, 88.0)),
+    19: ((0, -40.0, 110.0), (2.8, -40.3, 109.5), (8.8, -40.8, 104.0), (16.0, -39.5, 95.0), (18.4, -39.0, 88.0)),
+    20: ((0, -43.6, 104.5), (2.7, -43.8, 104.0), (8.0, -43.5, 98.0), (15.0, -42.8, 92.0), (18.0, -42.5, 87.5)),
+    21: ((0, -45.6, 98.5), (2.9, -45.5, 97.5), (7.4, -44.8, 93.0), (13.4, -44.6, 89.5), (18.0, -45.2, 87.0)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +92,7 @@ def _bend(front: Tensor, side: Tensor, back: Tensor, cosine: Tensor) -> Tensor:
 
 def _guide(row: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
     """Points near the head and outward rays for grid coordinates: row (N,) and azimuth (N,) radians."""
-    knots = CubicSpline(_ROWS[:, 0], _ROWS[:, 1:])
     f = torch.from_numpy(PchipInterpolator(_ROWS[:, 0], _ROWS[:, 1:])(row.numpy()))
-    del knots
     cosine, sine = azimuth.cos(), azimuth.sin()
     y = _bend(f[:, 0], f[:, 1], f[:, 2], cosine)
     z = _bend(f[:, 3], f[:, 4], f[:, 5], cosine)
@@ -104,11 +100,8 @@ def _guide(row: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
     elevation = ((97.0 - y) / 17).clamp(0, 3)  # the crown draws together
     width = GUIDE_WIDTH * (1 - 0.16 * (1 - elevation / 3) ** 2)
     x = width * sine
-    nose = torch.from_numpy(PchipInterpolator(_NOSE_ROWS[:, 0], _NOSE_ROWS[:, 1:])(row.clamp(14, 23).numpy()))
-    near = torch.exp(-((x / 15.0) ** 4)) * (cosine > 0)
-    y, z = y + near * nose[:, 0], z + near * nose[:, 1]
-    tilt = torch.deg2rad(tilt + near * nose[:, 2])
-    turn = torch.atan2(sine / width, cosine / 88.0) * (1 - 0.35 * near)
+    tilt = torch.deg2rad(tilt)
+    turn = torch.atan2(sine / width, cosine / 88.0)
     ray = torch.stack([turn.sin() * tilt.cos(), tilt.sin(), turn.cos() * tilt.cos()], dim=1)
     return torch.stack([x, y, z], dim=1), ray
 
@@ -140,16 +133,11 @@ def row_of_height(height: Tensor) -> Tensor:
     return torch.from_numpy(PchipInterpolator(_ROWS[order, 1], _ROWS[order, 0])(height.numpy()))
 
 
-def onto_form(frontal: Tensor) -> Tensor:
-    """Points of the form that a viewer in front sees at frontal positions (x, y), (N,2) -> (N,3)."""
-    azimuth = _azimuth_of(frontal[:, 0])
-    ray = torch.stack([(0.6 * azimuth).sin(), torch.zeros_like(azimuth), (0.6 * azimuth).cos()], dim=1)
-    reached = torch.cat([frontal, 85.0 * torch.ones(len(frontal), 1).double()], dim=1)
-    for _ in range(3):  # slide the ray sideways until it lands at the wanted x
-        start = reached + 30 * ray
-        hit = cast(start, -ray, 30)
-        reached = reached + torch.cat([frontal - hit[:, :2], hit[:, 2:] - reached[:, 2:]], dim=1)
-    return hit
+def onto_form(points: Tensor) -> Tensor:
+    """Where a viewer in front, a little to the side for what lies aside, sees the form near points (N,3)."""
+    azimuth = 0.6 * _azimuth_of(points[:, 0])
+    ray = torch.stack([azimuth.sin(), torch.zeros_like(azimuth), azimuth.cos()], dim=1)
+    return cast(points + 12 * ray, -ray, 30)
 
 
 def coons(border: Tensor, height: int, width: int) -> Tensor:
@@ -176,11 +164,20 @@ def sculpture() -> Sculpture:
     start, ray = _guide(plane[t.grid[on_grid], 0], plane[t.grid[on_grid], 1])
     vertices[t.grid[on_grid]] = cast(start + 45 * ray, -ray)
     _crown(t, vertices, plane)
-    free = _relax(t, vertices)
-    del free
+    _nose(t, vertices)
+    _relax(t, vertices)
     _lay_rings(t, vertices, plane)
     vertices[t.midline, 0] = 0.0
     return Sculpture(vertices, plane)
+
+
+def _nose(t: Topology, vertices: Tensor) -> None:
+    """Rows over and under the nose, where rays from the front would miss, laid by their table."""
+    for row, points in _NOSE_ROWS.items():
+        spots = torch.from_numpy(PchipInterpolator(_NOSE_COLUMNS, np.array(points), axis=0)(np.arange(7)))
+        ids = t.grid[row, :7]
+        here = ids >= 0
+        vertices[ids[here]] = project(spots[here], 5)
 
 
 def _crown(t: Topology, vertices: Tensor, plane: Tensor) -> None:
@@ -214,7 +211,7 @@ def _neighbours(quads: Tensor, count: int) -> Tensor:
     return torch.sparse_coo_tensor(pairs.T, 1 / degree[pairs[:, 0]], (count, count), check_invariants=False).coalesce()
 
 
-def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> Tensor:
+def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> None:
     """Evens the grid out along the form; ring systems come later, so only quads between grid and crown count."""
     present = torch.zeros(t.half_count, dtype=torch.bool)
     present[t.grid[t.grid >= 0]] = True
@@ -224,15 +221,11 @@ def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> Tensor:
     fixed = t.midline | ~present
     for edge in (t.grid[-1], *(t.rings[name][0] for name in t.rings)):
         fixed[edge] = True
-    on_midline = present & t.midline
-    on_midline[t.grid[-1]] = False
-    on_midline[t.rings["mouth"][0]] = False
     for _ in range(rounds):
         mean = average @ vertices
         step = torch.where(fixed[:, None], vertices, 0.5 * vertices + 0.5 * mean)
         step[~fixed] = project(step[~fixed], 1)
         vertices.copy_(step)
-    return ~fixed
 
 
 def _lay_rings(t: Topology, vertices: Tensor, plane: Tensor) -> None:

@@ -38,7 +38,7 @@ class Block:
 
 EYE = Block(8, 14, 6, 16, 15)
 MOUTH = Block(22, 28, 0, 10, 16)
-NOSTRIL = Block(18, 21, 1, 5, 5)
+NOSTRIL = Block(19, 21, 1, 5, 5)
 EAR = Block(9, 21, 21, 25, 10)
 EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, NOSTRIL_RIM, EAR_RIM = 8, 5, 9, 2, 4
 """Rings that mean something: lid edge, border of the red of the lips, where lips touch, nostril and ear edge."""
