@@ -43,14 +43,13 @@ def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, itera
             part = problem.rows(rows)
             here = x[rows]
             gradient = part.gradient(here)
-            residual = part.residual(here, gradient)
-            open_ = part.unsolved(here, tolerance, residual)
+            open_ = part.unsolved(here, tolerance, gradient)
             if not bool(open_.any()):
                 break
             if not bool(open_.all()):
                 rows, here, gradient = rows[open_], here[open_], gradient[open_]
-                part, residual = problem.rows(rows), residual[open_]
-            x[rows] = _step(part, here, gradient, residual)
+                part = problem.rows(rows)
+            x[rows] = _step(part, here, gradient, part.residual(here, gradient))
     return x
 
 

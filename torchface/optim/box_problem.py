@@ -56,20 +56,24 @@ class BoxProblem:
         """What a move m from a point of gradient g adds to the objective, without the cancellation of two of them."""
         return (moved * (gradient + 0.5 * self.curvature(moved))).sum(-1)
 
-    def residual(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
-        """:math:`\\max_i |x - clip(x - (Hx+f)/diag H)|_i / (1 + |x_i|)`, (B,); zero only at the optimum."""
+    def residuals(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
+        """:math:`|x - clip(x - (Hx+f)/diag H)|_i / (1 + |x_i|)`, (B,N); zero everywhere only at the optimum."""
         gradient = self.gradient(x) if gradient is None else gradient
-        return ((x - self.clip(x - gradient / self.diagonal)).abs() / (1 + x.abs())).amax(-1)
+        return (x - self.clip(x - gradient / self.diagonal)).abs() / (1 + x.abs())
 
-    def unsolved(self, x: Tensor, tolerance: float, residual: Tensor | None = None) -> Tensor:
-        """Where the residual exceeds both the tolerance and what rounding alone can leave of it, (B,) bool."""
-        residual = self.residual(x) if residual is None else residual
-        open_ = residual > tolerance
+    def residual(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
+        """The largest of a problem's residuals, (B,)."""
+        return self.residuals(x, gradient).amax(-1)
+
+    def unsolved(self, x: Tensor, tolerance: float, gradient: Tensor | None = None) -> Tensor:
+        """Where a residual exceeds both the tolerance and what rounding alone can leave of it, (B,) bool."""
+        residuals = self.residuals(x, gradient)
+        open_ = residuals.amax(-1) > tolerance
         if not bool(open_.any()):
             return open_
         sums = BoxProblem(self.H.abs(), self.f.abs(), self.lower, self.upper, self.diagonal).gradient(x.abs())
-        rounding = 4 * torch.finfo(x.dtype).eps * (sums / self.diagonal / (1 + x.abs())).amax(-1)
-        return open_ & (residual > rounding)
+        rounding = 4 * torch.finfo(x.dtype).eps * sums / self.diagonal / (1 + x.abs())
+        return (residuals > rounding.clamp(min=tolerance)).any(-1)
 
 
 def metric(H: Tensor) -> Tensor:

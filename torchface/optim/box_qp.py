@@ -11,13 +11,14 @@ from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 
-# Steps of splitting between looks at the residual. A coarse solve ends in the first rounds nearly always; a fine one
-# needs more digits than splitting gives quickly, so Newton steps follow the first round at once. Either may need the
-# later rounds where H is singular or close to it: splitting brings such problems near enough for Newton steps.
-_ROUNDS_COARSE, _ROUNDS_FINE = (60, 40, 40), (60,)
-_ROUNDS_LATER = (100, 200, 400, 800, 1600)
+# Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
+# ends in the first rounds nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps
+# follow the first round at once. The later rounds are for an H that is singular or close to it: splitting brings such
+# problems near enough for Newton steps to end them.
+_COARSE_ROUNDS = ((0, 48), (0, 32), (0, 32), (0, 32))
+_FINE_ROUNDS = ((0, 60),)
+_LATER_ROUNDS = ((8, 100), (8, 200), (8, 400), (8, 800), (8, 1600), (100, 0))
 _COARSE = 1e-7
-_NEWTON_STEPS, _LAST_NEWTON_STEPS = 8, 100
 # The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
 # variable alone would go, or where the residual itself is still this share of that way.
 _RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
@@ -62,7 +63,7 @@ def box_qp(
 
     Example:
         >>> H = torch.tensor([[2.0, 0.0], [0.0, 4.0]])
-        >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).tolist()
+        >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).round(decimals=4).tolist()
         [[0.5, 1.0], [0.0, 0.5]]
     """
     return BoxQP(H, lower, upper, tolerance)(f, start)
@@ -80,7 +81,7 @@ class BoxQP:
 
     Example:
         >>> qp = BoxQP(torch.eye(2), lower=0.0, upper=float("inf"))
-        >>> qp(torch.tensor([[-3.0, 1.0]])).tolist()
+        >>> qp(torch.tensor([[-3.0, 1.0]])).round(decimals=4).tolist()
         [[3.0, 0.0]]
     """
 
@@ -125,25 +126,27 @@ class BoxQP:
 
 def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None, tolerance: float) -> Tensor:
     """Rounds of splitting for the problems still open, Newton steps for the last of them."""
-    rounds = _ROUNDS_COARSE if tolerance >= _COARSE else _ROUNDS_FINE
+    first = _COARSE_ROUNDS if tolerance >= _COARSE else _FINE_ROUNDS
     state = start_splitting(problem, start)
     x = state.z.clone()
     rows = torch.arange(len(x), device=x.device)
     part = problem
-    plan = [(0, 0), *((steps, 0) for steps in rounds[:-1]), (rounds[-1], _NEWTON_STEPS)]
-    plan += [(steps, _NEWTON_STEPS) for steps in _ROUNDS_LATER]
-    plan[-1] = (_ROUNDS_LATER[-1], _LAST_NEWTON_STEPS)
-    for steps, newton_steps in plan:
-        state = splitting_steps(part, factors, state, steps)
-        found = state.z
+    for number, (newton_steps, steps) in enumerate((*first, *_LATER_ROUNDS)):
+        gradient = part.gradient(state.z)
         if newton_steps:
-            found = projected_newton(part, found, tolerance, newton_steps)
-        x[rows] = found
-        still = part.unsolved(found, tolerance).nonzero()[:, 0]
-        if not len(still):
+            x[rows] = found = projected_newton(part, state.z, tolerance, newton_steps)
+            still = part.unsolved(found, tolerance)
+        else:
+            x[rows] = state.z
+            still = part.unsolved(state.z, tolerance, gradient)
+        keep = still.nonzero()[:, 0]
+        if not len(keep):
             break
-        if len(still) < len(rows):
-            rows, part, state, factors = rows[still], part.rows(still), state.rows(still), factors.rows(still)
+        if len(keep) < len(rows):
+            rows, part, state, factors = rows[keep], part.rows(keep), state.rows(keep), factors.rows(keep)
+            gradient = gradient[keep]
+        dtype = torch.float32 if number < len(first) else torch.float64
+        state = splitting_steps(part, factors, state, steps, gradient, dtype)
     _check_bounded(problem, x)
     return x
 

@@ -12,6 +12,10 @@ In the variable :math:`t = z - u` everything but the clip is one affine map,
 :math:`v = t G + (2 - \alpha) z + c` with :math:`G = \alpha \rho D (H + \rho D)^{-1} - I` and
 :math:`c = -\alpha (H + \rho D)^{-1} f`, and :math:`t' = 2 z' - v`: a product, two additions and a clamp a step.
 
+The constant is formed from the gradient g at any point w as
+:math:`c = -\alpha (H + \rho D)^{-1} g + w ((\alpha - 1) I - G)`. With g and w in float64 and w near the solution the
+steps themselves may run in float32: what they round away is a share of what is left to go, not of f.
+
 Source: Boyd et al. 2011, sections 3.4.3 and 5.2; the diagonal metric takes the place of a scaled H.
 """
 
@@ -49,6 +53,10 @@ class SplittingFactors:
             return self
         return SplittingFactors(self.step[keep], self.offset[keep], self.relaxation)
 
+    def constant(self, w: Tensor, gradient: Tensor) -> Tensor:
+        """:math:`c` from the gradient at w, both (B,N)."""
+        return _times(gradient, self.offset) - _times(w, self.step) + (self.relaxation - 1) * w
+
 
 @dataclass(frozen=True, eq=False)
 class SplittingState:
@@ -82,33 +90,41 @@ def start_splitting(problem: BoxProblem, start: Tensor | None) -> SplittingState
 
 
 def splitting_steps(
-    problem: BoxProblem, factors: SplittingFactors, state: SplittingState, steps: int
+    problem: BoxProblem,
+    factors: SplittingFactors,
+    state: SplittingState,
+    steps: int,
+    gradient: Tensor | None = None,
+    dtype: torch.dtype = torch.float64,
 ) -> SplittingState:
-    """The state after this many steps."""
-    if factors.step.ndim == 3:
-        return _steps_of_many(problem, factors, state, steps)
-    constant = problem.f @ factors.offset
-    keep = 2 - factors.relaxation
-    lower, upper = problem.lower, problem.upper
-    z, t = state.z.clone(), state.t.clone()
+    """The state after some steps.
+
+    Args:
+        problem: B problems.
+        factors: of its H.
+        state: where to start.
+        steps: how many.
+        gradient: of the problem at ``state.z``, (B,N), if it is at hand.
+        dtype: in which the steps run; what goes in and comes out is float64.
+    """
+    gradient = problem.gradient(state.z) if gradient is None else gradient
+    constant = factors.constant(state.z, gradient).to(dtype)
+    lower, upper, step = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)
+    z, t = state.z.to(dtype, copy=True), state.t.to(dtype, copy=True)
+    if step.ndim == 3:
+        constant, z, t = constant[:, None], z[:, None], t[:, None]
+    product = torch.addmm if step.ndim == 2 else torch.baddbmm
     v = torch.empty_like(z)
     for _ in range(steps):
-        torch.addmm(constant, t, factors.step, out=v)
-        v.add_(z, alpha=keep)
+        product(constant, t, step, out=v)
+        v.add_(z, alpha=2 - factors.relaxation)
         torch.clamp(v, lower, upper, out=z)
         torch.lerp(v, z, 2.0, out=t)  # 2 z - v
-    return SplittingState(z, t)
+    shape = state.z.shape
+    # In float32 a bound may have been rounded to the wrong side of itself.
+    return SplittingState(problem.clip(z.view(shape).double()), t.view(shape).double())
 
 
-def _steps_of_many(problem: BoxProblem, factors: SplittingFactors, state: SplittingState, steps: int) -> SplittingState:
-    """The same with an H a problem: rows as (B,1,N)."""
-    constant = torch.bmm(problem.f[:, None], factors.offset)
-    keep = 2 - factors.relaxation
-    z, t = state.z[:, None].clone(), state.t[:, None].clone()
-    v = torch.empty_like(z)
-    for _ in range(steps):
-        torch.baddbmm(constant, t, factors.step, out=v)
-        v.add_(z, alpha=keep)
-        torch.clamp(v, problem.lower, problem.upper, out=z)
-        torch.lerp(v, z, 2.0, out=t)
-    return SplittingState(z[:, 0], t[:, 0])
+def _times(x: Tensor, matrix: Tensor) -> Tensor:
+    """x (B,N) by one matrix or by one each."""
+    return x @ matrix if matrix.ndim == 2 else torch.bmm(x[:, None], matrix)[:, 0]
