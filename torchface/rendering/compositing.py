@@ -30,7 +30,7 @@ def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
 
 
 def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
-    """Images (3,H,W) in rows of ``columns``, on white; a column is as wide as its widest, a row as high as its highest."""
+    """Images (3,H,W) in rows of ``columns``, on white; columns as wide, and rows as high, as their largest image."""
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     heights = [max(image.shape[1] for image in row) for row in rows]
     widths = [max(image.shape[2] for image in images[i::columns]) for i in range(min(columns, len(images)))]
