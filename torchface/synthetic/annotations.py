@@ -15,7 +15,7 @@ from torchface.synthetic.topology import EAR, EYE_RIM, MOUTH_BORDER, MOUTH_CONTA
 # The left half of the jaw's contour from the ear to before the chin, and of the brow from its inner to its outer end.
 _JAW = ((69, -12, 12), (67, -28, 14), (64, -46, 16), (58.5, -64, 20), (50.5, -81, 30), (40.5, -94, 46), (29.5, -104, 62), (16, -110, 76))  # fmt: skip
 _BROW = ((9.5, 17.5, 92), (18, 20.5, 90), (28, 22.5, 86), (38.5, 21.5, 79), (48, 16.5, 68))
-_NOSE_BRIDGE = (7.0, -7.0, -20.0, -33.5)
+_NOSE_BRIDGE = (6.5, -7.0, -20.0, -33.5)
 
 
 @lru_cache(maxsize=1)
@@ -49,12 +49,12 @@ def _landmarks(t: Topology) -> Tensor:
     jaw = _nearest(_JAW, skin)
     middle = skin & t.midline & (p[:, 2] > 30)
     spots = tuple((0.0, y, 90.0) for y in _NOSE_BRIDGE)
-    chin = _nearest(((0.0, -113.5, 80.0),), middle)
+    chin = _nearest(((0.0, -115.0, 80.0),), middle)
     brow = _nearest(_BROW, skin)
     bridge = torch.stack([
         (p[:, 1] - y).abs().masked_fill(~middle, torch.inf).argmin() for _, y, _ in spots
     ])  # fmt: skip
-    base = _nearest(((0.0, -44.0, 93.5),), middle)
+    base = t.grid[21, :1]
     wings = _nearest(((7.0, -45.0, 92.0), (14.0, -42.5, 90.5)), skin)
     rim, (above, below) = t.rings["eye"][EYE_RIM], lid_order()
     corner_in, corner_out = rim[above[0]], rim[above[16]]

@@ -35,10 +35,10 @@ def _lid_rim() -> Tensor:
     """The opening's edge seen from in front, (32,2), in ring order."""
     tau = torch.arange(UPPER_LID + 1).double() / UPPER_LID
     tau = 0.75 * tau + 0.25 * (1 - (math.pi * tau).cos()) / 2
-    x = EYE_CENTRE[0] - 15.0 + 30.0 * tau
+    x = EYE_CENTRE[0] - 15.3 + 30.6 * tau
     base = -2.6 + 3.0 * tau
-    upper = base + _pchip(tau, [0, 0.08, 0.22, 0.42, 0.62, 0.82, 1], [0, 2.1, 4.7, 6.3, 5.9, 3.4, 0])
-    lower = base - _pchip(tau, [0, 0.08, 0.22, 0.42, 0.66, 0.86, 1], [0, 0.8, 2.3, 3.9, 4.5, 2.9, 0])
+    upper = base + _pchip(tau, [0, 0.08, 0.22, 0.42, 0.62, 0.82, 1], [0, 1.9, 4.2, 5.7, 5.4, 3.2, 0])
+    lower = base - _pchip(tau, [0, 0.08, 0.22, 0.42, 0.66, 0.86, 1], [0, 0.8, 2.2, 3.7, 4.2, 2.7, 0])
     rim = torch.zeros(32, 2, dtype=torch.float64)
     above, below = lid_order()
     rim[below] = torch.stack([x, lower], 1)
@@ -58,7 +58,7 @@ def eye_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     strength = torch.zeros(32, dtype=torch.float64)
     strength[above] = (math.pi * torch.arange(UPPER_LID + 1).double() / UPPER_LID).sin() ** 0.7
     outward = torch.nn.functional.normalize(skin - centre, dim=-1)
-    depth = torch.tensor([0.0, 0.5, 1.1, 0.3, -1.3, -0.4, 0.0, 0.0]).double()[:, None]
+    depth = torch.tensor([0.0, 0.4, 0.9, 0.9, -1.7, -0.5, 0.0, 0.0]).double()[:, None]
     skin = skin + outward * (depth * strength)[..., None]
     rings = [border[None], skin]
     edge = skin[-1]
@@ -96,7 +96,7 @@ def contact_line(x: Tensor) -> tuple[Tensor, Tensor]:
     """Height and depth where the lips meet, at a distance from the midline."""
     share = (x.abs() / MOUTH_HALF_WIDTH).clamp(max=1.1)
     height = STOMION_HEIGHT - 0.5 * torch.exp(-((x / 4.0) ** 2)) + 0.5 * torch.exp(-(((x.abs() - 10) / 6) ** 2))
-    return height - 0.8 * share**3, 92.4 - 12.5 * share**2.2
+    return height - 0.8 * share**3, 91.8 - 12.5 * share**2.2
 
 
 def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
@@ -109,7 +109,7 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     red = torch.zeros(27, 2, dtype=torch.float64)
     knots = [0.0, 0.12, 0.24, 0.45, 0.7, 0.9, 1.0]
     red[lower] = torch.stack([x * 1.035, _pchip(s, knots, [-76.6, -76.6, -76.4, -75.2, -72.2, -69.2, -67.8])], 1)
-    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-58.9, -58.4, -57.9, -59.4, -62.6, -65.6, -67.1])], 1)
+    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-59.5, -58.9, -58.3, -59.6, -62.6, -65.6, -67.1])], 1)
     share = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0]).double()[:, None, None]
     edge = onto_form(torch.cat([red, 92 - 0.02 * red[:, :1] ** 2], dim=1))
     skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(MOUTH_BORDER, 27, 3)
@@ -188,10 +188,10 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     angle = torch.atan2(offset @ upward / 1.7, offset @ forward)
     sine, cosine = angle.sin(), angle.cos()
     back = ((0.35 - cosine) / 1.35).clamp(0, 1) ** 0.8  # 0 where the ear grows from the cheek, 1 at its free edge
-    tall = torch.where(sine > 0, 31.0, 31.0) * sine
+    tall = torch.where(sine > 0, 29.5, 29.5) * sine
     wide = 17.5 * cosine * (1 + 0.22 * sine) - 1.5 * sine
     lobe = (-sine - 0.45).clamp(min=0) / 0.55
-    rim = 19.0 * back * (1 - 0.45 * lobe) + 3.0 * (1 - back)
+    rim = 19.0 * back * (1 - 0.45 * lobe) + 1.2 * (1 - back)
     hollow = 1 - lobe
     rings = [border]
     base = border @ outward  # the head under the ear
@@ -201,7 +201,7 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
         (0.46, 0.42 * rim - 4.0 * hollow), (0.30, 0.28 * rim - 6.0),
     ):  # fmt: skip
         spot = centre + (size * tall)[:, None] * upward + (size * wide)[:, None] * forward
-        root = base.mean() + (base - base.mean()) * size
+        root = 67.0 + 0.65 * (base - 67.0) * (1 - back)
         spot[:, 0] = root + height
         rings.append(spot)
     return torch.stack(rings)

@@ -47,24 +47,25 @@ def _blend_head() -> tuple[Ellipsoid | RoundCone, ...]:
         # Skull and face.
         Ellipsoid((0, 38, -16), (75, 74, 79), 1),
         Ellipsoid((0, 45, 26), (62, 60, 66), 40),
-        Ellipsoid((0, -5, 18), (63, 72, 64), 40),
+        Ellipsoid((0, -5, 18), (57.5, 72, 64), 40),
         # Neck, and the muscle that runs from behind the ear to the throat.
         RoundCone((0, -70, -14), (0, -200, -36), 46, 52, 30),
         RoundCone((0, -10, -46), (0, -130, -52), 36, 36, 40),
         RoundCone((48, -50, -20), (16, -190, 12), 9, 10, 26),
+        RoundCone((56, -8, -18), (52, -38, -18), 11, 9, 26),
         # Upper jaw, muzzle, lower jaw from chin to angle to joint, chewing muscle, cheek.
         Ellipsoid((0, -32, 45), (44, 42, 41), 25),
         Ellipsoid((0, -64, 51), (35, 40, 40), 24),
-        RoundCone((13, -98, 70), (38, -74, 14), 12, 13, 22),
-        RoundCone((38, -74, 14), (54, -18, 8), 12.0, 9, 22),
-        Ellipsoid((40, -50, 24), (14, 32, 28), 24),
+        RoundCone((13, -98, 70), (34.5, -75, 14), 12, 13, 22),
+        RoundCone((34.5, -75, 14), (51, -18, 8), 12.0, 9, 22),
+        Ellipsoid((37, -48, 24), (14, 32, 28), 24),
         Ellipsoid((32, -48, 42), (27, 36, 32), 26),
-        Ellipsoid((0, -100, 73.5), (18, 14, 15.5), 16),
+        Ellipsoid((0, -101.5, 73.5), (18, 14, 15.5), 16),
         # Cheekbone from beside the nose to the ear; brow ridge.
-        RoundCone((35, -22, 60), (54, -14, 42), 13.5, 10.5, 26),
-        RoundCone((54, -14, 42), (61, -8, 12), 9.0, 6.5, 24),
-        RoundCone((8, 16, 79), (28, 20, 77), 9, 10, 22),
-        RoundCone((28, 19, 77), (49, 10, 58), 10, 9, 20),
+        RoundCone((35, -22, 60), (52, -14, 42), 13.5, 10.5, 26),
+        RoundCone((52, -14, 42), (55, -8, 12), 9.5, 6.5, 24),
+        RoundCone((8, 18, 79), (28, 23, 76), 9, 10, 22),
+        RoundCone((28, 22, 76), (49, 13, 57), 10, 9, 22),
         Ellipsoid((0, 18, 80), (18, 16, 14), 18),
         # Orbit, then the lids over the eyeball.
         Ellipsoid((x - 1.5, y + 0.5, 88.5), (17.5, 11.5, 12.5), 20, cut=True),
@@ -74,11 +75,11 @@ def _blend_head() -> tuple[Ellipsoid | RoundCone, ...]:
         Ellipsoid((79, 24, 54), (14, 26, 22), 26, cut=True),
         # Nose: bridge, sides, tip, wings, the partition between the nostrils.
         RoundCone((0, 10, 78), (0, -14, 91), 8.0, 7.2, 12),
-        RoundCone((0, -10, 90), (0, -33, 101.5), 7.2, 9.0, 9),
+        RoundCone((0, -10, 90), (0, -33.3, 102.7), 7.2, 9.0, 9),
         RoundCone((4, -4, 81), (8.5, -33, 89), 5, 8, 9),
-        Ellipsoid((3.8, -33.5, 102.8), (7.2, 7.2, 8.0), 6),
-        Ellipsoid((11.4, -36.6, 93.0), (5.8, 6.6, 9.0), 4),
-        RoundCone((0, -38.5, 101.5), (0, -43, 91), 3.8, 5.0, 6),
+        Ellipsoid((3.8, -33.8, 105.2), (7.2, 7.2, 8.0), 6),
+        Ellipsoid((12.0, -36.4, 93.0), (6.0, 6.6, 9.0), 4),
+        RoundCone((0, -38.5, 101.5), (0, -41.0, 87), 3.8, 4.2, 3.5),
         # Hollow above the chin.
         Ellipsoid((0, -86.5, 99), (24, 7, 12.5), 13, cut=True),
     )

@@ -10,15 +10,25 @@ import torch
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
-from torchface.synthetic.features import ear_rings, eyeball_points, eye_rings, mouth_rings, nostril_rings
+from torchface.synthetic.features import (
+    MOUTH_HALF_WIDTH,
+    STOMION_HEIGHT,
+    ear_rings,
+    eye_rings,
+    eyeball_points,
+    mouth_rings,
+    nostril_rings,
+)
 from torchface.synthetic.form import cast, project
 from torchface.synthetic.topology import (
     CAP_SIDE,
     COLUMNS,
     EAR,
     EYE,
+    EYE_RIM,
     MOUTH,
     MOUTH_BORDER,
+    MOUTH_CONTACT,
     NOSTRIL,
     ROWS,
     Topology,
@@ -65,7 +75,7 @@ _COLUMN_AT = np.array([
     (0, 7.5, 16.0, 28.0, 50.0),
     (0, 7.5, 16.0, 28.0, 50.0),
 ])  # fmt: skip
-_EAR_SPAN = (86.0, 110.0)  # azimuth of the ear's block, degrees
+_EAR_SPAN = (84.0, 107.0)  # azimuth of the ear's block, degrees
 
 # Where rows pass over the nose's lower half: row, then a point (x, y, z) on each of the columns below; the form decides.
 _NOSE_COLUMNS = np.array([0, 1, 3, 5, 6])
@@ -74,7 +84,7 @@ _NOSE_ROWS = {
     18: ((0, -34.5, 112.5), (2.9, -34.5, 112.0), (9.2, -35.0, 106.0), (15.8, -34.5, 95.0), (18.2, -34.5, 88.0)),
     19: ((0, -40.0, 110.0), (2.8, -40.3, 109.5), (8.8, -40.8, 104.0), (16.0, -39.5, 95.0), (18.4, -39.0, 88.0)),
     20: ((0, -43.6, 104.5), (2.7, -43.8, 104.0), (8.0, -43.5, 98.0), (15.0, -42.8, 92.0), (18.0, -42.5, 87.5)),
-    21: ((0, -45.6, 98.5), (2.9, -45.5, 97.5), (7.4, -44.8, 93.0), (13.4, -44.6, 89.5), (18.0, -45.2, 87.0)),
+    21: ((0, -45.0, 95.0), (2.9, -45.0, 94.5), (7.4, -44.8, 93.0), (13.4, -44.6, 89.5), (18.0, -45.2, 87.0)),
 }  # fmt: skip
 
 
@@ -218,13 +228,14 @@ def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> None:
     present[t.crown] = True
     quads = t.half_quads[present[t.half_quads].all(1)]
     average = _neighbours(quads, t.half_count)
-    fixed = t.midline | ~present
+    fixed = ~present
     for edge in (t.grid[-1], *(t.rings[name][0] for name in t.rings)):
         fixed[edge] = True
     for _ in range(rounds):
         mean = average @ vertices
         step = torch.where(fixed[:, None], vertices, 0.5 * vertices + 0.5 * mean)
         step[~fixed] = project(step[~fixed], 1)
+        step[t.midline, 0] = 0.0
         vertices.copy_(step)
 
 
@@ -239,18 +250,34 @@ def _lay_rings(t: Topology, vertices: Tensor, plane: Tensor) -> None:
         placed = shape(vertices[rings[0]], onto_form)
         vertices[rings[1:]] = placed[1:]
         centre = plane[rings[0]].amin(0) + (plane[rings[0]].amax(0) - plane[rings[0]].amin(0)) / 2
-        if name == "mouth":
-            centre[1] = 0.0
-        share = torch.linspace(1, 0.08, len(rings), dtype=torch.float64)[:, None, None]
-        plane[rings[1:]] = (centre + (plane[rings[0]] - centre) * share)[1:]
+        skin = 0
         if name in ("eye", "mouth"):  # what is skin keeps its frontal place
-            skin = MOUTH_BORDER + 3 if name == "mouth" else 8
-            spots = placed[1 : skin + 1]
+            skin = MOUTH_CONTACT if name == "mouth" else EYE_RIM
+            spots = placed[1 : skin + 1].clone()
+            if name == "mouth":
+                _part_lips(spots)
             plane[rings[1 : skin + 1], 0] = row_of_height(spots[..., 1].clamp(-112, 97))
             plane[rings[1 : skin + 1], 1] = _azimuth_of(spots[..., 0])
+            centre = plane[rings[skin]].mean(0) if name == "eye" else centre
+        if name == "mouth":
+            centre = torch.tensor([float(plane[rings[skin, [0, -1]], 0].mean()), 0.0]).double()
+        share = torch.linspace(1, 0.08, len(rings) - skin, dtype=torch.float64)[:, None, None]
+        plane[rings[skin + 1 :]] = (centre + (plane[rings[skin]] - centre) * share)[1:]
         _fill_cap(t.caps[name], vertices, plane, block.height, block.width, half=name == "mouth")
     loops, front, back = t.eyeball, t.caps["eyeball_front"], t.caps["eyeball_back"]
     vertices[loops], vertices[front], vertices[back] = eyeball_points(loops, front, back)
+
+
+def _part_lips(spots: Tensor) -> None:
+    """Opens the lips in the plane, so that there is room on the page for the inside of the mouth; rings from 1."""
+    across = (spots[MOUTH_CONTACT - 1, :, 0] / MOUTH_HALF_WIDTH).clamp(max=1)
+    sign = torch.where(torch.arange(27) < 13, 1.0, -1.0).double()
+    line = STOMION_HEIGHT - 0.8 * across**3 + sign * 2.2 * (1 - across**2)
+    border = spots[MOUTH_BORDER - 1, :, 1].clone()
+    for ring in range(MOUTH_BORDER, MOUTH_CONTACT):
+        share = (ring - MOUTH_BORDER + 1) / (MOUTH_CONTACT - MOUTH_BORDER)
+        spots[ring, :, 1] = border + share * (line - border)
+        spots[ring, :, 0] = spots[MOUTH_BORDER - 1, :, 0] * (1 - share) + spots[MOUTH_CONTACT - 1, :, 0] * share
 
 
 def _fill_cap(cap: Tensor, vertices: Tensor, plane: Tensor, height: int, width: int, half: bool) -> None:

@@ -73,7 +73,19 @@ def unwrapping() -> Unwrapping:
     for side, (cx, cy, radius) in enumerate(EYE_ISLANDS):
         ids = balls if side == 0 else t.mirror[balls]
         skin[ids] = torch.tensor([cx, cy]).double() + radius * _eye_disc(whole[ids], side)
-    return Unwrapping(torch.cat([skin, seam_uv, crown_uv]).float(), uv_quads)
+    # The grid at the back of each eyeball cannot lie in the disc: it is a small island of its own.
+    rows = [skin, seam_uv, crown_uv]
+    for side, (cx, cy) in enumerate(((0.76, 0.96), (0.24, 0.96))):
+        cap = t.caps["eyeball_back"].flatten() if side == 0 else t.mirror[t.caps["eyeball_back"].flatten()]
+        cap_row = torch.arange(count)
+        cap_row[cap] = sum(map(len, rows)) + torch.arange(len(cap))
+        inside = torch.zeros(count, dtype=torch.bool)
+        inside[cap] = True
+        quads = inside[t.quads].all(1)
+        uv_quads[quads] = cap_row[t.quads[quads]]
+        flat = whole[cap][:, :2] - whole[cap][:, :2].mean(0)
+        rows.append(torch.tensor([cx, cy]).double() + 0.005 * flat)
+    return Unwrapping(torch.cat(rows).float(), uv_quads)
 
 
 def _row_height(row: Tensor) -> Tensor:
