@@ -109,7 +109,7 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     red = torch.zeros(27, 2, dtype=torch.float64)
     knots = [0.0, 0.12, 0.24, 0.45, 0.7, 0.9, 1.0]
     red[lower] = torch.stack([x * 1.035, _pchip(s, knots, [-76.6, -76.6, -76.4, -75.2, -72.2, -69.2, -67.8])], 1)
-    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-59.5, -58.9, -58.3, -59.6, -62.6, -65.6, -67.1])], 1)
+    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-59.1, -58.5, -57.9, -59.3, -62.6, -65.6, -67.1])], 1)
     share = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0]).double()[:, None, None]
     edge = onto_form(torch.cat([red, 92 - 0.02 * red[:, :1] ** 2], dim=1))
     skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(MOUTH_BORDER, 27, 3)
@@ -240,7 +240,7 @@ def _square_bearing(across: Tensor, down: Tensor) -> Tensor:
 
 def _on_eyeball(polar: Tensor, turn: Tensor) -> Tensor:
     cornea = 0.9 * ((0.52 - polar) / 0.52).clamp(0, 1) ** 1.2
-    radius = EYE_RADIUS - 0.15 + cornea * 0.8
+    radius = EYE_RADIUS - 0.15 + cornea * 0.25
     way = torch.stack([polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos()], dim=-1)
     return torch.tensor(EYE_CENTRE).double() + radius[..., None] * way
 

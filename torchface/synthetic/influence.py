@@ -63,7 +63,7 @@ def _lip_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
 def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     values = torch.zeros(len(p), 1, dtype=torch.float64)
     side = torch.where(position > 26, 52 - position, position).double()
-    turn = ramp(side, 9.0, 18.5)
+    turn = ramp(side, 6.5, 20.0)
     lips = ring >= 3
     values[lips, 0] = turn[lips]
     cap = torch.zeros(len(p), dtype=torch.bool)
@@ -76,9 +76,9 @@ def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     # The bone: below a line from under the mouth's corner to the jaw's angle; the throat follows part of the way.
     line = -82 + 0.10 * (80 - p[:, 2])
     below_chin = (p[:, 1] < -106) & (p[:, 2] < 62)
-    bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 18) & ~lips & ~cap & ~below_chin & (ring < 3)
+    bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 30) & ~lips & ~cap & ~below_chin & (ring < 3)
     values[bone] = 1.0
-    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -12) | _named("still_for_lips")
+    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -32) | _named("still_for_lips")
     still |= (p[:, 1] > -50) & (p[:, 0].abs() < 22) & (p[:, 2] > 60) & (ring < 0)
     still &= ~(lips | cap)
     return _spread(values, bone | lips | cap | still)[:, 0].clamp(0, 1)

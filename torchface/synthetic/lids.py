@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.synthetic.features import lid_order
+from torchface.synthetic.form import LID_THICKNESS
 from torchface.synthetic.identity import Anatomy, both_sides, bump, mean_vertices, ramp
 from torchface.synthetic.topology import EYE_RIM, topology
 
@@ -53,11 +54,17 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
         goal[above] += share[0].clamp(-1, 1).abs() * (longest - a.norm(dim=1))
         goal[below[1:-1]] += (share[1].clamp(-1, 1).abs() * (longest - b.norm(dim=1)))[1:-1]
         moved[ring] *= (goal / moved[ring].norm(dim=1))[:, None]
+    travel = torch.zeros(32, dtype=torch.float64)
+    travel[below] = share[1].clamp(-1, 1).abs()
+    travel[above] = share[0].clamp(-1, 1).abs()
     edge_way = moved[EYE_RIM] - around[EYE_RIM]
     for ring in (*range(1, EYE_RIM), *range(EYE_RIM + 2, len(rings) - 1)):
         moved[ring] = around[ring] + _FOLLOW[ring] * edge_way
-        if ring >= 4:  # nearer the edge the skin slides over the ball at its own height
-            moved[ring] *= (around[ring].norm(dim=1) / moved[ring].norm(dim=1))[:, None]
+        if ring >= 4:  # nearer the edge the skin slides over the ball; what lay folded in the crease comes up
+            now = around[ring].norm(dim=1)
+            cover = head.eye_radius + (LID_THICKNESS + 0.1 if ring < EYE_RIM else 0.0)
+            goal = now + travel * 0.2 * torch.nn.functional.softplus((cover - now) / 0.2)
+            moved[ring] *= (goal / moved[ring].norm(dim=1))[:, None]
     fold = torch.zeros(32, dtype=torch.float64)
     fold[above] = torch.sin(math.pi * torch.arange(17).double() / 16)
     moved[1:6, :, 1] += lean * fold * torch.tensor([0.3, 0.7, 1.0, 0.9, 0.5]).double()[:, None]

@@ -105,7 +105,7 @@ def _paint(p: Tensor, marks: Tensor) -> Tensor:
     lips, mouth, depth, socket, lash, eyeball, nostril, ear = marks.unbind(1)
     color = torch.tensor(SKIN).expand(len(p), 3).clone()
     broad, fine, pores = _noise(p, 16.0, 1), _noise(p, 4.5, 2), _noise(p, 0.9, 3)
-    red = 0.55 * _blob(p, (40, -30, 62), (22, 18, 30)) + 0.65 * _blob(p, (3, -36, 108), (15, 10, 14))
+    red = 0.55 * _blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * _blob(p, (3, -36, 108), (15, 10, 14))
     red += 0.3 * _blob(p, (0, -100, 88), (22, 12, 20)) + 0.35 * ear + 0.18 * broad.clamp(min=0) + 0.08 * fine
     color = _mix(color, (0.76, 0.43, 0.37), 0.62 * red)
     dark = 0.5 * _blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.45 * _blob(p, (22, 6, 80), (10, 7, 14))
@@ -140,8 +140,8 @@ def _brows(p: Tensor) -> Tensor:
     ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
     # Strokes: noise drawn out along a direction that turns from upright to outward.
     lean = 0.9 - 0.6 * along.clamp(0, 1)
-    stroke = torch.stack([(x - lean * 0 - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.35, z * 0.2], dim=1)
-    hair = 0.62 + 0.55 * _noise(stroke, 1.6, 7)
+    stroke = torch.stack([(x - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.45, z * 0.3], dim=1)
+    hair = 0.68 + 0.42 * _noise(stroke, 0.9, 7) + 0.12 * _noise(stroke, 2.4, 9)
     return (inside * ends * hair * (z > 40)).clamp(0, 0.92)
 
 
