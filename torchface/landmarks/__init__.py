@@ -1,0 +1,39 @@
+"""Landmarks on faces: in pictures, and on scans unwrapped into UV space."""
+
+from torchface.landmarks.annotations import ScanAnnotation, load_annotations, save_annotations
+from torchface.landmarks.contours import Contour, TraceSettings, trace_contour
+from torchface.landmarks.correspondences import AutomaticLandmarks, LandmarkPairs, contour_correspondences
+from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
+from torchface.landmarks.detector_files import load_detector, save_detector
+from torchface.landmarks.face_frame import FaceFrame
+from torchface.landmarks.relief import relief
+from torchface.landmarks.scan import ScanLandmarks, appearance_image, scan_landmarks
+from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
+from torchface.landmarks.uv import DetectorSettings, UVLandmarkDetector, UVLandmarks
+
+__all__ = [
+    "TWELVE",
+    "AutomaticLandmarks",
+    "Contour",
+    "CylinderLayout",
+    "DetectorSettings",
+    "FaceFrame",
+    "LandmarkPairs",
+    "ScanAnnotation",
+    "ScanLandmarks",
+    "TraceSettings",
+    "UVLandmarkDetector",
+    "UVLandmarks",
+    "UnwrappedHead",
+    "appearance_image",
+    "contour_correspondences",
+    "load_annotations",
+    "load_detector",
+    "relief",
+    "save_annotations",
+    "save_detector",
+    "scan_landmarks",
+    "trace_contour",
+    "twelve_from_ibug",
+    "unwrap",
+]

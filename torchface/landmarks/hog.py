@@ -1,0 +1,128 @@
+"""Histograms of oriented gradients at every place of an image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, one_hot, pad
+
+from torchface.errors import ShapeError, ValueRangeError
+
+_FAINT = 0.01  # gradients below this, in units of the image a pixel, count as flat
+_CLIP = 0.4
+
+
+@dataclass(frozen=True)
+class HogLayout:
+    """How a window is described.
+
+    Args:
+        window: side of the square window, pixels.
+        cell: side of a cell, pixels; the window holds (window/cell)² of them.
+        bins: orientations, over half a turn (a gradient and its opposite are one).
+        stride: a window is described at every ``stride``-th pixel.
+
+    Raises:
+        ValueRangeError: the window is no even number of cells, or the stride does not divide a cell.
+    """
+
+    window: int = 32
+    cell: int = 8
+    bins: int = 9
+    stride: int = 2
+
+    def __post_init__(self) -> None:
+        if min(self.window, self.cell, self.bins, self.stride) < 1 or self.window % (2 * self.cell):
+            raise ValueRangeError(f"HogLayout: found {self}, expected a window of an even number of cells")
+        if self.cell % (2 * self.stride):
+            raise ValueRangeError(f"HogLayout: found {self}, expected a cell of an even number of strides")
+
+    @property
+    def side(self) -> int:
+        """Cells along a window's side."""
+        return self.window // self.cell
+
+    def positions(self, rows: Tensor) -> Tensor:
+        """Pixel coordinate of the centre of a window at a place of the map."""
+        return rows * float(self.stride) - 0.5
+
+    def rows(self, positions: Tensor) -> Tensor:
+        """The place of the map whose window is centred nearest to a pixel coordinate, int64."""
+        return ((positions + 0.5) / self.stride).round().long()
+
+
+def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
+    """Normalised orientation histograms of cells centred at every stride.
+
+    Gradients vote with their magnitude for the two nearest orientations, of all channels the steepest; a cell is
+    divided by the root mean square of the cells around, clipped, and its root taken, so that strong edges do not
+    drown faint ones.
+
+    Args:
+        images: (B,C,H,W) in [0,1].
+        layout: of the windows.
+
+    Returns:
+        (B,bins,H/stride+1,W/stride+1).
+
+    Raises:
+        ShapeError: not (B,C,H,W).
+
+    Source: Dalal and Triggs 2005.
+    """
+    if images.ndim != 4:
+        raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,C,H,W)")
+    padded = pad(images, (1, 1, 1, 1), mode="replicate")
+    along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    steepest = (along_x.square() + along_y.square()).argmax(1, keepdim=True)
+    along_x, along_y = along_x.gather(1, steepest)[:, 0], along_y.gather(1, steepest)[:, 0]
+    votes = _votes(along_x, along_y, layout.bins)
+    cells = avg_pool2d(votes, layout.cell, layout.stride, padding=layout.cell // 2)
+    reach = 2 * layout.cell // layout.stride
+    around = avg_pool2d(cells.square().sum(1, keepdim=True), reach + 1, 1, reach // 2, count_include_pad=False)
+    return (cells / (around + _FAINT**2).sqrt()).clamp(max=_CLIP).sqrt()
+
+
+def _votes(along_x: Tensor, along_y: Tensor, bins: int) -> Tensor:
+    """Magnitudes (B,bins,H,W), each shared between the two bins next to its orientation."""
+    magnitude = (along_x.square() + along_y.square()).sqrt()
+    place = torch.atan2(along_y, along_x).remainder(math.pi) * (bins / math.pi)
+    lower = place.floor()
+    share = place - lower
+    first = lower.long() % bins
+    votes = one_hot(first, bins) * (magnitude * (1 - share))[..., None]
+    votes = votes + one_hot((first + 1) % bins, bins) * (magnitude * share)[..., None]
+    return votes.permute(0, 3, 1, 2)
+
+
+def windows(cells: Tensor, layout: HogLayout, centres: Tensor) -> Tensor:
+    """Descriptors (N,bins,side,side) of windows centred at places (N,2), column and row, of one map (bins,h,w)."""
+    step = layout.cell // layout.stride
+    offsets = ((torch.arange(layout.side, device=cells.device) - (layout.side - 1) / 2) * step).long()
+    rows = (centres[:, 1, None, None] + offsets[:, None]).clamp(0, cells.shape[1] - 1)
+    columns = (centres[:, 0, None, None] + offsets[None, :]).clamp(0, cells.shape[2] - 1)
+    return cells[:, rows, columns].permute(1, 0, 2, 3)
+
+
+def similarity(cells: Tensor, filters: Tensor, layout: HogLayout) -> Tensor:
+    r"""Cosine of the angle between filters and the windows at every place: a convolution, normalised.
+
+    Args:
+        cells: maps (B,bins,h,w).
+        filters: (K,bins,side,side).
+        layout: of the windows.
+
+    Returns:
+        (B,K,h,w) in [-1,1].
+    """
+    step = layout.cell // layout.stride
+    reach = (layout.side - 1) * step // 2
+    unit = filters / filters.flatten(1).norm(dim=1).clamp(min=1e-9)[:, None, None, None]
+    product = conv2d(pad(cells, (reach,) * 4, mode="replicate"), unit, dilation=step)
+    energy = pad(cells.square().sum(1, keepdim=True), (reach,) * 4, mode="replicate")
+    norm = conv2d(energy, torch.ones_like(filters[:1, :1]), dilation=step).sqrt()
+    return product / norm.clamp(min=1e-9)

@@ -1,0 +1,274 @@
+"""Landmarks in UV space by a bank of HOG filters, the scores they give, and where landmarks usually lie."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.face_frame import FaceFrame
+from torchface.landmarks.hog import HogLayout, cell_map, similarity, windows
+from torchface.landmarks.mean_shift import mean_shift
+from torchface.landmarks.smoothing import unsharp
+from torchface.landmarks.twelve import TWELVE
+
+_FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
+_PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """How landmarks are matched; lengths in pixels of the image.
+
+    Args:
+        hog: the descriptor.
+        unsharp_sigma, unsharp_amount: of the pre-filter.
+        good_radius: a match this near to the landmark is a good one.
+        similarity_threshold: matches below it are not looked at.
+        responses: the best so many matches of each filter are kept.
+        bandwidth: of the mean shift.
+    """
+
+    hog: HogLayout = field(default_factory=HogLayout)
+    unsharp_sigma: float = 3.0
+    unsharp_amount: float = 1.0
+    good_radius: float = 20.0
+    similarity_threshold: float = 0.3
+    responses: int = 200
+    bandwidth: float = 10.0
+
+
+class UVLandmarks(NamedTuple):
+    """Found landmarks: ``pixels`` (B,L,2), x right and y down, and ``confidence`` (B,L) in [0,1], 0 where only the
+    prior speaks."""
+
+    pixels: Tensor
+    confidence: Tensor
+
+
+class UVLandmarkDetector(nn.Module):
+    r"""Finds landmarks in images that share a UV space, roughly.
+
+    Every training image gives a HOG filter a landmark. A filter's scores near its landmark in the other images, and
+    elsewhere, are two Gaussians; the location of a landmark is a third:
+
+    .. math:: s \in \text{good} \iff \mathcal{N}(s; \mu_g, \sigma_g) \ge \mathcal{N}(s; \mu_b, \sigma_b), \qquad
+       \hat{x} = \arg\max_{c} |c| \; \mathcal{N}(\bar{x}_c; \mu, \Sigma)
+
+    over the clusters c that mean shift makes of the good ones among every filter's best 200 matches.
+
+    Args:
+        images: how many training images there were.
+        size: side of the square images, pixels.
+        names: of the landmarks.
+        appearance: what the images show, "texture" or "relief".
+        settings: how to match; a dict as in ``config`` will do.
+        frame: config of the ``FaceFrame`` that scans are laid into, where there is one.
+
+    Source: thesis 3.2.2.
+    """
+
+    filters: Tensor
+    mean_cell: Tensor
+    good: Tensor
+    bad: Tensor
+    prior_mean: Tensor
+    prior_covariance: Tensor
+
+    def __init__(
+        self,
+        images: int,
+        size: int = 1024,
+        names: tuple[str, ...] = TWELVE,
+        appearance: str = "texture",
+        settings: DetectorSettings | dict[str, Any] | None = None,
+        frame: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        if appearance not in ("texture", "relief"):
+            raise ValueRangeError(f"appearance: found {appearance!r}, expected 'texture' or 'relief'")
+        self.names, self.size, self.appearance = tuple(names), size, appearance
+        self.settings = _settings(settings)
+        self.frame = None if frame is None else FaceFrame(**frame)
+        hog, count = self.settings.hog, len(self.names)
+        self.register_buffer("filters", torch.zeros(count, images, hog.bins, hog.side, hog.side))
+        self.register_buffer("mean_cell", torch.zeros(hog.bins))
+        self.register_buffer("good", torch.zeros(count, images, 2))
+        self.register_buffer("bad", torch.zeros(count, images, 2))
+        self.register_buffer("prior_mean", torch.zeros(count, 2))
+        self.register_buffer("prior_covariance", torch.zeros(count, 2, 2))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What the constructor needs: plain values only."""
+        return {
+            "images": self.filters.shape[1],
+            "size": self.size,
+            "names": list(self.names),
+            "appearance": self.appearance,
+            "settings": asdict(self.settings),
+            "frame": None if self.frame is None else self.frame.config,
+        }
+
+    @classmethod
+    def fit(
+        cls,
+        images: Tensor,
+        landmarks: Tensor,
+        names: tuple[str, ...] = TWELVE,
+        appearance: str = "texture",
+        settings: DetectorSettings | None = None,
+        frame: FaceFrame | None = None,
+        progress: Any = None,
+    ) -> UVLandmarkDetector:
+        """Learns from annotated images.
+
+        Args:
+            images: (M,C,S,S) in [0,1], at least two.
+            landmarks: pixels, (M,L,2); NaN where one is not known (at most all but two of the images).
+            names: of the L landmarks.
+            appearance: what the images show, "texture" or "relief".
+            settings: how to match.
+            frame: the frame the images were unwrapped in, kept for ``scan_landmarks``.
+            progress: called with the number of images done and in all.
+
+        Raises:
+            ShapeError: images and landmarks do not fit each other.
+            ValueRangeError: fewer than two images, or a landmark that fewer than two have.
+        """
+        _check_training(images, landmarks, names)
+        self = cls(len(images), images.shape[-1], names, appearance, settings, None if frame is None else frame.config)
+        if frame is not None and self.frame is not None:
+            self.frame.load_state_dict(frame.state_dict())
+        self._fit_prior(landmarks)
+        maps = [self._raw_cells(image[None])[0] for image in images]
+        self.mean_cell.copy_(torch.stack([cells.mean((1, 2)) for cells in maps]).mean(0))
+        hog = self.settings.hog
+        places = hog.rows(torch.nan_to_num(landmarks))
+        for i, cells in enumerate(maps):
+            self.filters[:, i] = windows(cells - self.mean_cell[:, None, None], hog, places[i])
+        self.filters[~torch.isfinite(landmarks).all(-1).T] = 0.0
+        self._fit_scores(maps, landmarks, progress)
+        return self
+
+    def forward(self, images: Tensor) -> UVLandmarks:
+        """Landmarks of images (B,C,S,S) in [0,1].
+
+        Raises:
+            ShapeError: images of another size than those learned from.
+        """
+        if images.ndim != 4 or images.shape[-2:] != (self.size, self.size):
+            raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,C,{self.size},{self.size})")
+        pixels = self.prior_mean.repeat(len(images), 1, 1)
+        confidence = torch.zeros(pixels.shape[:2], dtype=pixels.dtype, device=pixels.device)
+        for b, image in enumerate(images):  # one image's responses are 100 MB; a batch of them would be too much
+            cells = self._cells(image[None])
+            for k in range(len(self.names)):
+                pixels[b, k], confidence[b, k] = self._locate(k, cells)
+        return UVLandmarks(pixels, confidence)
+
+    def matches(self, landmark: int, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a landmark's filters match: pixels (N,2), and how many filters say so (N,)."""
+        scores = similarity(cells, self.filters[landmark], self.settings.hog)[0]
+        width = scores.shape[-1]
+        flat = scores.flatten(1)
+        best, place = flat.topk(min(self.settings.responses, flat.shape[1]), dim=1)
+        good = (best >= self.settings.similarity_threshold) & self._more_likely_good(landmark, best)
+        found, votes = place[good].unique(return_counts=True)
+        columns, rows = found % width, torch.div(found, width, rounding_mode="floor")
+        return self.settings.hog.positions(torch.stack([columns, rows], dim=-1)), votes
+
+    def _locate(self, landmark: int, cells: Tensor) -> tuple[Tensor, Tensor]:
+        points, votes = self.matches(landmark, cells)
+        mean, covariance = self.prior_mean[landmark], self.prior_covariance[landmark]
+        if len(points) == 0:
+            return mean, mean.new_zeros(())
+        clusters = mean_shift(points, self.settings.bandwidth, votes)
+        offset = clusters.centres - mean
+        squared = (offset * torch.linalg.solve(covariance, offset.T).T).sum(-1)
+        near = torch.exp(-0.5 * squared) * (squared < _FARTHEST**2)
+        value = clusters.sizes * near
+        best = int(value.argmax())
+        if float(value[best]) <= 0:
+            return mean, mean.new_zeros(())
+        return clusters.centres[best], value[best] / (self.filters.shape[1] * self.settings.responses)
+
+    def _more_likely_good(self, landmark: int, scores: Tensor) -> Tensor:
+        """Whether scores (M,R) of a landmark's filters are likelier among the good than among the bad."""
+        mean_good, spread_good = self.good[landmark, :, :1], self.good[landmark, :, 1:]
+        mean_bad, spread_bad = self.bad[landmark, :, :1], self.bad[landmark, :, 1:]
+        # Above the mean of the good, a score can only be better: a wide Gaussian of bad ones has no say there.
+        clipped = torch.minimum(scores, mean_good)
+        likely = -0.5 * ((clipped - mean_good) / spread_good) ** 2 - spread_good.log()
+        unlikely = -0.5 * ((clipped - mean_bad) / spread_bad) ** 2 - spread_bad.log()
+        return likely >= unlikely
+
+    def _fit_prior(self, landmarks: Tensor) -> None:
+        mean = landmarks.nanmean(0)
+        offset = torch.nan_to_num(landmarks - mean)
+        count = torch.isfinite(landmarks).all(-1).sum(0).clamp(min=2)
+        covariance = torch.einsum("mli,mlj->lij", offset, offset) / (count - 1)[:, None, None]
+        self.prior_mean.copy_(mean)
+        self.prior_covariance.copy_(covariance + _PRIOR_FLOOR**2 * torch.eye(2, dtype=covariance.dtype))
+
+    def _fit_scores(self, maps: list[Tensor], landmarks: Tensor, progress: Any) -> None:
+        """Count, sum and sum of squares of good and bad scores a filter, over the images it does not come from."""
+        settings, count = self.settings, len(maps)
+        sums = torch.zeros(2, len(self.names), count, 3, dtype=torch.float64)
+        height, width = maps[0].shape[1:]
+        rows, columns = (settings.hog.positions(torch.arange(n)) for n in (height, width))
+        for i, cells in enumerate(maps):
+            centred = (cells - self.mean_cell[:, None, None])[None]
+            others = torch.arange(count) != i
+            for k in range(len(self.names)):
+                if not bool(torch.isfinite(landmarks[i, k]).all()):
+                    continue
+                scores = similarity(centred, self.filters[k, others], settings.hog)[0]
+                away = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
+                near = away <= settings.good_radius**2
+                kept = scores >= settings.similarity_threshold
+                for which, region in enumerate((near, ~near)):
+                    chosen = torch.where(kept & region, scores, 0.0).flatten(1)
+                    moments = [(kept & region).flatten(1).sum(1), chosen.sum(1), chosen.square().sum(1)]
+                    sums[which, k, others] += torch.stack([m.double() for m in moments], dim=-1)
+            if progress is not None:
+                progress(i + 1, count)
+        for table, part in zip((self.good, self.bad), sums.unbind(0), strict=True):
+            number, total, squares = part.unbind(-1)
+            mean = total / number.clamp(min=1)
+            spread = (squares / number.clamp(min=1) - mean**2).clamp(min=1e-4).sqrt()
+            table.copy_(torch.stack([mean, spread], dim=-1))
+        # A filter that never matched where it should have: nothing it finds counts as good.
+        self.good[..., 0][sums[0, ..., 0] == 0] = 2.0
+
+    def _raw_cells(self, images: Tensor) -> Tensor:
+        sharp = unsharp(images.float(), self.settings.unsharp_sigma, self.settings.unsharp_amount)
+        return cell_map(sharp, self.settings.hog)
+
+    def _cells(self, images: Tensor) -> Tensor:
+        return self._raw_cells(images) - self.mean_cell[None, :, None, None]
+
+
+def _settings(given: DetectorSettings | dict[str, Any] | None) -> DetectorSettings:
+    if given is None:
+        return DetectorSettings()
+    if isinstance(given, DetectorSettings):
+        return given
+    rest = {**given, "hog": HogLayout(**given["hog"])} if isinstance(given.get("hog"), dict) else given
+    return DetectorSettings(**rest)
+
+
+def _check_training(images: Tensor, landmarks: Tensor, names: tuple[str, ...]) -> None:
+    if images.ndim != 4 or images.shape[-1] != images.shape[-2]:
+        raise ShapeError(f"images: found {tuple(images.shape)}, expected (M,C,S,S)")
+    if landmarks.shape != (len(images), len(names), 2):
+        raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected ({len(images)},{len(names)},2)")
+    known = torch.isfinite(landmarks).all(-1).sum(0)
+    if len(images) < 2 or int(known.min()) < 2:
+        raise ValueRangeError(
+            f"fit: found {len(images)} images and a landmark known in {int(known.min()) if len(known) else 0}, "
+            "expected every landmark in at least two"
+        )
