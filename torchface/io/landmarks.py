@@ -146,7 +146,7 @@ def _pts(path: Path) -> LandmarkPoints:
     body, end, _ = rest.partition("}")
     if not brace or not end:
         raise FileFormatError(f"{path}: found no points between braces, expected iBUG's PTS")
-    declared = [line.split(":", 1)[1].strip() for line in head.splitlines() if line.strip().startswith("n_points")]
+    declared = [line.partition(":")[2].strip() for line in head.splitlines() if line.strip().startswith("n_points")]
     rows = [line.split() for line in body.splitlines() if line.strip()]
     if declared and declared[0] != str(len(rows)):
         raise FileFormatError(f"{path}: found {len(rows)} points, expected the n_points: {declared[0]} of its head")

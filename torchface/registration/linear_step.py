@@ -14,7 +14,7 @@ from torchface.registration.subspace import Subspace
 
 Array = NDArray[np.float64]
 
-_RIDGE = 1e-9
+_RIDGE = 1e-11
 _TOLERANCE = 1e-2
 _MOST_ITERATIONS = 200
 

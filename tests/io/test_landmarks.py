@@ -1,0 +1,141 @@
+"""Landmark files of menpo, iBUG and the toolkit's own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.io.landmarks import LandmarkPoints, load_landmark_points
+from torchface.io.picks import Correspondences, save_correspondences
+
+GROUPS = {"chin": 17, "leye": 6, "reye": 6, "leyebrow": 5, "nose": 9, "reyebrow": 5, "mouth": 20}
+
+
+def ljson(points: list, labels: list | None = None) -> dict:
+    return {"version": 3, "groups": {"LJSON": {"labels": labels or [], "landmarks": {"points": points}}}}
+
+
+def save(path: Path, document: object) -> Path:
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def sixty_eight(tmp_path: Path) -> Path:
+    labels, first = [], 0
+    for name, count in GROUPS.items():
+        labels.append({"label": name, "mask": list(range(first, first + count))})
+        first += count
+    return save(tmp_path / "head.ljson", ljson([[i, 2.0 * i, -i] for i in range(68)], labels))
+
+
+def test_ljson_points_and_groups_are_read(sixty_eight: Path) -> None:
+    found = load_landmark_points(sixty_eight)
+    assert found.points.dtype == torch.float64
+    assert torch.equal(found.points[:, 1], 2 * torch.arange(68.0).double())
+    assert found.groups["nose"].tolist() == list(range(34, 43))
+
+
+def test_menpos_groups_come_in_ibugs_order(sixty_eight: Path) -> None:
+    order = load_landmark_points(sixty_eight).ibug()[:, 0].long().tolist()
+    chin, brows, nose = list(range(17)), [*range(29, 34), *range(43, 48)], list(range(34, 43))
+    assert order == [*chin, *brows, *nose, *range(17, 29), *range(48, 68)]
+
+
+def test_other_sets_are_not_taken_for_ibugs(tmp_path: Path) -> None:
+    with pytest.raises(ShapeError, match="found 2, expected 68"):
+        LandmarkPoints(torch.zeros(2, 3)).ibug()
+    labels = [{"label": "ear", "mask": [0]}]
+    other = load_landmark_points(save(tmp_path / "ear.ljson", ljson([[0, 0, 0]], labels)))
+    with pytest.raises(NameMismatchError, match="found the groups ear, expected chin"):
+        other.ibug()
+
+
+def test_missing_points_are_nan_and_flat_ones_turn_from_row_column_to_x_y(tmp_path: Path) -> None:
+    found = load_landmark_points(save(tmp_path / "a.ljson", ljson([[10, 20], [None, None]])))
+    assert found.points[0].tolist() == [20, 10]
+    assert found.points[1].isnan().all()
+
+
+def test_older_versions_are_read(tmp_path: Path) -> None:
+    second = {"version": 2, "labels": [{"label": "tip", "mask": [1]}], "landmarks": {"points": [[1, 2, 3], [4, 5, 6]]}}
+    first = {
+        "version": 1,
+        "groups": [
+            {"label": "root", "landmarks": [{"point": [1, 2, 3]}]},
+            {"label": "tip", "landmarks": [{"point": [4, 5, 6]}]},
+        ],
+    }
+    for name, document in (("two.ljson", second), ("one.ljson", first)):
+        found = load_landmark_points(save(tmp_path / name, document))
+        assert found.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+        assert found.groups["tip"].tolist() == [1]
+
+
+def test_pts_counts_pixels_from_one(tmp_path: Path) -> None:
+    text = "version: 1\nn_points:  2\n{\n611.28 272.77\n1 1\n}\n"
+    found = load_landmark_points(save(tmp_path / "face.pts", text))
+    assert torch.allclose(found.points, torch.tensor([[610.28, 271.77], [0, 0]]).double())
+
+
+def test_pts_of_three_dimensions_are_positions(tmp_path: Path) -> None:
+    text = "version: 1\nn_points: 1\n{\n1 2 3\n}\n"
+    assert load_landmark_points(save(tmp_path / "face.pts", text)).points.tolist() == [[1, 2, 3]]
+
+
+def test_own_correspondences_give_their_scan_points(tmp_path: Path) -> None:
+    points = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    save_correspondences(Correspondences(torch.tensor([5, 9]), points, ("a", "b")), tmp_path / "pairs.json")
+    assert torch.allclose(load_landmark_points(tmp_path / "pairs.json").points.double(), points.double())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.txt", "1 2", "found the ending '.txt'"),
+        ("a.ljson", "{", "not JSON"),
+        ("a.ljson", "[]", '"version" of 1, 2 or 3'),
+        ("a.ljson", json.dumps({"version": 9}), '"version" of 1, 2 or 3'),
+        ("a.ljson", json.dumps({"version": 3, "groups": {}}), "found 0 sets"),
+        ("a.ljson", json.dumps(ljson([])), "two- or three-dimensional"),
+        ("a.ljson", json.dumps(ljson([[1, 2, 3], [1, 2]])), "different width"),
+        ("a.ljson", json.dumps(ljson([[1, 2, "x"]])), "no numbers"),
+        ("a.ljson", '{"version": 2, "landmarks": {"points": [[1, 2, 1e999]]}}', "infinite"),
+        ("a.ljson", json.dumps(ljson([[1, 2, 3]], [{"label": "x", "mask": [1]}])), "rows outside 0 to 0"),
+        ("a.pts", "1 2\n3 4\n", "no points between braces"),
+        ("a.pts", "n_points: 3\n{\n1 2\n}\n", "found 1 points, expected the n_points: 3"),
+        ("a.pts", "n_points: 1\n{\n1 two\n}\n", "found text among the points"),
+        ("a.pts", "n_points: 2\n{\n1 2\n1 2 3\n}\n", "different width"),
+    ],
+)
+def test_broken_files_say_what_is_wrong(tmp_path: Path, name: str, content: str, said: str) -> None:
+    with pytest.raises(FileFormatError, match=said) as caught:
+        load_landmark_points(save(tmp_path / name, content))
+    assert name in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"none\.ljson"):
+        load_landmark_points(tmp_path / "none.ljson")
+
+
+def test_mutated_landmark_files_are_read_or_refused(tmp_path: Path, sixty_eight: Path) -> None:
+    pts = save(tmp_path / "face.pts", "version: 1\nn_points:  3\n{\n611.28 272.77\n1 1\n5.5 1e2\n}\n")
+    check_reader(load_landmark_points, [sixty_eight], ".ljson")
+    check_reader(load_landmark_points, [pts], ".pts")
+
+
+@pytest.mark.real
+def test_real_files_are_read(data: Path) -> None:
+    head = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug()
+    assert head.shape == (68, 3)
+    nose, chin, right_eye, left_eye = head[30], head[8], head[36:42].mean(0), head[42:48].mean(0)
+    assert float(right_eye[0]) < float(nose[0]) < float(left_eye[0])
+    assert float(chin[1]) < float(nose[1]) < float(right_eye[1])
+    (picture,) = (data / "images" / "ibug").glob("*.pts")
+    assert load_landmark_points(picture).ibug().shape == (68, 2)
