@@ -13,13 +13,16 @@ from torchface.synthetic.identity import both_sides, mean_vertices
 from torchface.synthetic.topology import EAR, EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, NOSTRIL_RIM, Topology, topology
 
 # The left half of the jaw's contour from the ear to before the chin, and of the brow from its inner to its outer end.
-_JAW = ((69, -12, 12), (67, -28, 14), (64, -46, 16), (58.5, -64, 20), (50.5, -81, 30), (40.5, -94, 46), (29.5, -104, 62), (16, -110, 76))  # fmt: skip
+_JAW = (
+    (69, -12, 12), (67, -28, 14), (64, -46, 16), (58.5, -64, 20),
+    (50.5, -81, 30), (40.5, -94, 46), (29.5, -104, 62), (16, -110, 76),
+)  # fmt: skip
 _BROW = ((9.5, 17.5, 92), (18, 20.5, 90), (28, 22.5, 86), (38.5, 21.5, 79), (48, 16.5, 68))
 _NOSE_BRIDGE = (6.5, -7.0, -20.0, -33.5)
 
 
 @lru_cache(maxsize=1)
-def annotations() -> Annotations:
+def head_annotations() -> Annotations:
     """The same for every head."""
     t = topology()
     contacts = _contacts(t)

@@ -1,4 +1,4 @@
-"""What is laid into the form's openings: lids, lips, nostrils, ears and eyeballs, ring by ring from the block's border."""
+"""What is laid into the form's openings, ring by ring from the block's border: lids, lips, nostrils, ears, eyeballs."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable
 
 import torch
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from torchface.synthetic.form import EYE_CENTRE, EYE_RADIUS, LID_THICKNESS, gradient, project
+from torchface.synthetic.form import EYE_CENTRE, EYE_RADIUS, gradient, project
 from torchface.synthetic.topology import EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT
 
 OntoForm = Callable[[Tensor], Tensor]
@@ -20,8 +21,6 @@ STOMION_HEIGHT = -66.5
 
 
 def _pchip(at: Tensor, knots: list[float], values: list[float]) -> Tensor:
-    from scipy.interpolate import PchipInterpolator
-
     return torch.from_numpy(PchipInterpolator(knots, values)(at.numpy()))
 
 
@@ -188,7 +187,7 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     angle = torch.atan2(offset @ upward / 1.7, offset @ forward)
     sine, cosine = angle.sin(), angle.cos()
     back = ((0.35 - cosine) / 1.35).clamp(0, 1) ** 0.8  # 0 where the ear grows from the cheek, 1 at its free edge
-    tall = torch.where(sine > 0, 29.5, 29.5) * sine
+    tall = 32.2 * sine
     wide = 17.5 * cosine * (1 + 0.22 * sine) - 1.5 * sine
     lobe = (-sine - 0.45).clamp(min=0) / 0.55
     rim = 19.0 * back * (1 - 0.45 * lobe) + 1.2 * (1 - back)
@@ -243,6 +242,3 @@ def _on_eyeball(polar: Tensor, turn: Tensor) -> Tensor:
     radius = EYE_RADIUS - 0.15 + cornea * 0.25
     way = torch.stack([polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos()], dim=-1)
     return torch.tensor(EYE_CENTRE).double() + radius[..., None] * way
-
-
-__all__ = ["LID_THICKNESS", "ear_rings", "eye_rings", "eyeball_points", "mouth_rings", "nostril_rings"]

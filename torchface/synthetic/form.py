@@ -76,9 +76,9 @@ def _blend_head() -> tuple[Ellipsoid | RoundCone, ...]:
         # Nose: bridge, sides, tip, wings, the partition between the nostrils.
         RoundCone((0, 10, 78), (0, -14, 91), 8.0, 7.2, 12),
         RoundCone((0, -10, 90), (0, -32.8, 103.3), 7.2, 9.0, 9),
-        RoundCone((4, -4, 81), (8.5, -33, 89), 5, 8, 9),
+        RoundCone((4, -4, 81), (8.0, -31, 89), 5, 7.2, 9),
         Ellipsoid((3.8, -33.0, 105.9), (7.2, 7.2, 8.0), 6),
-        Ellipsoid((12.0, -36.4, 93.0), (6.0, 6.6, 9.0), 4),
+        Ellipsoid((12.2, -37.0, 93.0), (5.8, 6.2, 9.0), 3.5),
         RoundCone((0, -38.5, 101.5), (0, -41.0, 87), 3.8, 4.2, 3.5),
         # Hollow above the chin.
         Ellipsoid((0, -86.5, 99), (24, 7, 12.5), 13, cut=True),

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.synthetic.annotations import annotations
+from torchface.synthetic.annotations import head_annotations
 from torchface.synthetic.identity import Anatomy, anatomy
 from torchface.synthetic.skin import skin_texture
 from torchface.synthetic.topology import topology
@@ -39,19 +38,6 @@ def dress(person: Anatomy, texture: bool) -> Mesh:
         t.quads.clone(),
         flat.uvs.clone(),
         flat.quads.clone(),
-        annotations=annotations(),
+        annotations=head_annotations(),
         texture=skin_texture() if texture else None,
     )
-
-
-__all__ = ["head"]
-
-
-def vertex_count() -> int:
-    """How many vertices every head has."""
-    return topology().count
-
-
-def mirrored(delta: Tensor) -> Tensor:
-    """A displacement (V,3) of the left side as one of the right."""
-    return delta[topology().mirror] * torch.tensor([-1.0, 1.0, 1.0], dtype=delta.dtype)

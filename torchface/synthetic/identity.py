@@ -127,7 +127,7 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
      lambda p, _: _along(1, (p[:, 1] - 30).clamp(min=0) ** 1.4 / 83**1.4)),
     ("face_width", "width across the cheekbones, mm", 137, 5.5,
      lambda p, _: _along(0, 0.5 * p[:, 0].sign() * ramp(p[:, 0].abs(), 14, 60) * ramp(p[:, 2], -60, 10)
-                         * torch.exp(-(((p[:, 1] + 20) / 48) ** 2)))),
+                         * torch.exp(-(((p[:, 1] + 12) / 48) ** 4)))),
     ("jaw_width", "width across the angles of the jaw, mm", 105, 5.0,
      lambda p, _: _along(0, 0.5 * p[:, 0].sign() * ramp(p[:, 0].abs(), 8, 46)
                          * torch.exp(-(((p[:, 1] + 80) / 36) ** 2)) * ramp(p[:, 2], -40, 5))),
@@ -146,7 +146,7 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
     ("nose_width", "width across the wings, mm", 35, 1.9,
      lambda p, _: _along(0, p[:, 0] / 35 * _nose(p))),
     ("nose_protrusion", "tip in front of the base, mm", 19, 1.4,
-     lambda p, _: _along(2, bump(p, (0, -34, 112), (15, 13, 11)) * 1.05)),
+     lambda p, _: _along(2, bump(p, (0, -34, 113), (15, 13, 10)) * 1.14)),
     ("nose_bridge", "how high the back of the nose stands, mm from the mean", 0, 1.3,
      lambda p, _: _along(2, bump(p, (0, -11, 96), (8, 12, 14)))),
     ("nose_root", "depth of the nasion, mm from the mean", 0, 1.2,
@@ -186,7 +186,7 @@ _FIELDS: tuple[tuple[str, str, float, float, Field], ...] = (
      lambda p, parts: _along(2, parts.lips_ring * (1 - (p[:, 0].abs() / 26).clamp(max=1) ** 2))),
     ("ear_size", "height of the ear, mm", 62, 3.2, _ear_scale),
     ("ear_protrusion", "how far the ear's edge stands off, mm from the mean", 0, 2.5, _ear_turn),
-    ("neck_width", "width of the neck, mm", 112, 6.0,
+    ("neck_width", "width of the neck, mm from the mean", 0, 6.0,
      lambda p, _: torch.cat([p[:, :1], torch.zeros_like(p[:, :1]), p[:, 2:] + 30], 1) / 112
      * ramp(-p[:, 1], 105, 150)[:, None]),
 )  # fmt: skip
@@ -199,7 +199,10 @@ _EYE_PARAMETERS: tuple[tuple[str, str, float, float], ...] = (
     ("eye_size", "radius of the eyeball, mm", EYE_RADIUS, 0.35),
 )
 
-IDENTITY: tuple[IdentityParameter, ...] = tuple(IdentityParameter(*row[:4]) for row in (*_FIELDS, *_EYE_PARAMETERS))
+IDENTITY: tuple[IdentityParameter, ...] = tuple(
+    IdentityParameter(name, description, mean, deviation)
+    for name, description, mean, deviation in (*(row[:4] for row in _FIELDS), *_EYE_PARAMETERS)
+)
 """Every way in which heads differ; coefficients are in standard deviations."""
 
 LID_SHARE = torch.tensor([0.0, 0.15, 0.4, 0.7, 0.9] + [1.0] * 11, dtype=torch.float64)
@@ -216,6 +219,11 @@ def mean_vertices() -> Tensor:
     return whole
 
 
+def mirrored(delta: Tensor) -> Tensor:
+    """A displacement (V,3) of the left side as one of the right."""
+    return delta[topology().mirror] * torch.tensor([-1.0, 1.0, 1.0], dtype=delta.dtype)
+
+
 def both_sides(half_ids: Tensor) -> tuple[Tensor, Tensor]:
     """Vertex ids of a left part and of its mirror image."""
     return half_ids, topology().mirror[half_ids]
@@ -226,16 +234,14 @@ def _modes() -> tuple[Tensor, Tensor, Tensor]:
     """Displacement a standard deviation (K,V+4,3), lid share (V,), share by which lids keep to the eyeball (V,)."""
     t = topology()
     mean = mean_vertices()
-    left = torch.tensor([1.0, 1.0, 1.0]).double()
     probes = torch.tensor([EYE_CENTRE, EYE_CENTRE, HINGE, HINGE], dtype=torch.float64)
     probes[1::2, 0] *= -1
     points = torch.cat([mean, probes])
     parts = _parts(len(points))
-    modes = torch.stack([field(points, parts) * row[3] for row in _FIELDS for field in (row[4],)])
+    modes = torch.stack([field(points, parts) * deviation for _, _, _, deviation, field in _FIELDS])
     modes = torch.cat([modes, torch.zeros(len(_EYE_PARAMETERS), *modes.shape[1:], dtype=modes.dtype)])
     lid = torch.zeros(t.count, dtype=torch.float64)
     keep = torch.zeros(t.count, dtype=torch.float64)
-    del left
     for side, sign in ((0, 1.0), (1, -1.0)):
         ids = both_sides(t.rings["eye"])[side]
         cap = both_sides(t.caps["eye"])[side]

@@ -166,7 +166,7 @@ def _opening(head: Anatomy) -> float:
     """The lids' opening against the mean head's."""
     rim = topology().rings["eye"][EYE_RIM]
     above, below = lid_order()
-    gap = lambda v: float((v[rim[above[8]], 1] - v[rim[below[8]], 1]))  # noqa: E731
+    gap = lambda v: float(v[rim[above[8]], 1] - v[rim[below[8]], 1])  # noqa: E731
     return gap(head.vertices) / gap(mean_vertices())
 
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchface.synthetic.identity import Anatomy, bump, mean_vertices, ramp
+from torchface.synthetic.identity import Anatomy, bump, mean_vertices, mirrored, ramp
 from torchface.synthetic.influence import LIP_HANDLES, Influence, influence
 from torchface.synthetic.topology import MOUTH_BORDER, MOUTH_CONTACT, topology
 
@@ -15,6 +15,17 @@ JAW_ANGLE = math.radians(19.0)
 _HANDLE = torch.arange(LIP_HANDLES)
 _SIDE = torch.where(_HANDLE > 26, 52 - _HANDLE, _HANDLE)  # 0 upper midline, 13 corner, 26 lower midline
 _LEFT = torch.where(_HANDLE > 26, -1.0, 1.0).double()
+
+
+# A lip turned in over the teeth: for each ring the motion up and forward, millimetres.
+_ROLL_LOWER = {
+    4: (0.6, -0.6), 5: (3.2, -2.2), 6: (3.6, -4.2), 7: (2.4, -5.6),
+    8: (0.6, -5.0), 9: (0.0, -3.8), 10: (-0.6, -3.2), 11: (0.0, -2.4),
+}  # fmt: skip
+_ROLL_UPPER = {
+    4: (-0.6, -0.6), 5: (-3.0, -2.0), 6: (-3.2, -3.8), 7: (-2.0, -4.8),
+    8: (-0.6, -4.2), 9: (0.0, -3.4), 10: (0.5, -3.0), 11: (0.0, -2.4),
+}  # fmt: skip
 
 
 class Mouth:
@@ -110,7 +121,8 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
     left_corner = m.corner * (_LEFT > 0)
     opened = m.jaw(JAW_ANGLE, (0, -1.0, -1.5)) + m.spread(m.slide(-0.05 * a * w * m.corner, 0.0))
     vec = lambda *xyz: torch.tensor(xyz, dtype=torch.float64)  # noqa: E731
-    shapes = {
+    chin = m.push((0, -96, 88), (16, 12, 16), vec(0, 3.4, 0.8))
+    return {
         "jawOpen": opened,
         "jawForward": m.jaw(shift=(0, -0.6, 6.5)),
         "jawLeft": m.jaw(shift=(2.5, -0.4, 0.0), yaw=math.radians(4.5)),
@@ -121,30 +133,35 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
         "mouthSmileLeft": _smile(m, left_corner)
         + m.push((36, -34, 68), (13, 13, 20), vec(0.6, 3.2, 2.4))
         + m.push((37, -62, 60), (8, 14, 16), vec(1.8, 1.0, -1.6)),
-        "mouthFrownLeft": _side_motion(m, 0.05 * w, -7.0 * size, -0.4, 4.2) + m.push((24, -84, 78), (9, 8, 14), vec(0.6, -1.6, 1.0)),
+        "mouthFrownLeft": _side_motion(m, 0.05 * w, -7.0 * size, -0.4, 4.2)
+        + m.push((24, -84, 78), (9, 8, 14), vec(0.6, -1.6, 1.0)),
         "mouthDimpleLeft": _side_motion(m, 0.16 * w, 1.2 * size, -3.0, 2.8),
         "mouthStretchLeft": _side_motion(m, 0.24 * w, -3.6 * size, -0.6, 5.0),
-        "mouthRollLower": m.profile({}, {4: (0.6, -0.6), 5: (3.2, -2.2), 6: (3.6, -4.2), 7: (2.4, -5.6), 8: (0.6, -5.0), 9: (0.0, -3.8), 10: (-0.6, -3.2), 11: (0, -2.4)}, mid)
+        "mouthRollLower": m.profile({}, _ROLL_LOWER, mid)
         + m.spread(m.slide(0.0, 0.8 * m.is_lower * mid, 0.0)),
-        "mouthRollUpper": m.profile({4: (-0.6, -0.6), 5: (-3.0, -2.0), 6: (-3.2, -3.8), 7: (-2.0, -4.8), 8: (-0.6, -4.2), 9: (0.0, -3.4), 10: (0.5, -3.0), 11: (0, -2.4)}, {}, mid)
+        "mouthRollUpper": m.profile(_ROLL_UPPER, {}, mid)
         + m.spread(m.slide(0.0, -0.5 * m.is_upper * mid, 0.0)),
-        "mouthShrugLower": m.spread(m.slide(0.0, (3.6 * m.is_lower + 2.4 * m.is_upper) * mid * size, 1.6 * m.is_lower * mid))
-        + m.push((0, -96, 88), (16, 12, 16), vec(0, 3.4, 0.8)) + _mirrored(m.push((0, -96, 88), (16, 12, 16), vec(0, 3.4, 0.8))),
-        "mouthShrugUpper": m.spread(m.slide(0.0, (3.2 * m.is_upper + 0.9 * m.is_lower) * mid * size, 1.4 * m.is_upper * mid)),
+        "mouthShrugLower": m.spread(
+            m.slide(0.0, (3.6 * m.is_lower + 2.4 * m.is_upper) * mid * size, 1.6 * m.is_lower * mid)
+        ) + chin + mirrored(chin),
+        "mouthShrugUpper": m.spread(
+            m.slide(0.0, (3.2 * m.is_upper + 0.9 * m.is_lower) * mid * size, 1.4 * m.is_upper * mid)
+        ),
         "mouthPressLeft": _press(m),
-        "mouthLowerDownLeft": m.spread(m.slide(0.6 * size * m.is_lower * m.left * mid, -6.2 * size * m.is_lower * mid * m.left * _bell(a, 0.35, 0.75), -0.4 * m.is_lower * m.left * mid)),
-        "mouthUpperUpLeft": m.spread(m.slide(0.4 * size * m.is_upper * m.left * mid, 5.6 * size * m.is_upper * mid * m.left * _bell(a, 0.35, 0.75), -0.2 * m.is_upper * m.left * mid))
+        "mouthLowerDownLeft": _lift(m, m.is_lower * mid, 0.6, -6.2, -0.4),
+        "mouthUpperUpLeft": _lift(m, m.is_upper * mid, 0.4, 5.6, -0.2)
         + m.push((22, -42, 84), (9, 10, 16), vec(0.2, 2.2, 0.8)),
     }  # fmt: skip
-    return shapes
 
 
 def _bell(across: Tensor, centre: float, width: float) -> Tensor:
     return torch.exp(-(((across - centre) / width) ** 2))
 
 
-def _mirrored(delta: Tensor) -> Tensor:
-    return delta[topology().mirror] * torch.tensor([-1.0, 1.0, 1.0], dtype=delta.dtype)
+def _lift(m: Mouth, lip: Tensor, out: float, up: float, forward: float) -> Tensor:
+    """The left half of a lip drawn up or down; ``lip`` (52,) says which handles, the rest is in millimetres."""
+    side = lip * m.left
+    return m.spread(m.slide(out * m.size * side, up * m.size * side * _bell(m.across, 0.35, 0.75), forward * side))
 
 
 def _smile(m: Mouth, corner: Tensor) -> Tensor:

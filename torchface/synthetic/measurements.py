@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.synthetic.annotations import annotations
+from torchface.synthetic.annotations import head_annotations
 from torchface.synthetic.features import lid_order
-from torchface.synthetic.topology import EYE_RIM, topology
+from torchface.synthetic.topology import EAR_RIM, EYE_RIM, topology
 
 WING_ROW, WING_COLUMN = 19, 5
 JAW_ANGLE_ROW, JAW_ANGLE_COLUMN = 31, 19
@@ -22,12 +21,12 @@ def measure(head: Mesh) -> dict[str, float]:
     """
     t, v = topology(), head.vertices.double()
     marks = v[head.landmarks]
-    skin = v[annotations().regions["face"] | annotations().regions["cranium"]]
+    skin = v[head_annotations().regions["face"] | head_annotations().regions["cranium"]]
     rim = v[t.rings["eye"][EYE_RIM]]
     inner, outer = rim[lid_order()[0][[0, 16]]]
-    balls = [v[annotations().regions[f"eyeball_{side}"]] for side in ("left", "right")]
+    balls = [v[head_annotations().regions[f"eyeball_{side}"]] for side in ("left", "right")]
     low = skin[(skin[:, 1] > -45) & (skin[:, 1] < 5) & (skin[:, 2] > 5)]
-    ear = v[t.rings["ear"]].reshape(-1, 3)
+    ear = v[t.rings["ear"][EAR_RIM]]
     span = lambda points, axis: float(points[:, axis].max() - points[:, axis].min())  # noqa: E731
     return {
         "head_length": span(skin[skin[:, 1] > 8], 2),
@@ -50,7 +49,3 @@ def measure(head: Mesh) -> dict[str, float]:
 
 def _middle(points: Tensor) -> Tensor:
     return (points.amax(0) + points.amin(0)) / 2
-
-
-__all__ = ["measure"]
-assert torch

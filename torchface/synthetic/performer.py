@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.synthetic.head import dress, mirrored
-from torchface.synthetic.identity import anatomy
+from torchface.synthetic.head import dress
+from torchface.synthetic.identity import anatomy, mirrored
 from torchface.synthetic.lids import upper_face
 from torchface.synthetic.lips import lower_face
 

@@ -1,4 +1,4 @@
-"""The mean head's vertices: the grid cast onto the form, then lids, lips, nostrils, ears, mouth and eyeballs laid in."""
+"""The mean head's vertices: the grid cast onto the form, then lids, lips, nostrils, ears and eyeballs laid in."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ _COLUMN_AT = np.array([
 ])  # fmt: skip
 _EAR_SPAN = (84.0, 107.0)  # azimuth of the ear's block, degrees
 
-# Where rows pass over the nose's lower half: row, then a point (x, y, z) on each of the columns below; the form decides.
+# Where rows pass over the nose's lower half: row, then a point near the form for each of these columns.
 _NOSE_COLUMNS = np.array([0, 1, 3, 5, 6])
 _NOSE_ROWS = {
     17: ((0, -29.5, 110.0), (2.8, -29.5, 109.5), (8.6, -29.5, 104.0), (14.5, -30.5, 92.0), (17.5, -31.0, 86.0)),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.mesh import fan_triangulation
 from torchface.rendering.raycast import RayCaster
-from torchface.synthetic.annotations import annotations
+from torchface.synthetic.annotations import head_annotations
 from torchface.synthetic.features import lid_order
 from torchface.synthetic.form import EYE_CENTRE
 from torchface.synthetic.identity import both_sides, mean_vertices, ramp
@@ -59,7 +59,7 @@ def _texels(size: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def _vertex_marks() -> Tensor:
     """What the painter must know beyond positions, (V,8), in the order of ``_MARKS``."""
-    t, regions = topology(), annotations().regions
+    t, regions = topology(), head_annotations().regions
     marks = torch.zeros(t.count, len(_MARKS))
     lips = torch.tensor([0.0] * (MOUTH_BORDER - 1) + [0.0, 0.55, 1.0, 1.0, 1.0, 1.0] + [1.0] * 7)
     deep = (torch.arange(len(t.rings["mouth"])) - MOUTH_CONTACT).clamp(min=0) / 7
