@@ -12,7 +12,7 @@ from torchface.errors import ShapeError
 from torchface.optim.box_problem import metric
 from torchface.optim.splitting import RELAXATION, RHO, prepare_splitting
 
-STEPS = 64
+STEPS = 72
 STEPS_WITH_GAPS = 96
 # Numbers below this share of the largest on the diagonal of H would overflow its scaling.
 _SMALLEST_DIAGONAL = 1e-6

@@ -24,7 +24,7 @@ from torchface.rig import BlendshapeRig
 
 _RHOS = (0.06, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
 _PARITY = 1e-5
-_TEST_FRAMES = 256
+_TEST_FRAMES = 512
 _FRAMES_A_POSE = 10
 
 
@@ -143,24 +143,27 @@ def export_solver(
 
 
 def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
-    """The metric's rho of a small set that leaves the least worst gap on these markers (T,M,3), from cold."""
+    """The metric's rho of a small set that leaves the least gap on these markers (T,M,3), from cold.
+
+    A small rho suits the few frames with a slow mode, a larger one all others: the 98 % quantile weighs the two.
+    """
     exact = copy.deepcopy(solver).double()
     markers = markers.double()
     energy = exact.energy(markers)
     least = energy.value(exact(markers))
     cold = torch.zeros_like(energy.f)
 
-    def worst(rho: float) -> float:
-        return float((energy.value(SolverGraph(exact, steps, rho=rho)(markers, cold)) / least).max())
+    def gap(rho: float) -> float:
+        return float((energy.value(SolverGraph(exact, steps, rho=rho)(markers, cold)) / least).quantile(0.98))
 
-    return min(_RHOS, key=worst)
+    return min(_RHOS, key=gap)
 
 
 def random_frames(solver: MarkerSolver, count: int, noise: float = 0.3, seed: int = 0) -> Tensor:
     """Markers (T,M,3) that move from one random sparse pose to the next, with noise in millimetres, in marker space."""
     generator = torch.Generator().manual_seed(seed)
     poses = (count // _FRAMES_A_POSE + 2, len(solver.names))
-    active = torch.rand(poses, generator=generator) < 0.4
+    active = torch.rand(poses, generator=generator) < 0.2
     keys = active * torch.rand(poses, generator=generator).square()
     time_ = torch.arange(count) / _FRAMES_A_POSE
     before, share = time_.long(), time_.frac()[:, None]

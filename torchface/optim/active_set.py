@@ -9,6 +9,8 @@ Source: Bertsekas 1982, Projected Newton methods for optimization problems with 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -25,14 +27,18 @@ _RIDGE = 1e-13
 _RIDGE_TRIES = 5
 
 
-def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, iterations: int = 100) -> Tensor:
+def projected_newton(
+    problem: BoxProblem, start: Tensor, tolerance: float, iterations: int = 100, careful: bool = True
+) -> Tensor:
     """The minimisers (B,N), from feasible ``start`` (B,N).
 
     Args:
         problem: B problems, float64.
         start: feasible points, (B,N).
         tolerance: on ``problem.residual``; a problem that reaches it is left alone.
-        iterations: at most so many factorisations a problem; a handful is usual.
+        iterations: at most so many steps.
+        careful: search where the full step does not descend, and so descend always; otherwise leave such a problem
+            where it stands, too far from its solution for Newton steps to be worth their price.
     """
     numbers = _CHUNK_NUMBERS.get(start.device.type, _CHUNK_NUMBERS["other"])
     chunk = max(1, numbers // problem.f.shape[1] ** 2)
@@ -44,39 +50,62 @@ def projected_newton(problem: BoxProblem, start: Tensor, tolerance: float, itera
             here = x[rows]
             gradient = part.gradient(here)
             open_ = part.unsolved(here, tolerance, gradient)
-            if not bool(open_.any()):
-                break
             if not bool(open_.all()):
                 rows, here, gradient = rows[open_], here[open_], gradient[open_]
                 part = problem.rows(rows)
-            x[rows] = _step(part, here, gradient, part.residual(here, gradient))
+            if not len(rows):
+                break
+            step = _NewtonStep.at(part, here, gradient)
+            x[rows] = torch.where(step.descends[:, None], step.full, here)
+            stuck = (~step.descends).nonzero()[:, 0]
+            if not len(stuck):
+                continue
+            if careful:
+                x[rows[stuck]] = _careful_step(part.rows(stuck), here[stuck], gradient[stuck], step.rows(stuck))
+            else:
+                rows = rows[step.descends]
     return x
 
 
-def _step(problem: BoxProblem, x: Tensor, gradient: Tensor, residual: Tensor) -> Tensor:
-    # A variable closer to its bound than the residual counts as at it, else the search path could collapse.
-    near = residual.clamp(max=1e-3)[:, None]
-    held = ((x - problem.lower <= near) & (gradient > 0)) | ((problem.upper - x <= near) & (gradient < 0))
-    damping = _DAMPING * residual.clamp(max=1)
-    newton = solve_free(problem.H, problem.diagonal, ~held, -gradient, damping)
-    direction = torch.where(held, -gradient / problem.diagonal, newton)
-    # The full step is right nearly always; only the others pay for more.
-    full = problem.clip(x + direction)
-    moved = full - x
-    promised = (gradient * moved).sum(-1)
-    worse = problem.change(moved, gradient) > 0.1 * promised
-    if bool(worse.any()):
-        full[worse] = _careful_step(
-            problem.rows(worse), x[worse], gradient[worse], held[worse], near[worse], damping[worse]
-        )
-    return full
+@dataclass(frozen=True, eq=False)
+class _NewtonStep:
+    """A full step and what it was made from.
+
+    Args:
+        full: where it leads, in the box, (B,N).
+        descends: whether the objective falls enough there, (B,).
+        held: variables at a bound whose gradient pushes outward, (B,N).
+        near: how close to a bound counts as at it, (B,1).
+        damping: added to the scaled diagonal, (B,).
+    """
+
+    full: Tensor
+    descends: Tensor
+    held: Tensor
+    near: Tensor
+    damping: Tensor
+
+    @staticmethod
+    def at(problem: BoxProblem, x: Tensor, gradient: Tensor) -> _NewtonStep:
+        residual = problem.residual(x, gradient)
+        # A variable closer to its bound than the residual counts as at it, else the search path could collapse.
+        near = residual.clamp(max=1e-3)[:, None]
+        held = ((x - problem.lower <= near) & (gradient > 0)) | ((problem.upper - x <= near) & (gradient < 0))
+        damping = _DAMPING * residual.clamp(max=1)
+        newton = solve_free(problem.H, problem.diagonal, ~held, -gradient, damping)
+        full = problem.clip(x + torch.where(held, -gradient / problem.diagonal, newton))
+        moved = full - x
+        descends = problem.change(moved, gradient) <= 0.1 * (gradient * moved).sum(-1)
+        return _NewtonStep(full, descends, held, near, damping)
+
+    def rows(self, keep: Tensor) -> _NewtonStep:
+        return _NewtonStep(self.full[keep], self.descends[keep], self.held[keep], self.near[keep], self.damping[keep])
 
 
-def _careful_step(
-    problem: BoxProblem, x: Tensor, gradient: Tensor, held: Tensor, near: Tensor, damping: Tensor
-) -> Tensor:
+def _careful_step(problem: BoxProblem, x: Tensor, gradient: Tensor, step: _NewtonStep) -> Tensor:
     """A step that a bound at hand cannot stop: what the direction would push out is held too, and solved again."""
-    at_lower, at_upper = x - problem.lower <= near, problem.upper - x <= near
+    held, damping = step.held, step.damping
+    at_lower, at_upper = x - problem.lower <= step.near, problem.upper - x <= step.near
     direction = solve_free(problem.H, problem.diagonal, ~held, -gradient, damping)
     for _ in range(_BLOCKED_TRIES):
         blocked = ~held & ((at_lower & (direction < 0)) | (at_upper & (direction > 0)))

@@ -13,11 +13,12 @@ from torchface.optim.splitting import SplittingFactors, prepare_splitting, split
 
 # Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
 # ends in the first rounds nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps
-# follow the first round at once. The later rounds are for an H that is singular or close to it: splitting brings such
-# problems near enough for Newton steps to end them.
+# follow the first round at once. Later rounds are for an H that is singular or close to it: splitting brings such
+# problems near enough for Newton steps to end them, and the last ones make sure.
 _COARSE_ROUNDS = ((0, 48), (0, 32), (0, 32), (0, 32))
 _FINE_ROUNDS = ((0, 60),)
-_LATER_ROUNDS = ((8, 100), (8, 200), (8, 400), (8, 800), (8, 1600), (100, 0))
+_LATER_ROUNDS = ((4, 100), (4, 200), (4, 400), (4, 400))
+_CAREFUL_ROUNDS = ((8, 400), (8, 800), (8, 1600), (100, 0))
 _COARSE = 1e-7
 # The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
 # variable alone would go, or where the residual itself is still this share of that way.
@@ -131,10 +132,11 @@ def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None,
     x = state.z.clone()
     rows = torch.arange(len(x), device=x.device)
     part = problem
-    for number, (newton_steps, steps) in enumerate((*first, *_LATER_ROUNDS)):
+    quick = len(first) + len(_LATER_ROUNDS)
+    for number, (newton_steps, steps) in enumerate((*first, *_LATER_ROUNDS, *_CAREFUL_ROUNDS)):
         gradient = part.gradient(state.z)
         if newton_steps:
-            x[rows] = found = projected_newton(part, state.z, tolerance, newton_steps)
+            x[rows] = found = projected_newton(part, state.z, tolerance, newton_steps, number >= quick)
             still = part.unsolved(found, tolerance)
         else:
             x[rows] = state.z
@@ -145,7 +147,7 @@ def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None,
         if len(keep) < len(rows):
             rows, part, state, factors = rows[keep], part.rows(keep), state.rows(keep), factors.rows(keep)
             gradient = gradient[keep]
-        dtype = torch.float32 if number < len(first) else torch.float64
+        dtype = torch.float32 if number < quick else torch.float64
         state = splitting_steps(part, factors, state, steps, gradient, dtype)
     _check_bounded(problem, x)
     return x
