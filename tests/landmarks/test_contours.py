@@ -60,7 +60,9 @@ def test_no_single_column_can_do_better() -> None:
     for c in range(1, 100):
         cost = settings.dark * grey[:, c] + settings.near / 101**2 * (rows - arc[c]) ** 2
         for n in (c - 1, c + 1):
-            cost = cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2 + settings.smooth * (rows - path[n]) ** 2
+            cost = (
+                cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2 + settings.smooth * (rows - path[n]) ** 2
+            )
         allowed = grey[:, c] <= limit
         assert cost[path[c]] <= cost[allowed if allowed.any() else slice(None)].min() + 1e-9
 

@@ -28,7 +28,9 @@ def ball(radius: float, groove: float = 0.0) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=6, radius=radius)
     vertices = torch.tensor(sphere.vertices)
     vertices = vertices * (1 - groove / radius * torch.exp(-0.5 * (vertices[:, 1:2] / 2.5) ** 2))
-    return Mesh(vertices.float(), torch.tensor(sphere.faces, dtype=torch.int64), colors=(vertices / radius).float() / 2 + 0.5)
+    return Mesh(
+        vertices.float(), torch.tensor(sphere.faces, dtype=torch.int64), colors=(vertices / radius).float() / 2 + 0.5
+    )
 
 
 def test_pixels_and_points_are_inverse() -> None:

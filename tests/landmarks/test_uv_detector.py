@@ -20,7 +20,7 @@ SIZE = 160
 
 def stamp(image: Tensor, kind: str, x: float, y: float) -> None:
     across, down = torch.meshgrid(torch.arange(SIZE) - x, torch.arange(SIZE) - y, indexing="xy")
-    near = torch.exp(-((across**2 + down**2) / 14**2) ** 4)
+    near = torch.exp(-(((across**2 + down**2) / 14**2) ** 4))
     away = (across**2 + down**2).sqrt()
     mark = {
         "cross": torch.exp(-((across / 2) ** 2)) + torch.exp(-((down / 2) ** 2)),

@@ -55,7 +55,7 @@ def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates, search: P
 def misfit(poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceSample) -> Tensor:
     """Mean distance (B,) of moved points from a surface, millimetres; one that is far or faces away counts 12."""
     moved, turned = poses.apply(points), normals @ poses.rotation.transpose(-1, -2)
-    distance, row = surface.nearest(moved)
+    distance, row = surface.nearest(moved, _REACH)
     facing = (surface.normals[row] * turned).sum(-1) > _FACING
     return torch.where(facing, distance.clamp(max=_REACH), _REACH).mean(-1)
 
@@ -81,7 +81,7 @@ def refine(
     for reach in reaches:  # each round starts where the last one ended
         now = Similarity(scale, rotation, translation)
         moved, turned = now.apply(points), normals @ rotation.transpose(-1, -2)
-        distance, row = surface.nearest(moved)
+        distance, row = surface.nearest(moved, reach)
         n, y = surface.normals[row], surface.points[row]
         centre = moved.mean(1, keepdim=True)
         arm = moved - centre

@@ -23,12 +23,14 @@ class SurfaceSample:
     normals: Tensor
     tree: cKDTree
 
-    def nearest(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance and row of the nearest point for queries (...,3), each (...)."""
+    def nearest(self, queries: Tensor, within: float) -> tuple[Tensor, Tensor]:
+        """Distance and row of the nearest point for queries (...,3), each (...); infinity and any row beyond ``within``
+        millimetres, which is what makes it fast."""
         flat = queries.reshape(-1, 3).numpy()
-        distance, row = self.tree.query(flat, workers=-1)
+        distance, row = self.tree.query(flat, distance_upper_bound=within, workers=-1)
         shape = queries.shape[:-1]
-        return torch.from_numpy(distance).view(shape), torch.from_numpy(row).view(shape)
+        rows = torch.from_numpy(row).clamp(max=len(self.points) - 1)
+        return torch.from_numpy(distance).view(shape), rows.view(shape)
 
 
 def sample_surface(mesh: Mesh, count: int = 20000, seed: int = 0) -> SurfaceSample:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import ValueRangeError
+from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.geometry.operators import components, corners
 from torchface.geometry.proximity import SurfaceIndex
 from torchface.io.files import write_file
@@ -22,6 +22,7 @@ from torchface.landmarks.correspondences import template_features
 from torchface.landmarks.scan import LINES
 from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
 from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
 from torchface.synthetic.dressing import Dress, dressed
 from torchface.synthetic.fusion import DepthNoise, fuse
 from torchface.synthetic.photographs import Photography, photographed
@@ -30,7 +31,6 @@ from torchface.synthetic.subdivision import finely_coloured
 _DISTANCE = 520.0
 _VIEWS = tuple((yaw, pitch) for pitch in (-14.0, 22.0) for yaw in (-100.0, -65.0, -32.0, 0.0, 32.0, 65.0, 100.0))
 _LINE_POINTS = 60
-_FINE = 1.2
 _MENPO_GROUPS = (
     ("chin", range(17)),
     ("leyebrow", range(17, 22)),
@@ -48,6 +48,7 @@ class ScannerSettings:
 
     Args:
         voxel: resolution of the fused surface; a scan has about 120,000 / voxel² vertices.
+        detail: the head is subdivided until its edges are about this long.
         noise: of depth.
         holes: how many are torn, with radii up to ``hole_radius``.
         crumbs: loose bits floating about.
@@ -59,6 +60,7 @@ class ScannerSettings:
     """
 
     voxel: float = 1.4
+    detail: float = 1.2
     noise: DepthNoise = field(default_factory=DepthNoise)
     holes: int = 5
     hole_radius: float = 5.0
@@ -89,6 +91,21 @@ class RawScan:
     translation: Tensor
 
 
+def eyes_closed(rig: BlendshapeRig) -> Mesh:
+    """A performer as it sits before the scanner: neutral, both eyes shut.
+
+    Raises:
+        NameMismatchError: the rig has no ``eyeBlinkLeft`` or ``eyeBlinkRight``.
+    """
+    blinks = ("eyeBlinkLeft", "eyeBlinkRight")
+    missing = [name for name in blinks if name not in rig.names]
+    if missing:
+        raise NameMismatchError(f"rig: found no shape {missing[0]!r}, expected ARKit's names")
+    weights = torch.zeros(1, len(rig.names))
+    weights[0, [rig.names.index(name) for name in blinks]] = 1.0
+    return rig.neutral.with_vertices(rig(weights)[0])
+
+
 def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) -> RawScan:
     """Scans a head.
 
@@ -103,7 +120,7 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
     """
     settings = settings or ScannerSettings()
     generator = torch.Generator().manual_seed(seed)
-    smooth = finely_coloured(head, _FINE)
+    smooth = finely_coloured(head, settings.detail)
     head = head.with_vertices(smooth.vertices[: len(head.vertices)])
     landmarks = head.vertices[head.landmarks].double()
     annotation = _truth(head, landmarks)
