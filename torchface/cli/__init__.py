@@ -17,6 +17,7 @@ from torchface.cli.export import EXPORTS
 from torchface.cli.info import info
 from torchface.cli.pick import pick
 from torchface.cli.progress import console
+from torchface.cli.register import register
 from torchface.cli.render import render
 from torchface.cli.solve import solve
 from torchface.cli.transfer import transfer
@@ -25,6 +26,7 @@ from torchface.errors import TorchfaceError
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
+    "register": register,
     "transfer": transfer,
     "solve": solve,
     "render": render,

@@ -1,0 +1,101 @@
+"""``torchface register``: a template bent onto many scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from tyro.conf import Positional
+
+from torchface.cli.progress import console
+
+_MOST_ROWS = 40
+
+
+def register(
+    template: Positional[Path],
+    scans: Positional[tuple[Path, ...]],
+    out: Path,
+    landmarks: Path | None = None,
+    jobs: int = 1,
+    cluster: str | None = None,
+    part: str | None = None,
+    unit: str | None = None,
+    detector: Path | None = None,
+    texture_size: int = 1024,
+    quiet: bool = False,
+) -> None:
+    """Bend a template onto raw scans: each scan's face in the template's topology, with the scan's colours.
+
+    Writes OUT/NAME.glb and a record OUT/NAME.json for each scan, OUT/summary.csv and OUT/contact_sheet.png. A scan
+    that cannot be registered is reported and skipped. Killed and started again, the command goes on where it was;
+    a scan whose files have changed is registered anew.
+
+    Args:
+        template: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        scans: Files (.obj, .ply, .stl, .glb, .gltf), or folders of them.
+        out: The folder to write into.
+        landmarks: Folder of landmark files named as the scans are: .ljson, .pts or .json in the order of the
+            template's annotated landmarks, or correspondences saved by `torchface pick`.
+        jobs: How many processes, of one thread each.
+        cluster: Address of a Ray cluster, or "auto" on one of its machines, instead of --jobs; scans and OUT must lie
+            where all its machines see them. Needs the extra: pip install torchface[cluster].
+        part: Keep this region of the template only, such as face.
+        unit: Unit of the scans (mm, cm, m) where it is not the format's own.
+        detector: Folder of a landmark detector for scans without landmarks.
+        texture_size: Texels a side of each result's texture; 0 makes none.
+        quiet: Show no progress.
+    """
+    from torchface.registration.corpus_record import CorpusEntry
+    from torchface.workflows.register import register_scans
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=quiet) as progress:
+        scanning = progress.add_task("registering", total=None, rate="")
+        sheet = progress.add_task("contact sheet", total=None, rate="", visible=False)
+
+        new = 0
+
+        def registered(done: int, total: int, entry: CorpusEntry) -> None:
+            nonlocal new
+            new += not entry.reused
+            elapsed = progress.tasks[scanning].elapsed
+            rate = f"{60 * new / elapsed:.1f} a minute" if elapsed and new else ""
+            progress.update(scanning, completed=done, total=total, rate=rate)
+            if not entry.registered:
+                progress.console.print(
+                    f"[yellow]skipped[/] {escape(entry.scan.name)}: {escape(entry.error)}", highlight=False
+                )
+
+        def drawn(done: int, total: int) -> None:
+            progress.update(sheet, completed=done, total=total, visible=True)
+
+        done = register_scans(
+            template, scans, out, landmarks, jobs, cluster, part, unit, detector, texture_size, registered, drawn
+        )
+    entries = done.report.entries
+    reused = sum(entry.reused for entry in entries)
+    title = f"{len(done.report.registered)} of {len(entries)} scans registered"
+    table = Table(title=title + (f", {reused} known from an earlier run" if reused else ""))
+    for head in ("scan", "median", "on the scan", "start by", "seconds", "remarks"):
+        table.add_column(head)
+    # The worst first: those are the ones to look at.
+    ranked = sorted(entries, key=lambda entry: (entry.registered, -entry.median_distance if entry.registered else 0.0))
+    for entry in ranked[:_MOST_ROWS]:
+        numbers = (f"{entry.median_distance:.3f} mm", f"{entry.matched:.0%}") if entry.registered else ("skipped", "")
+        remarks = "; ".join(entry.notes) or entry.error
+        table.add_row(escape(entry.name), *numbers, entry.start, f"{entry.seconds:.1f}", escape(remarks))
+    console.print(table)
+    if len(entries) > _MOST_ROWS:
+        console.print(f"the {_MOST_ROWS} worst; all are in {done.report.summary}")
+    print(done.report.summary)
+    print(done.contact_sheet)

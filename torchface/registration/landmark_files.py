@@ -1,0 +1,72 @@
+"""Landmark files beside scans, read as what ``register`` takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.io.files import millimetres_per, read_file
+from torchface.io.landmarks import load_landmark_points
+from torchface.io.picks import load_correspondences
+from torchface.mesh import Mesh
+from torchface.registration.preparation import Landmarks
+
+ENDINGS = (".ljson", ".json", ".pts")
+_METRES = (".glb", ".gltf")
+_LARGEST_FILE = 16 * 2**20
+
+
+def landmark_file(folder: Path, scan: Path) -> Path | None:
+    """The file of a scan's landmarks: its name with ``.ljson``, ``.json`` or ``.pts``; None where there is none."""
+    return next((path for ending in ENDINGS if (path := folder / f"{scan.stem}{ending}").is_file()), None)
+
+
+def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit: str | None = None) -> Landmarks:
+    """Template vertex ids (L,) and scan points (L,3), millimetres.
+
+    Args:
+        path: correspondences as ``torchface pick`` saves them (JSON, made for this template); or points only
+            (LJSON, or PTS of three numbers a row), in the order of the template's annotated landmarks, in the scan's
+            unit.
+        template: what will be registered.
+        scan: the scan's file; metres where it is glTF.
+        unit: of the scan's file, where it is another.
+
+    Raises:
+        FileFormatError: a broken file, or points in a picture.
+        TopologyError: correspondences of another template.
+        ValueRangeError: points only, and a template without annotated landmarks.
+        ShapeError: another number of points than the template has landmarks.
+    """
+    path = Path(path)
+    if _is_correspondences(path):
+        pairs = load_correspondences(path)
+        pairs.check(template)
+        return pairs.vertices, pairs.points
+    found = load_landmark_points(path)
+    if found.points.shape[1] != 3:
+        raise FileFormatError(f"{path}: found points in a picture, two numbers each; expected places on the scan")
+    if template.annotations is None or template.annotations.landmarks is None:
+        raise ValueRangeError(
+            f"{path}: found points without vertices and a template without annotated landmarks; expected "
+            "correspondences, or an annotated template (torchface pick makes both)"
+        )
+    ids = template.annotations.landmarks.cpu()
+    points = found.ibug() if found.groups and len(ids) == 68 else found.points
+    if len(points) != len(ids):
+        raise ShapeError(f"{path}: found {len(points)} points, expected the template's {len(ids)} landmarks")
+    per_unit = millimetres_per(unit or ("m" if Path(scan).suffix.lower() in _METRES else "mm"))
+    return ids, points * torch.tensor(per_unit, dtype=points.dtype)
+
+
+def _is_correspondences(path: Path) -> bool:
+    if path.suffix.lower() != ".json":
+        return False
+    try:
+        document = json.loads(read_file(path, _LARGEST_FILE))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not JSON ({error})") from error
+    return isinstance(document, dict) and "format" in document

@@ -1,0 +1,134 @@
+"""From a template and scans on disk to registered meshes, a table and a contact sheet on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, FileFormatError, TopologyError
+from torchface.geometry.alignment import similarity_transform
+from torchface.io import load_mesh, load_rig
+from torchface.io.ict_facekit import region
+from torchface.mesh import Mesh, submesh
+from torchface.registration.corpus import CorpusReport, register_corpus
+from torchface.registration.corpus_record import CorpusEntry
+from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.viz.faces import face_views
+
+CONTACT_SHEET = "contact_sheet.png"
+_WIDTH, _HEIGHT = 144, 180
+_TEXT = 11
+_SKIPPED = 0.85
+
+
+@dataclass(frozen=True)
+class RegisteredScans:
+    """What a run left on disk: the report with its table, and the picture of all scans."""
+
+    report: CorpusReport
+    contact_sheet: Path
+
+
+def load_template(path: Path, part: str | None = None, unit: str | None = None) -> Mesh:
+    """The mesh to bend: a mesh file, or the neutral of a rig (.glb, a folder of OBJ files, ICT-FaceKit's folder)."""
+    if path.is_dir():
+        return load_rig(path, unit, part).neutral
+    mesh = load_mesh(path, unit)
+    return mesh if part is None else submesh(mesh, region(mesh, part)).mesh
+
+
+def register_scans(
+    template: Path,
+    scans: Sequence[Path],
+    out: Path,
+    landmarks: Path | None = None,
+    jobs: int = 1,
+    cluster: str | None = None,
+    part: str | None = None,
+    unit: str | None = None,
+    detector: Path | None = None,
+    texture_size: int = 1024,
+    progress: Callable[[int, int, CorpusEntry], None] | None = None,
+    drawing: Callable[[int, int], None] | None = None,
+) -> RegisteredScans:
+    """Registers and draws; see ``torchface register --help`` for the arguments.
+
+    Args:
+        progress: called for each scan, as ``register_corpus`` does.
+        drawing: called with (faces drawn, scans).
+
+    Raises:
+        AlignmentError: not one scan could be registered; table and contact sheet are written all the same.
+        TorchfaceError: the template, ``out`` or a setting is of no use.
+    """
+    mesh = load_template(template, part)
+    if len(mesh.faces) == 0:
+        raise TopologyError(f"{template}: found {len(mesh.vertices)} vertices and no triangle, expected a face's mesh")
+    report = register_corpus(
+        mesh,
+        scans,
+        out,
+        jobs,
+        cluster,
+        progress,
+        landmarks=landmarks,
+        unit=unit,
+        detector=detector,
+        texture_size=texture_size,
+    )
+    picture = contact_sheet(report, mesh, drawing)
+    save_picture(picture, report.out / CONTACT_SHEET)
+    if not report.registered:
+        raise AlignmentError(
+            f"{out}: none of {len(report.entries)} scans could be registered, see {report.summary.name}; the first, "
+            f"{report.entries[0].scan.name}: {report.entries[0].error}"
+        )
+    return RegisteredScans(report, report.out / CONTACT_SHEET)
+
+
+def contact_sheet(report: CorpusReport, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Tensor:
+    """All registered faces from the front as the template looks, with name and distance; (3,H,W).
+
+    Args:
+        report: of the corpus.
+        template: gives the direction that is the front: a scan may be turned any way.
+        progress: called with (faces drawn, scans).
+    """
+    cells = []
+    for number, entry in enumerate(report.entries, 1):
+        cells.append(_cell(entry, template))
+        if progress is not None:
+            progress(number, len(report.entries))
+    columns = max(4, round((len(cells) * 1.8) ** 0.5))
+    return sheet(cells, min(columns, len(cells)))
+
+
+def _cell(entry: CorpusEntry, template: Mesh) -> Tensor:
+    name = entry.name if len(entry.name) <= 20 else f"{entry.name[:9]}..{entry.name[-9:]}"
+    if entry.result is not None:
+        try:
+            mesh = load_mesh(entry.result)
+            upright = in_place_of(mesh, template)
+            face = face_views(upright, (0.0,), width=_WIDTH, height=_HEIGHT, samples=1, framed_by=upright)
+            return caption(caption(face, name, _TEXT), f"{entry.median_distance:.2f} mm", _TEXT)
+        except FileFormatError:  # somebody has taken it away meanwhile
+            pass
+    blank = torch.full((3, _HEIGHT, _WIDTH), _SKIPPED)
+    return caption(caption(blank, name, _TEXT), "skipped", _TEXT)
+
+
+def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Mesh:
+    """A mesh turned and moved, without a change of size, to where a template of the same topology is.
+
+    Args:
+        mesh: V vertices.
+        template: V vertices.
+        weights: how much each vertex says, (V,); equal if absent.
+    """
+    own, other = mesh.vertices.double(), template.vertices.double()
+    pose = similarity_transform(own[None], other[None], None if weights is None else weights[None], scale=False)
+    return mesh.with_vertices(pose.apply(own[None])[0].to(mesh.vertices))
