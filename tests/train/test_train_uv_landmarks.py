@@ -1,0 +1,145 @@
+"""The recipe end to end on a handful of coarse scans, and what the detector then gives to registration."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
+from torchface.geometry.alignment import Similarity
+from torchface.geometry.proximity import SurfaceIndex
+from torchface.io import load_mesh
+from torchface.landmarks import (
+    AutomaticLandmarks,
+    DetectorSettings,
+    UVLandmarkDetector,
+    contour_correspondences,
+    load_annotations,
+    load_detector,
+    scan_landmarks,
+)
+from torchface.landmarks.correspondences import template_features
+from torchface.landmarks.evaluation import landmark_errors
+from torchface.landmarks.hog import HogLayout
+from torchface.landmarks.scan import LINES
+from torchface.synthetic import draw_identities, head, performer
+from torchface.synthetic.photographs import Photography
+from torchface.synthetic.scanner import ScannerSettings, eyes_closed, write_scans
+from train.uv_landmarks import Settings, Trained, train
+
+pytest.importorskip("safetensors")
+pytest.importorskip("tomli_w")
+
+SIZE = 512
+QUICK = DetectorSettings(hog=HogLayout(stride=4))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scans")
+    identities = draw_identities(6, torch.Generator().manual_seed(2), spread=0.7)
+    settings = ScannerSettings(voxel=2.5, detail=2.5, photography=Photography(height=450))
+    write_scans((eyes_closed(performer(identity)) for identity in identities), path, settings)
+    return path
+
+
+def settings(folder: Path, out: Path) -> Settings:
+    return Settings(folder, folder / "annotations.json", out, "texture", held_out=1, size=SIZE, detector=QUICK)
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Path]:
+    out = tmp_path_factory.mktemp("models") / "uv"
+    return train(settings(folder, out)), out
+
+
+def test_landmarks_of_the_scan_held_out_are_found(trained: tuple[Trained, Path]) -> None:
+    (errors,) = trained[0].errors
+    assert errors.mean_pixels < 8 * SIZE / 512
+    assert max(errors.lines.values()) < 4
+
+
+def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder: Path) -> None:
+    result, out = trained
+    assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "held_out.png"}
+    again = load_detector(out)
+    scan = load_mesh(folder / "scan_005.obj")
+    found = scan_landmarks(again, scan)
+    truth = load_annotations(folder / "annotations.json")["scan_005.obj"]
+    assert torch.allclose(landmark_errors(found, scan, truth).pixels, result.errors[0].pixels, atol=1e-3)
+
+
+def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], folder: Path) -> None:
+    scan = load_mesh(folder / "scan_005.obj")
+    truth = load_annotations(folder / "annotations.json")["scan_005.obj"]
+    template = head(texture=False)
+    pairs = contour_correspondences(trained[0].detector, template, scan)
+    assert set(LINES) <= set(pairs.names)
+    assert SurfaceIndex(scan.vertices, scan.faces).nearest(pairs.points).distance.max() < 3.0
+    for name in LINES:
+        rows = [i for i, label in enumerate(pairs.names) if label == name]
+        assert len(rows) > 10
+        away = torch.cdist(pairs.points[rows].double(), truth.lines[name]).amin(1)
+        assert away.median() < 3.0
+        # Template vertices and scan points run the same way along the line.
+        across = template.vertices[pairs.vertices[rows], 0]
+        along = (pairs.points[rows].double() - truth.lines[name][0]) @ (truth.lines[name][-1] - truth.lines[name][0])
+        assert torch.corrcoef(torch.stack([across.double(), along]))[0, 1] > 0.97
+
+
+def test_registration_is_given_landmarks(trained: tuple[Trained, Path], folder: Path) -> None:
+    template = head(texture=False)
+    scan = load_mesh(folder / "scan_005.obj")
+    closed = replace(template, annotations=replace(template.annotations, contacts=None))
+    with pytest.raises(ValueRangeError, match="contact pairs"):
+        template_features(closed)
+    # The template has no texture: what is not annotated could not be detected on it, what is needs no texture.
+    finder = AutomaticLandmarks(trained[0].detector, template)
+    inverse = trained[0].detector.frame.locate(scan).inverse()
+    own = trained[0].detector.frame.locate(template)
+    rotation = inverse.rotation @ own.rotation
+    translation = inverse.apply(own.translation[:, None])[:, 0]
+    found = finder(template, scan, Similarity(inverse.scale * own.scale, rotation, translation))
+    assert found is not None
+    vertices, points = found
+    assert vertices.dtype == torch.int64
+    assert len(vertices) == len(points) > 60
+    with pytest.raises(TopologyError, match="vertices"):
+        finder(scan, scan, inverse)
+
+
+def test_a_detector_of_textures_refuses_a_scan_without(trained: tuple[Trained, Path], folder: Path) -> None:
+    scan = replace(load_mesh(folder / "scan_000.obj"), texture=None, uvs=None, uv_faces=None)
+    with pytest.raises(ValueRangeError, match="no texture"):
+        scan_landmarks(trained[0].detector, scan)
+    with pytest.raises(ValueRangeError, match="FaceFrame"):
+        scan_landmarks(UVLandmarkDetector(2), scan)
+
+
+def test_annotations_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> None:
+    document = json.loads((folder / "annotations.json").read_text())
+    one = dict(document, scans={"scan_000.obj": document["scans"]["scan_000.obj"]})
+    (tmp_path / "one.json").write_text(json.dumps(one))
+    with pytest.raises(TorchfaceError, match="at least two"):
+        train(replace(settings(folder, tmp_path), annotations=tmp_path / "one.json"))
+    document["scans"]["scan_000.obj"]["points"]["nose"] = [1, "two", 3]
+    (tmp_path / "text.json").write_text(json.dumps(document))
+    with pytest.raises(FileFormatError, match=r"scan_000.obj: nose"):
+        load_annotations(tmp_path / "text.json")
+    (tmp_path / "else.json").write_text('{"format": "something"}')
+    with pytest.raises(FileFormatError, match="scan-annotations"):
+        load_annotations(tmp_path / "else.json")
+
+
+def test_the_command_says_what_it_wants() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "train.uv_landmarks", "--help"], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "--scans" in shown.stdout
+    assert "--annotations" in shown.stdout
