@@ -113,7 +113,7 @@ class LinearStep:
         place = maps[3::4]
         downhill = self._rows_t @ blocks(data.targets - place[self._vertices])
         downhill += self._beta2 * (self._landmark_rows_t @ (data.landmarks - place[self._landmarks]))
-        downhill -= self._alpha2 * (self._space.stiffness_rows.T @ (self._space.stiffness @ maps))
+        downhill -= self._alpha2 * self._space.stiffness_gradient(maps)
         return maps + self._space.basis @ conjugate_gradients(apply, self._solver.solve, downhill, tolerance)
 
 

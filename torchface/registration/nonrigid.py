@@ -31,6 +31,7 @@ from torchface.registration.texture import ScanColors, has_colors, resampled_tex
 _RIGID_SAMPLES = 1500
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _NEAR = 3.0
+_FAR = 10.0
 
 Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
 """Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
@@ -44,7 +45,7 @@ class Registration:
     Args:
         mesh: the scan's face in the template's topology, in the scan's place, with the scan's colours.
         pose: the similarity that first laid the template on the scan, a batch of one.
-        distance: of each vertex to the scan, (V,) float64, millimetres.
+        distance: of each vertex to the scan, (V,) float64, millimetres; beyond 10 mm it may be a little too long.
         matched: which vertices' places the scan tells, (V,) bool; the others follow their neighbours.
         record: what was done.
     """
@@ -119,7 +120,7 @@ def register(
         say(f"bending, stage {number} of {len(schedule.stages)}")
         stages.append(deformer.run(stage, number))
     say("measuring")
-    nearest = start.surface.nearest(deformer.current)
+    nearest = _nearest(start.surface, deformer.current)
     matched = _matched(deformer, start.surface, nearest, schedule)
     vertices = deformer.current.to(template.vertices)
     mesh = replace(template, vertices=vertices, colors=None, texture=None)
@@ -189,6 +190,17 @@ def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bo
     agree = (surface.normals_at(found) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
     near = found.distance <= found.distance.median()
     return float(agree[near].mean()) < 0
+
+
+def _nearest(surface: SurfaceIndex, points: Tensor) -> SurfacePoints:
+    """Exact where the scan is near; what has no place on it would take many times as long as all the rest."""
+    quick = surface.among_nearest_samples(points)
+    near = quick.distance <= _FAR
+    exact = surface.nearest(points[near])
+    for found, better in ((quick.points, exact.points), (quick.barycentric, exact.barycentric)):
+        found[near] = better
+    quick.triangle[near], quick.distance[near] = exact.triangle, exact.distance
+    return quick
 
 
 def _matched(deformer: Deformer, surface: SurfaceIndex, nearest: SurfacePoints, schedule: Schedule) -> Tensor:

@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 _WIDTH = 1.5
+_NEAREST = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +32,14 @@ class Subspace:
         return self.basis[3::4].tocsr()
 
     @cached_property
-    def stiffness_rows(self) -> sparse.csr_array:
-        """(M ⊗ G) B, (4E,N)."""
-        return (self.stiffness @ self.basis).tocsr()
-
-    @cached_property
     def stiffness_matrix(self) -> sparse.csc_array:
         """The stiffness term's matrix, (N,N)."""
-        return (self.stiffness_rows.T @ self.stiffness_rows).tocsc()
+        # Squared first: (M ⊗ G) B has many more entries than B.
+        return (self.basis.T @ ((self.stiffness.T @ self.stiffness) @ self.basis)).tocsc()
+
+    def stiffness_gradient(self, maps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Half the stiffness term's derivative by y at the maps X (4V,3): (N,3)."""
+        return self.basis.T @ (self.stiffness.T @ (self.stiffness @ maps))
 
 
 def all_maps(stiffness: sparse.csr_array) -> Subspace:
@@ -57,10 +58,10 @@ def translations(stiffness: sparse.csr_array) -> Subspace:
 def graph(points: NDArray[np.float64], pairs: NDArray[np.int64], stiffness: sparse.csr_array, count: int) -> Subspace:
     r"""A coarse graph: nodes far from each other, and every vertex a blend of the nodes near it along the surface.
 
-    .. math:: X_i = \sum_k w_{ik} X_k, \qquad w_{ik} \propto \big(1 - d_{ik}^2 / r^2\big)^2
+    .. math:: X_i = \sum_k w_{ik} X_k, \qquad w_{ik} \propto \big(1 - d_{ik} / r_i\big)^2
 
-    with d along edges, so that the upper lip does not follow the lower, and r 1.5 times the largest distance from a
-    vertex to its node. The stiffness is the full mesh's, restricted to such blends.
+    with d along edges, so that the upper lip does not follow the lower, and r the distance of the first node that is
+    left out, the seventh. The stiffness is the full mesh's, restricted to such blends.
 
     Args:
         points: vertices at rest, (V,3).
@@ -78,10 +79,25 @@ def graph(points: NDArray[np.float64], pairs: NDArray[np.int64], stiffness: spar
     nearest = dijkstra(ways, directed=False, indices=nodes, min_only=True)
     radius = _WIDTH * max(float(nearest.max()), float(lengths.mean()))
     distance = dijkstra(ways, directed=False, indices=nodes, limit=radius)
-    node, vertex = np.nonzero(np.isfinite(distance))
-    weight = (1 - (distance[node, vertex] / radius) ** 2) ** 2 + 1e-12
-    weight /= np.bincount(vertex, weight, len(points))[vertex]
+    node, vertex, weight = _nearest_nodes(distance, radius)
     return Subspace(_blend(points, nodes, node, vertex, weight), stiffness)
+
+
+def _nearest_nodes(
+    distance: NDArray[np.float64], radius: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Node, vertex and weight of each pair that counts, from distances (K,V), infinite beyond the radius."""
+    count = min(_NEAREST + 1, len(distance))
+    order = np.argpartition(distance, count - 1, axis=0)[:count]
+    near = np.take_along_axis(distance, order, axis=0)
+    reach = np.minimum(near.max(0), radius) if len(distance) > _NEAREST else np.full(distance.shape[1], radius)
+    weight = np.square(np.maximum(1 - near / np.maximum(reach, 1e-300), 0.0)) * np.isfinite(near)
+    # Nodes at equal distance all around leave no weight: then the nearest has it all.
+    lone = weight.sum(0) < 1e-12
+    weight[near[:, lone].argmin(0), np.flatnonzero(lone)] = 1.0
+    weight /= weight.sum(0)
+    row, vertex = np.nonzero(weight)
+    return order[row, vertex], vertex, weight[row, vertex]
 
 
 def _blend(
