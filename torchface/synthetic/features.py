@@ -13,9 +13,13 @@ from torchface.synthetic.form import EYE_CENTRE, EYE_RADIUS, gradient, project
 from torchface.synthetic.topology import EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT
 
 OntoForm = Callable[[Tensor], Tensor]
+LID_SHARES = (0.0, 0.22, 0.42, 0.58, 0.71, 0.81, 0.89, 0.95, 1.0)
+LIP_SHARES = (0.0, 0.3, 0.55, 0.75, 0.9, 1.0)
+"""How far along from the block's border to the lid's edge or the red of the lips each loop of skin lies."""
+
 UPPER_LID = 16  # edges along each lid; along each half lip there are 13
 HALF_LIP = 13
-MEDIAL_CORNER = 29
+MEDIAL_CORNER, LATERAL_CORNER = 29, 13
 MOUTH_HALF_WIDTH = 25.5
 STOMION_HEIGHT = -66.5
 
@@ -37,7 +41,7 @@ def _lid_rim() -> Tensor:
     x = EYE_CENTRE[0] - 15.3 + 30.6 * tau
     base = -2.6 + 3.0 * tau
     upper = base + _pchip(tau, [0, 0.08, 0.22, 0.42, 0.62, 0.82, 1], [0, 1.9, 4.2, 5.7, 5.4, 3.2, 0])
-    lower = base - _pchip(tau, [0, 0.08, 0.22, 0.42, 0.66, 0.86, 1], [0, 0.8, 2.2, 3.7, 4.2, 2.7, 0])
+    lower = base - _pchip(tau, [0, 0.08, 0.22, 0.42, 0.66, 0.86, 1], [0, 1.3, 2.5, 3.8, 4.2, 2.4, 0])
     rim = torch.zeros(32, 2, dtype=torch.float64)
     above, below = lid_order()
     rim[below] = torch.stack([x, lower], 1)
@@ -48,9 +52,10 @@ def _lid_rim() -> Tensor:
 def eye_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     """Rings (16,32,3): skin over the orbit, upper crease, lid edge, inner lid, a socket behind the eyeball."""
     rim = _lid_rim()
-    share = torch.tensor([0.0, 0.22, 0.42, 0.58, 0.71, 0.81, 0.89, 0.95, 1.0]).double()[:, None, None]
+    share = torch.tensor(LID_SHARES).double()[:, None, None]
     edge = onto_form(torch.cat([rim, torch.full((32, 1), 78.0, dtype=rim.dtype)], dim=1))
-    skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(EYE_RIM, 32, 3)
+    laid = border * (1 - share) + edge * share
+    skin = onto_form(laid[1:].reshape(-1, 3)).view(EYE_RIM, 32, 3)
     centre = torch.tensor(EYE_CENTRE).double()
     # The fold over the upper lid: a furrow with an overhang above it, strongest in the middle of the lid.
     above, _ = lid_order()
@@ -67,6 +72,7 @@ def eye_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     inner[:, 2] -= 0.4 * (out.norm(dim=-1) < EYE_RADIUS + 0.6)
     outside = (out[:, :2].norm(dim=-1) / EYE_RADIUS).clamp(min=1) - 1
     inner[:, 2] -= 5 * outside
+    inner = inner * ((EYE_RADIUS + 0.3) / inner.norm(dim=-1, keepdim=True)).clamp(min=1.0)
     rings.append((centre + inner)[None])
     # Six loops over the eyeball, from the inner edge to behind its equator.
     azimuth = torch.atan2(inner[:, 1], inner[:, 0])
@@ -107,9 +113,9 @@ def mouth_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     line_y, line_z = contact_line(x)
     red = torch.zeros(27, 2, dtype=torch.float64)
     knots = [0.0, 0.12, 0.24, 0.45, 0.7, 0.9, 1.0]
-    red[lower] = torch.stack([x * 1.035, _pchip(s, knots, [-76.6, -76.6, -76.4, -75.2, -72.2, -69.2, -67.8])], 1)
-    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-59.1, -58.5, -57.9, -59.3, -62.6, -65.6, -67.1])], 1)
-    share = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0]).double()[:, None, None]
+    red[lower] = torch.stack([x * 1.035, _pchip(s, knots, [-76.6, -76.6, -76.4, -75.2, -72.2, -69.2, -67.4])], 1)
+    red[upper] = torch.stack([x * 1.035, _pchip(s, knots, [-59.1, -58.5, -57.9, -59.3, -62.6, -65.6, -67.4])], 1)
+    share = torch.tensor(LIP_SHARES).double()[:, None, None]
     edge = onto_form(torch.cat([red, 92 - 0.02 * red[:, :1] ** 2], dim=1))
     skin = onto_form((border * (1 - share) + edge * share)[1:].reshape(-1, 3)).view(MOUTH_BORDER, 27, 3)
     is_upper = torch.arange(27) < HALF_LIP

@@ -76,9 +76,9 @@ def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     # The bone: below a line from under the mouth's corner to the jaw's angle; the throat follows part of the way.
     line = -82 + 0.10 * (80 - p[:, 2])
     below_chin = (p[:, 1] < -106) & (p[:, 2] < 62)
-    bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 30) & ~lips & ~cap & ~below_chin & (ring < 3)
+    bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 40) & ~lips & ~cap & ~below_chin & (ring < 3)
     values[bone] = 1.0
-    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -32) | _named("still_for_lips")
+    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -26) | _named("still_for_lips")
     still |= (p[:, 1] > -50) & (p[:, 0].abs() < 22) & (p[:, 2] > 60) & (ring < 0)
     still &= ~(lips | cap)
     return _spread(values, bone | lips | cap | still)[:, 0].clamp(0, 1)

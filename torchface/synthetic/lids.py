@@ -41,9 +41,10 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
     share = torch.zeros(2, 17, dtype=torch.float64)
     share[0], share[1] = upper, lower
     way = torch.zeros(len(rings), 32, 3, dtype=torch.float64)
+    height = _closing_heights(around, above, below)[:, None]
     for ring in range(EYE_RIM, EYE_RIM + 2):
         a, b = around[ring, above], around[ring, below]
-        meet = CLOSING_HEIGHT * a + (1 - CLOSING_HEIGHT) * b
+        meet = height * a + (1 - height) * b
         longest = torch.maximum(a.norm(dim=1), b.norm(dim=1))
         meet = torch.nn.functional.normalize(meet, dim=1) * longest[:, None]
         way[ring, above] = share[0][:, None] * (meet - a)
@@ -58,8 +59,15 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
     travel[below] = share[1].clamp(-1, 1).abs()
     travel[above] = share[0].clamp(-1, 1).abs()
     edge_way = moved[EYE_RIM] - around[EYE_RIM]
+    step = torch.arange(17)
+    from_corner = torch.zeros(32, dtype=torch.float64)
+    for lid in (above, below):
+        from_corner[lid] = torch.minimum(step, 16 - step).double()
     for ring in (*range(1, EYE_RIM), *range(EYE_RIM + 2, len(rings) - 1)):
-        moved[ring] = around[ring] + _FOLLOW[ring] * edge_way
+        # Near the corners the skin gives way sooner: it turns about the corner instead of sliding past it.
+        give = (EYE_RIM - ring) if ring < EYE_RIM else 0
+        near = 1 - min(0.75 + 0.06 * give, 0.92) * torch.exp(-from_corner / 1.5) if give else torch.ones(32)
+        moved[ring] = around[ring] + (_FOLLOW[ring] * near)[:, None] * edge_way
         if ring >= 4:  # nearer the edge the skin slides over the ball; what lay folded in the crease comes up
             now = around[ring].norm(dim=1)
             cover = head.eye_radius + (LID_THICKNESS + 0.1 if ring < EYE_RIM else 0.0)
@@ -71,6 +79,25 @@ def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: flo
     delta = torch.zeros_like(head.vertices)
     delta[rings] = moved - around
     return delta
+
+
+def _closing_heights(around: Tensor, above: Tensor, below: Tensor) -> Tensor:
+    """Where the lids meet, as a share of the way from the lower to the upper edge, (17,).
+
+    Beside a corner they meet on the line in which the skin outside goes on, so that nothing folds there.
+    """
+    step = torch.arange(17)
+    height = torch.full((17,), CLOSING_HEIGHT, dtype=torch.float64)
+    rim = around[EYE_RIM]
+    for beside, corner in ((1, 0), (15, 16)):
+        tip = rim[above[corner]]
+        way = around[EYE_RIM - 1, above[corner]] - tip
+        a, b = rim[above[beside]], rim[below[beside]]
+        line = tip[1] + way[1] / way[0] * (0.5 * (a[0] + b[0]) - tip[0])
+        wanted = ((line - b[1]) / (a[1] - b[1])).clamp(0.1, 0.9)
+        near = torch.exp(-((step - beside).abs().double() / 1.5))
+        height = height + (wanted - CLOSING_HEIGHT) * near
+    return height
 
 
 def _turn_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
@@ -138,7 +165,7 @@ def upper_face(head: Anatomy) -> dict[str, Tensor]:
     return {
         "eyeBlinkLeft": lids(1.0, 1.0) + push((30, 16, 80), (16, 7, 20), (0, -1.0, 0)),
         "eyeWideLeft": lids(-0.33, -0.12, lean=0.8) + push((30, 20, 82), (17, 8, 20), (0, 1.2, 0)),
-        "eyeSquintLeft": lids(0.22, 1.1) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
+        "eyeSquintLeft": lids(0.26, 0.85) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
         "eyeLookDownLeft": _turn_eye(head, -GAZE, 0) + lids(0.52, -0.35),
         "eyeLookUpLeft": _turn_eye(head, GAZE, 0) + lids(-0.30, 0.35, lean=0.6),
         "eyeLookInLeft": _turn_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),

@@ -184,7 +184,10 @@ def _close(m: Mouth, opened: Tensor) -> Tensor:
     line = torch.cat([rings[MOUTH_CONTACT], t.mirror[rings[MOUTH_CONTACT]][1:26].flip(0)])
     motion = opened[line]
     twin = torch.where(_HANDLE <= 26, 26 - _HANDLE, 78 - _HANDLE) % LIP_HANDLES
-    meet = 0.72 * motion[torch.where(_SIDE < 13, _HANDLE, twin)] + 0.28 * motion[torch.where(_SIDE < 13, twin, _HANDLE)]
+    # The lower lip's share of where they meet: most is the upper's, at the corners both move alike.
+    share = (0.28 + 0.22 * torch.exp(-(((_SIDE - 13) / 3.0) ** 2)))[:, None]
+    upper, lower = torch.where(_SIDE < 13, _HANDLE, twin), torch.where(_SIDE < 13, twin, _HANDLE)
+    meet = (1 - share) * motion[upper] + share * motion[lower]
     return m.spread(meet - motion)
 
 

@@ -11,6 +11,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from torchface.synthetic.features import (
+    LID_SHARES,
+    LIP_SHARES,
     MOUTH_HALF_WIDTH,
     STOMION_HEIGHT,
     ear_rings,
@@ -45,7 +47,8 @@ _ROWS = np.array([
     (0, 97.0, 97.0, 97.0, 60, -12, -80, 54, 54, 54),
     (2, 80.0, 80.0, 80.0, 74, -12, -92, 38, 38, 38),
     (4, 60.0, 60.0, 60.0, 88, -12, -95, 18, 18, 18),
-    (6, 38.0, 38.0, 38.0, 92, -10, -96, 4, 4, 4),
+    (6, 34.0, 34.0, 34.0, 92, -10, -96, 4, 4, 4),
+    (7, 25.5, 25.5, 25.5, 92, -9, -96, 0, 0, 0),
     (8, 18.5, 18.5, 18.0, 92, -8, -95, 0, 0, 0),
     (14, -16.0, -17.0, -19.0, 90, -6, -86, 0, 0, -8),
     (18, -31.0, -33.0, -42.0, 92, -6, -76, 0, 0, -8),
@@ -258,6 +261,9 @@ def _lay_rings(t: Topology, vertices: Tensor, plane: Tensor) -> None:
                 _part_lips(spots)
             plane[rings[1 : skin + 1], 0] = row_of_height(spots[..., 1].clamp(-112, 97))
             plane[rings[1 : skin + 1], 1] = _azimuth_of(spots[..., 0])
+            shares = torch.tensor(LID_SHARES if name == "eye" else LIP_SHARES).double()[1:, None, None]
+            edge = plane[rings[len(shares)]]
+            plane[rings[1 : len(shares) + 1]] = plane[rings[0]] * (1 - shares) + edge * shares
             centre = plane[rings[skin]].mean(0) if name == "eye" else centre
         if name == "mouth":
             centre = torch.tensor([float(plane[rings[skin, [0, -1]], 0].mean()), 0.0]).double()

@@ -83,7 +83,7 @@ def unwrapping() -> Unwrapping:
         inside[cap] = True
         quads = inside[t.quads].all(1)
         uv_quads[quads] = cap_row[t.quads[quads]]
-        flat = whole[cap][:, :2] - whole[cap][:, :2].mean(0)
+        flat = (whole[cap][:, :2] - whole[cap][:, :2].mean(0)) * torch.tensor([-1.0, 1.0]).double()
         rows.append(torch.tensor([cx, cy]).double() + 0.005 * flat)
     return Unwrapping(torch.cat(rows).float(), uv_quads)
 
