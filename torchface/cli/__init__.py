@@ -19,6 +19,7 @@ from torchface.cli.pick import pick
 from torchface.cli.progress import console
 from torchface.cli.register import register
 from torchface.cli.render import render
+from torchface.cli.rig import rig
 from torchface.cli.solve import solve
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
@@ -27,6 +28,7 @@ from torchface.errors import TorchfaceError
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "register": register,
+    "rig": rig,
     "transfer": transfer,
     "solve": solve,
     "render": render,

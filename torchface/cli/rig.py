@@ -1,0 +1,62 @@
+"""``torchface rig``: an actor's own rig from scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from torchface.cli.progress import console, steps
+
+
+def rig(
+    scan: Positional[Path],
+    template: Path,
+    out: Path,
+    landmarks: Path | None = None,
+    examples: Path | None = None,
+    detail: Path | None = None,
+    pose: tuple[str, ...] = (),
+    part: str | None = None,
+    unit: str | None = None,
+    detector: Path | None = None,
+    texture_size: int = 2048,
+    detail_size: int = 2048,
+    quiet: bool = False,
+) -> None:
+    """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
+
+    The neutral scan gives the actor's face in the template's topology, deformation transfer its shapes. Scans of
+    expressions make the shapes the actor's own; high-resolution scans give normal maps for wrinkles.
+
+    EXAMPLES holds scans (.obj, .ply, .stl, .glb, .gltf). Each file's name says roughly what it shows, as in
+    jawOpen.obj or jawOpen=0.6+mouthSmileLeft=0.5.obj; or a file weights.csv in the folder does, with the header
+    scan,<shape>,... and a row for each file. Landmark files of the same names (.ljson, .pts, .json) may lie beside the
+    scans. DETAIL holds one scan a shape at full strength, named for it, and neutral.obj (or another format).
+
+    Args:
+        scan: The actor at rest: any topology and pose, with holes, hair and collar.
+        template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        out: The .glb to write.
+        landmarks: The scan's landmarks: .ljson, .pts or .json in the order of the template's annotated landmarks, or
+            correspondences saved by `torchface pick`. Without them the face is found by its shape.
+        examples: Folder of scans of expressions.
+        detail: Folder of high-resolution scans.
+        pose: What the neutral scan shows where it is not at rest, such as eyeBlinkLeft=1 eyeBlinkRight=1 for closed
+            eyes; the rig's neutral has them open.
+        part: Keep this region of the template only, such as face.
+        unit: Unit of all scans (mm, cm, m) where it is not the format's own.
+        detector: Folder of a landmark detector for scans without landmarks.
+        texture_size: Texels a side of the rig's texture; 0 makes none.
+        detail_size: Texels a side of each normal map.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.pose import pose_weights
+    from torchface.workflows.rig import RigOptions, rig_actor
+
+    options = RigOptions(part, unit, pose_weights(pose), detector, texture_size, detail_size)
+    with steps(quiet) as step:
+        report = rig_actor(scan, template, out, landmarks, examples, detail, options, step)
+    for line in report.lines():
+        console.print(line, highlight=False, markup=False)
+    print(out)
