@@ -1,18 +1,24 @@
 """Faces as models: learned ones, personal rigs, and the detail that meshes are too coarse to hold."""
 
 from torchface.modeling.detail import BakeStatistics, NormalMap, bake_normal_map, detail_maps
+from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
+from torchface.modeling.open_eyes import open_eyes
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
 
 __all__ = [
     "BakeStatistics",
+    "ExampleRig",
     "NormalMap",
+    "RiggingSchedule",
     "ScanAlignment",
     "TransferReport",
     "TransferredRig",
     "align_scan",
     "bake_normal_map",
     "detail_maps",
+    "open_eyes",
+    "rig_from_examples",
     "transfer_deformation",
     "transfer_with_report",
 ]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.deformation import deformation_gradients, gradient_operator
 from torchface.mesh import Mesh
-from torchface.modeling.example_shapes import personal_gradients, shape_stiffness
+from torchface.modeling.example_shapes import example_shares, personal_part, shape_stiffness
 from torchface.modeling.shape_transfer import ShapeTransfer
 from torchface.modeling.transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.optim import box_qp
@@ -26,7 +27,7 @@ class RiggingSchedule:
         rounds: how often shapes and weights are solved in turn.
         beta: weight of the prior beside the fit, first and last round; in between it goes evenly.
         gamma: how firmly weights are held to the given ones, first and last round, square millimetres summed over
-            the vertices; in between evenly.
+            the vertices at the template's size; in between evenly. Raise it where the weights are well known.
         kappa: where the prior's stiffness levels off, in gradients without unit.
         theta: how steeply the stiffness falls where the template deforms.
 
@@ -104,7 +105,8 @@ def rig_from_examples(
     .. math:: \min_\alpha \lVert B_0 + \sum_i \alpha_i B_i - S \rVert^2 + \gamma \lVert \alpha - \alpha^* \rVert^2,
 
     in turn, with falling :math:`\beta` and :math:`\gamma`. Vertices that the template leaves still in a shape stay
-    still; separate parts of the head and contacts of lids and lips are held as in ``transfer_deformation``.
+    still. Separate parts of the head and contacts of lids and lips are held as in ``transfer_deformation``; how far
+    they part is learned from the examples as triangles are.
 
     Args:
         template: N shapes, V vertices, millimetres.
@@ -180,6 +182,7 @@ class _Rigging:
         self.prior_gradients = self._gradients(self.prior)
         self.example_gradients = self._gradients(self.offsets)
         self.compliance = self._compliance()
+        self.vertex_compliance = self._vertex_means(self.compliance)
         self.errors = [self.example_errors()]
 
     def _gradients(self, displacements: Tensor) -> Tensor:
@@ -202,26 +205,55 @@ class _Rigging:
         ]
         return torch.stack(rows) * transfer.moving[:, transfer.faces].any(-1)
 
+    def _vertex_means(self, values: Tensor) -> Tensor:
+        """The mean over the triangles round each vertex: (N,F) to (N,V)."""
+        faces = self.transfer.faces
+        sums = torch.zeros(len(values), len(self.transfer.goal), dtype=torch.float64)
+        sums.index_add_(1, faces.T.flatten(), values.repeat(1, 3))
+        return sums / torch.bincount(faces.flatten(), minlength=sums.shape[1]).clamp(min=1)
+
     def solve_shapes(self, beta: float) -> None:
-        residuals = self.example_gradients - (self.weights @ self.prior_gradients.flatten(1)).view_as(
-            self.example_gradients
-        )
-        more = personal_gradients(residuals, self.weights, self.compliance / beta).unflatten(-1, (3, 3))
+        """Shapes at fixed weights: triangle by triangle what the examples say, then vertices that agree with it."""
+        residuals = self.example_gradients - _combined(self.weights, self.prior_gradients)
+        missing = self.offsets - _combined(self.weights, self.prior)
+        shares = example_shares(residuals, self.weights, self.compliance / beta)
         used = (self.weights > 0).any(0)
         for group in self.groups:  # a loop over factorisations
             learning = [shape for shape in group if used[shape]]
-            if learning:
-                self.personal[learning] = self.transfer.follow(learning, more[learning])
+            if not learning:
+                continue
+            more = personal_part(shares, self.weights[:, learning], self.compliance[learning] / beta)
+            constraints = [
+                replace(held, values=self._offsets_between(held.matrix, learning, missing, beta))
+                for held in self.transfer.constraints(learning[0])
+            ]
+            self.personal[learning] = self.transfer.follow(learning, more.unflatten(-1, (3, 3)), constraints)
+
+    def _offsets_between(self, pairs: sparse.csr_array, shapes: list[int], missing: Tensor, beta: float) -> Tensor:
+        """How vertices that are tied or in contact move apart beyond the transfer, (G,K,3).
+
+        A gap is one more thing to fit, as free to change as the skin on its two sides.
+        """
+        columns = missing.permute(1, 0, 2).flatten(1).numpy()
+        residuals = torch.from_numpy(pairs @ columns).view(-1, len(missing), 3).transpose(0, 1)
+        compliance = torch.from_numpy(0.5 * abs(pairs) @ self.vertex_compliance.T.numpy()).T / beta
+        shares = example_shares(residuals, self.weights, compliance)
+        return personal_part(shares, self.weights[:, shapes], compliance[shapes])
 
     def solve_weights(self, gamma: float) -> None:
+        """Weights at fixed shapes: a quadratic program in [0,1] for each example."""
         shapes = (self.prior + self.personal).flatten(1)
         hessian = shapes @ shapes.T + gamma * torch.eye(len(shapes), dtype=torch.float64)
         self.weights = box_qp(hessian, -(self.offsets.flatten(1) @ shapes.T + gamma * self.given), start=self.weights)
 
     def example_errors(self) -> Tensor:
-        shapes = self.prior + self.personal
-        missing = self.offsets - (self.weights @ shapes.flatten(1)).view_as(self.offsets)
+        missing = self.offsets - _combined(self.weights, self.prior + self.personal)
         return missing.square().sum(-1).mean(-1).sqrt()
+
+
+def _combined(weights: Tensor, shapes: Tensor) -> Tensor:
+    """Weighted sums of shapes, (M,N) and (N,...) to (M,...)."""
+    return (weights @ shapes.flatten(1)).unflatten(1, shapes.shape[1:])
 
 
 def _check(template: BlendshapeRig, neutral: Mesh, examples: Tensor, weights: Tensor, contact_weight: float) -> None:

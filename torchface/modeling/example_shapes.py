@@ -27,32 +27,46 @@ def shape_stiffness(changes: Tensor, kappa: float, theta: float) -> Tensor:
     return ((1 + size) / (kappa + size)) ** theta
 
 
-def personal_gradients(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
-    r"""What each shape takes up of the examples' residuals.
+def example_shares(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
+    r"""What each example has to say, element by element, once what shapes share among them is taken out.
 
     .. math:: \min_D \sum_j \lVert R_j - \sum_i \alpha_{ji} D_i \rVert^2 + \sum_i c_i^{-1} \lVert D_i \rVert^2
 
-    for each triangle by itself. By Woodbury's identity
-    :math:`D = C A^\top (A C A^\top + I)^{-1} R`, a system of the size of the examples and not of the shapes.
+    has the minimiser :math:`D_i = c_i \sum_j \alpha_{ji} X_j` with :math:`X = (A C A^\top + I)^{-1} R`, by Woodbury's
+    identity: a system of the size of the examples and not of the shapes, for each triangle by itself.
 
     Args:
         residuals: R, what the prior leaves of each example, (M,F,K).
         weights: A, :math:`\alpha`, (M,N).
-        compliance: :math:`c = 1 / (\beta w)`, (N,F); a shape that a triangle may not change in has 0 there.
+        compliance: :math:`c = 1 / (\beta w)`, (N,F); a shape that an element may not change in has 0 there.
 
     Returns:
-        D, (N,F,K).
+        X, (M,F,K).
 
     Source: thesis 3.3.3, equations 27 and 28.
     """
-    count, triangles, size = residuals.shape
-    found = torch.empty(len(compliance), triangles, size, dtype=residuals.dtype, device=residuals.device)
+    count, elements, size = residuals.shape
+    shares = torch.empty_like(residuals)
     identity = torch.eye(count, dtype=residuals.dtype, device=residuals.device)
     step = max(1, _NUMBERS_AT_ONCE // (count * (count + size)))
     products = (weights[:, None] * weights[None]).flatten(0, 1)
-    for first in range(0, triangles, step):  # a loop over chunks that memory holds
+    for first in range(0, elements, step):  # a loop over chunks that memory holds
         chunk = slice(first, first + step)
         system = (products @ compliance[:, chunk]).T.reshape(-1, count, count) + identity
-        shares = torch.cholesky_solve(residuals[:, chunk].transpose(0, 1), torch.linalg.cholesky(system))
-        found[:, chunk] = compliance[:, chunk, None] * torch.einsum("mn,fmk->nfk", weights, shares)
-    return found
+        solved = torch.cholesky_solve(residuals[:, chunk].transpose(0, 1), torch.linalg.cholesky(system))
+        shares[:, chunk] = solved.transpose(0, 1)
+    return shares
+
+
+def personal_part(shares: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
+    r"""What some of the shapes take up, :math:`D_i = c_i \sum_j \alpha_{ji} X_j`.
+
+    Args:
+        shares: X, (M,F,K).
+        weights: of these shapes in the examples, (M,G).
+        compliance: of these shapes, (G,F).
+
+    Returns:
+        D, (G,F,K).
+    """
+    return compliance[..., None] * torch.einsum("mg,mfk->gfk", weights, shares)

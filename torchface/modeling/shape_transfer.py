@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -82,25 +82,28 @@ class ShapeTransfer:
                 progress(done, len(moved))
         return moved
 
-    def follow(self, group: list[int], gradients: Tensor) -> Tensor:
+    def constraints(self, shape: int) -> list[SoftConstraints]:
+        """What holds a shape's separate parts and its contacts beyond the transfer: offsets change by nothing more."""
+        below = self.seams.undoes.get(shape)
+        pose = self.rest + self.deltas[shape] + (0 if below is None else self.deltas[below])
+        asked = [*self._link_constraints(shape, self.goal), *self._contact_constraints(shape, pose, below)]
+        return [replace(constraint, values=torch.zeros_like(constraint.values)) for constraint in asked]
+
+    def follow(self, group: list[int], gradients: Tensor, constraints: Sequence[SoftConstraints]) -> Tensor:
         """How far vertices go beyond their transferred places where gradients ask for more.
 
-        The transfer's energy is quadratic: what is added to its gradients adds to its solution. Pins stay, ties between
-        parts and contacts keep the offset that the transfer gave them.
+        The transfer's energy is quadratic: what is added to its gradients adds to its solution. Pins stay.
 
         Args:
             group: shapes that share a factorisation, one of ``groups()`` or a part of it.
             gradients: what is added to the target's gradients in each of them, (G,F,3,3), in the source's frame.
+            constraints: those of ``constraints(group[0])``, with other values (G,K,3) where offsets change too.
 
         Returns:
             Displacements (G,V,3), in the source's frame.
         """
-        first, none = group[0], torch.zeros_like(self.deltas[group])
-        below = self.seams.undoes.get(first)
-        pose = self.rest + self.deltas[first] + (0 if below is None else self.deltas[below])
-        asked = [*self._link_constraints(first, self.goal), *self._contact_constraints(first, pose, below)]
-        kept = [replace(constraint, values=torch.zeros_like(constraint.values)) for constraint in asked]
-        return self.reconstruction.solve(gradients, none, ~self.moving[first], kept)
+        none = torch.zeros_like(self.deltas[group])
+        return self.reconstruction.solve(gradients, none, ~self.moving[group[0]], constraints)
 
     def rig(self, source: BlendshapeRig, target: Mesh, moved: Tensor) -> BlendshapeRig:
         """The target's rig with deltas (N,V,3) that were solved in the source's frame."""
