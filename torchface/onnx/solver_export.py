@@ -24,6 +24,8 @@ from torchface.rig import BlendshapeRig
 
 _RHOS = (0.06, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
 _PARITY = 1e-5
+# Two runs that round differently are up to about twice as far from each other as either is from the exact sum.
+_ROUNDINGS = 3.0
 _TEST_FRAMES = 512
 _FRAMES_A_POSE = 10
 
@@ -36,12 +38,15 @@ class SolverGap:
         missing: share of markers missing.
         worst, median: over the frames.
         parity: largest difference of a weight between ONNX Runtime and the same graph in PyTorch.
+        rounding: the same between PyTorch in single and in double precision: what shapes that the markers hardly see
+            owe to rounding alone.
     """
 
     missing: float
     worst: float
     median: float
     parity: float
+    rounding: float
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class SolverReport:
                 (
                     f"{gap.missing:.0%} missing",
                     f"energy above the exact solve: worst {gap.worst:.1e}, median {gap.median:.1e}; "
-                    f"ONNX Runtime against PyTorch {gap.parity:.1e}",
+                    f"ONNX Runtime against PyTorch {gap.parity:.1e}, rounding {gap.rounding:.1e}",
                 )
             )
         return rows
@@ -114,7 +119,8 @@ def export_solver(
         markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
 
     Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5; nothing is written.
+        ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and by more than rounding explains; nothing is
+            written.
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
@@ -122,9 +128,12 @@ def export_solver(
     model = solver_model(graph)
     session = _session(model)
     gaps = tuple(_gap(session, graph, solver, frames, missing) for missing in (0.0, 0.1, 0.3))
-    parity = max(gap.parity for gap in gaps)
-    if not parity <= _PARITY:
-        raise ValueRangeError(f"{path}: ONNX Runtime differs from PyTorch by {parity:.2g}, expected {_PARITY} at most")
+    for gap in gaps:
+        allowed = max(_PARITY, _ROUNDINGS * gap.rounding)
+        if not gap.parity <= allowed:
+            raise ValueRangeError(
+                f"{path}: ONNX Runtime differs from PyTorch by {gap.parity:.2g}, expected {allowed:.2g} at most"
+            )
     content = model.SerializeToString()
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -202,11 +211,13 @@ def _gap(
     least = energy.value(optimum)
     starts = (torch.zeros_like(optimum).float(), optimum.roll(1, 0).float())
     solved = [_run(session, markers, start) for start in starts]
-    parity = max(
-        float((graph(markers, start) - weights).abs().max()) for start, weights in zip(starts, solved, strict=True)
-    )
+    here = [graph(markers, start) for start in starts]
+    parity = max(float((own - weights).abs().max()) for own, weights in zip(here, solved, strict=True))
+    double = copy.deepcopy(graph).double()
+    precise = [double(markers.double(), start.double()) for start in starts]
+    rounding = max(float((own - weights).abs().max()) for own, weights in zip(here, precise, strict=True))
     gaps = torch.stack([(energy.value(weights.double()) - least) / least for weights in solved])
-    return SolverGap(missing, float(gaps.max()), float(gaps.median()), parity)
+    return SolverGap(missing, float(gaps.max()), float(gaps.median()), parity, rounding)
 
 
 def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor) -> float:

@@ -140,7 +140,7 @@ def _frame_picture(result: DemoResult, frame: int) -> Tensor:
     head = result.scene.head
     true = head.with_vertices(result.scene.truth(result.scene.weights[frame : frame + 1])[0])
     solved = head.with_vertices(result.rig(result.weights[frame : frame + 1].to(result.rig.deltas))[0])
-    error = (true.vertices - solved.vertices).norm(dim=1) * result.face
+    error = (true.vertices - solved.vertices).norm(dim=1)
     views = (FRONT, THREE_QUARTER)
     row = [
         caption(face_views(true, views, width=240, height=300, framed_by=head), f"true, frame {frame}"),
