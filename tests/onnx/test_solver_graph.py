@@ -18,6 +18,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.onnx import SolverGraph, export_solver
 from torchface.onnx.solver_export import hide_markers, random_frames
+from torchface.onnx.solver_model import solver_model
 
 
 @pytest.fixture(scope="module")

@@ -119,7 +119,7 @@ def export_solver(
         markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
 
     Raises:
-        ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and by more than rounding explains; nothing is
+        ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
             written.
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
