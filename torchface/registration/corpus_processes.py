@@ -133,13 +133,10 @@ def _work(pipe: Connection, job: CorpusJob) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is the parent's to answer
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
-    pipe.send(None)
-    while True:
-        try:
-            task = pipe.recv()
-        except EOFError:
-            return
-        pipe.send(job.run(task))
+    with suppress(EOFError, OSError):  # the parent is gone
+        pipe.send(None)
+        while True:
+            pipe.send(job.run(pipe.recv()))
 
 
 def _end_with_parent() -> None:
