@@ -104,12 +104,12 @@ def test_truer_closer_and_faster_than_trimesh(modes: IdentityModes) -> None:
             )
         rows.append(row)
     names = ("torchface", "torchface, no landmarks", "trimesh nricp_amberg")
-    print(f"\n{'head':>4}" + "".join(f"{name + ': true mm, surface mm, s':>44}" for name in names))
+    print(f"\n{'head':>4}" + "".join(f"{name + ': true mm, surface mm, s':>48}" for name in names))
     for seed, row in enumerate(rows):
-        print(f"{seed:4}" + "".join(f"{f'{a:8.3f} {b:8.3f} {c:8.2f}':>44}" for a, b, c in row))
+        print(f"{seed:4}" + "".join(f"{f'{a:8.3f} {b:8.3f} {c:8.2f}':>48}" for a, b, c in row))
     compared = np.array([row for row in rows if len(row) == 3])
     mean = compared.mean(0)
-    print("mean" + "".join(f"{f'{a:8.3f} {b:8.3f} {c:8.2f}':>44}" for a, b, c in mean))
+    print("mean" + "".join(f"{f'{a:8.3f} {b:8.3f} {c:8.2f}':>48}" for a, b, c in mean))
     ours, theirs = compared[:, 0], compared[:, 2]
     print(f"times faster: {np.median(theirs[:, 2] / ours[:, 2]):.1f} (median of the heads)")
     assert (ours[:, 0] <= 0.9 * theirs[:, 0]).all()

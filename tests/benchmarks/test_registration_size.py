@@ -43,12 +43,13 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 landmarks = (template.landmarks, head.vertices[modes.neutral.landmarks].double())
 times = []
 for _ in range(2):
-    begin = time.perf_counter()
+    begin, processor = time.perf_counter(), time.process_time()
     result = register(template, scan, landmarks)
-    times.append(time.perf_counter() - begin)
+    times.append((time.perf_counter() - begin, time.process_time() - processor))
 face_count = 9409
 print(json.dumps({
-    "template": len(template.vertices), "scan": len(vertices), "seconds": min(times),
+    "template": len(template.vertices), "scan": len(vertices), "seconds": min(times)[0],
+    "processor": min(t[1] for t in times),
     "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "before": before,
     "true": float((result.mesh.vertices[:face_count] - head.vertices[:face_count]).norm(dim=1).mean()),
     "surface": float(result.distance[:face_count].mean()),
@@ -69,10 +70,10 @@ def test_time_and_memory_up_to_large_meshes(ict_folder: Path) -> None:
             timeout=900,
         )
         rows.append(json.loads(child.stdout.splitlines()[-1]))
-    print(f"\n{'template':>9}{'scan':>9}{'s':>8}{'MB at most':>12}{'true mm':>9}{'surface mm':>12}")
+    print(f"\n{'template':>9}{'scan':>9}{'s':>8}{'processor s':>13}{'MB at most':>12}{'true mm':>9}{'surface mm':>12}")
     for row in rows:
         print(
-            f"{row['template']:9}{row['scan']:9}{row['seconds']:8.2f}{row['peak']:12.0f}{row['true']:9.3f}"
+            f"{row['template']:9}{row['scan']:9}{row['seconds']:8.2f}{row['processor']:13.2f}{row['peak']:12.0f}{row['true']:9.3f}"
             f"{row['surface']:12.3f}"
         )
     figure, axes = plt.subplots(figsize=(6, 4))
