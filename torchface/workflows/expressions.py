@@ -53,7 +53,7 @@ def weights_row(weights: dict[str, float], names: Sequence[str], where: str) -> 
     outside = [f"{name}={value:g}" for name, value in weights.items() if not 0 <= value <= 1]
     if outside:
         raise ValueRangeError(f"{where}: found {', '.join(outside[:5])}, expected weights from 0 to 1")
-    return matrix @ torch.tensor([weights[name] for name in given])
+    return matrix @ torch.tensor([float(weights[name]) for name in given])
 
 
 def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:

@@ -18,11 +18,13 @@ from torchface.mesh import Mesh
 from torchface.modeling import bake_normal_map, detail_maps, transfer_with_report
 from torchface.modeling.detail import NormalMap
 from torchface.modeling.example_rigging import ExampleRig, rig_from_examples
+from torchface.modeling.scanned_examples import seen_example
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.workflows.expressions import LAYOUT, Expression, expressions_in, neutral_in, weights_row
 from torchface.workflows.register import in_place_of
+from torchface.workflows.skin import dressed_as, hidden_parts
 
 _FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
 
@@ -144,11 +146,12 @@ def rig_actor(
     say("registering the neutral scan")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size)
     neutral = _at_rest(rig, job.posed(rig, shown), _upright(registration, rig.neutral))
+    neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     say(f"transferring {len(rig.names)} shapes")
     transferred = transfer_with_report(rig, neutral)
     actor, learned, used = transferred.rig, None, ()
     if expressions:
-        learned, used = job.learned(actor, neutral, expressions)
+        learned, used = job.learned(actor, neutral, registration.matched, expressions)
         actor = learned.rig
     maps = job.baked(actor, fine)
     say("writing the rig")
@@ -180,7 +183,7 @@ class _Actor:
         return register(mesh, read, marks, detector=detector, texture_size=texture_size)
 
     def learned(
-        self, actor: BlendshapeRig, neutral: Mesh, expressions: list[Expression]
+        self, actor: BlendshapeRig, neutral: Mesh, matched: Tensor, expressions: list[Expression]
     ) -> tuple[ExampleRig, tuple[str, ...]]:
         """The rig from the examples that could be registered, and their names."""
         vertices, weights, used = [], [], []
@@ -196,7 +199,8 @@ class _Actor:
                 continue
             moved = (guess.vertices - neutral.vertices).norm(dim=-1)
             steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
-            vertices.append(in_place_of(found.mesh, guess, steady.double()).vertices)
+            laid = in_place_of(found.mesh, guess, steady.double())
+            vertices.append(seen_example(laid, guess.vertices, found.matched & matched))
             weights.append(expression.weights)
             used.append(expression.name)
         if not used:
