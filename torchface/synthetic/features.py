@@ -188,23 +188,25 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     upward = torch.tensor([0.0, math.cos(lean), -math.sin(lean)]).double()
     forward = torch.tensor([0.0, math.sin(lean), math.cos(lean)]).double()
     outward = torch.tensor([1.0, 0.0, 0.0]).double()
-    centre = torch.tensor([0.0, -13.0, -8.0]).double()
+    centre = torch.tensor([0.0, -13.0, -9.5]).double()
     offset = border - border.mean(0)
     angle = torch.atan2(offset @ upward / 1.7, offset @ forward)
     sine, cosine = angle.sin(), angle.cos()
     back = ((0.35 - cosine) / 1.35).clamp(0, 1) ** 0.8  # 0 where the ear grows from the cheek, 1 at its free edge
-    tall = 32.2 * sine
+    tall = 36.6 * sine
     wide = 17.5 * cosine * (1 + 0.22 * sine) - 1.5 * sine
     lobe = (-sine - 0.45).clamp(min=0) / 0.55
-    rim = 19.0 * back * (1 - 0.45 * lobe) + 1.2 * (1 - back)
+    rim = 16.5 * back * (1 - 0.45 * lobe) + 1.2 * (1 - back)
     hollow = 1 - lobe
     rings = [border]
     base = border @ outward  # the head under the ear
     for size, height in (
-        (0.84, 0.0 * rim), (0.80, 0.45 * rim), (0.96, 0.92 * rim), (1.0, rim + 1.0), (0.93, rim + 1.8),
+        (0.62, 0.0 * rim), (0.64, 0.45 * rim), (0.96, 0.92 * rim), (1.0, rim + 1.0), (0.93, rim + 1.8),
         (0.85, rim - 2.4 * hollow), (0.68, 0.80 * rim + 0.6 + 1.2 * hollow), (0.56, 0.62 * rim + 0.5),
         (0.46, 0.42 * rim - 4.0 * hollow), (0.30, 0.28 * rim - 6.0),
     ):  # fmt: skip
+        # In front the ear grows out of the cheek: there each loop lies inside the one before.
+        size = size * back + (1 - back) * min(size, 0.98 - 0.045 * len(rings))
         spot = centre + (size * tall)[:, None] * upward + (size * wide)[:, None] * forward
         root = 67.0 + 0.65 * (base - 67.0) * (1 - back)
         spot[:, 0] = root + height

@@ -293,7 +293,7 @@ def _parts(count: int) -> _Parts:
         rings = both_sides(t.rings["mouth"])[side]
         upper[rings[:, :13]], lower[rings[:, 14:]] = share.expand(-1, 13), share.expand(-1, 13)
         ring[rings] = swell.expand(-1, 27)
-        grown = torch.tensor([0.0, 0.15, 0.35] + [1.0] * 8).double()[:, None]
+        grown = torch.tensor([0.0, 0.6, 0.72] + [1.0] * 8).double()[:, None]
         ear[both_sides(t.rings["ear"])[side]] = grown.expand(-1, t.rings["ear"].shape[1])
         ear[both_sides(t.caps["ear"])[side]] = 1.0
     assert MOUTH_BORDER == 5

@@ -94,7 +94,7 @@ def _closing_heights(around: Tensor, above: Tensor, below: Tensor) -> Tensor:
         way = around[EYE_RIM - 1, above[corner]] - tip
         a, b = rim[above[beside]], rim[below[beside]]
         line = tip[1] + way[1] / way[0] * (0.5 * (a[0] + b[0]) - tip[0])
-        wanted = ((line - b[1]) / (a[1] - b[1])).clamp(0.1, 0.9)
+        wanted = ((line - b[1]) / (a[1] - b[1])).clamp(-0.1, 1.1)
         near = torch.exp(-((step - beside).abs().double() / 1.5))
         height = height + (wanted - CLOSING_HEIGHT) * near
     return height
