@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -12,14 +13,15 @@ from torchface.errors import ShapeError
 from torchface.optim.box_problem import metric
 from torchface.optim.splitting import RELAXATION, RHO, prepare_splitting
 
-STEPS = 72
+STEPS = 66
 STEPS_WITH_GAPS = 96
 # Numbers below this share of the largest on the diagonal of H would overflow its scaling.
 _SMALLEST_DIAGONAL = 1e-6
 # Newton's iteration starts from this over a norm of A; below 2 it converges.
 NEWTON_START = 1.5
-# Share of the steps taken before f is formed again from what the markers' distances are by then.
-_FIRST_SHARE = 0.4
+# Shares of the steps after which f is formed again from what the markers' distances are by then: early, so that what
+# the first, rough f left behind in slow modes is gone at the end.
+_FORMED_AGAIN = (0.09, 0.27)
 
 
 class SolverGraph(nn.Module):
@@ -37,7 +39,7 @@ class SolverGraph(nn.Module):
     would keep the one H, but over-relaxed it can settle on a wrong point.) A frame without a marker gives ``previous``.
 
     In float32 a shape that moves the markers by hundredths of a millimetre drowns in the rounding of f when the markers
-    are centimetres from rest. So the steps halt once: from the gradient g at the weights w reached, which are short
+    are centimetres from rest. So the steps halt twice: from the gradient g at the weights w reached, made of short
     distances, :math:`f = g - Hw` gives :math:`c = -\alpha g (H + \rho D)^{-1} + w ((\alpha - 1) I - G)`, where nothing
     large cancels.
 
@@ -123,7 +125,7 @@ class SolverGraph(nn.Module):
             return self._with_gaps(offset, missing, z)
         offset = offset.flatten(1)
         v = z
-        for steps in first_and_rest(self.steps):
+        for steps in stretches(self.steps):
             constant = self._constant(offset, z)
             for _ in range(steps):
                 v = torch.addmm(constant, v, -self.step)
@@ -156,7 +158,7 @@ class SolverGraph(nn.Module):
         minus_step = self.rho * diagonal.transpose(1, 2) * offset + identity
         double_step = (2 - RELAXATION) * identity - 2 * (minus_step)
         z = v = z[:, None]
-        for steps in first_and_rest(self.steps_with_gaps):
+        for steps in stretches(self.steps_with_gaps):
             w = z
             distance = (known + self.gram_scale * (w @ self.rows.T)) * seen
             gradient = distance @ self.rows + share * (self.price + self.double_ridge * w)
@@ -167,10 +169,10 @@ class SolverGraph(nn.Module):
         return z[:, 0]
 
 
-def first_and_rest(steps: int) -> tuple[int, int]:
-    """How many steps are taken before and after f is formed again."""
-    first = round(_FIRST_SHARE * steps)
-    return first, steps - first
+def stretches(steps: int) -> list[int]:
+    """The steps between one forming of f and the next."""
+    marks = [0, *(round(share * steps) for share in _FORMED_AGAIN), steps]
+    return [after - before for before, after in pairwise(marks)]
 
 
 def _norm(H: Tensor) -> float:

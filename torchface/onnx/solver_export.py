@@ -22,10 +22,11 @@ from torchface.onnx.solver import STEPS, STEPS_WITH_GAPS, SolverGraph
 from torchface.onnx.solver_model import solver_model
 from torchface.rig import BlendshapeRig
 
-_RHOS = (0.06, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
+_RHOS = (0.03, 0.045, 0.06, 0.075, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
 _PARITY = 1e-5
-# Two runs that round differently are up to about twice as far from each other as either is from the exact sum.
-_ROUNDINGS = 3.0
+# Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
+# that computes something else lies much farther.
+_ROUNDINGS = 10.0
 _TEST_FRAMES = 512
 _FRAMES_A_POSE = 10
 

@@ -7,7 +7,7 @@ import torch
 
 from torchface import __version__
 from torchface.onnx.graph_builder import GraphBuilder
-from torchface.onnx.solver import NEWTON_START, SolverGraph, first_and_rest
+from torchface.onnx.solver import NEWTON_START, SolverGraph, stretches
 from torchface.optim.splitting import RELAXATION
 
 
@@ -61,7 +61,7 @@ def _complete_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, star
     build = GraphBuilder(parent)
     offset = build.op("Reshape", offset, "row")
     z = v = start
-    for steps in first_and_rest(graph.steps):
+    for steps in stretches(graph.steps):
         distance = build.op("Gemm", z, "rows", offset, transB=1, alpha=graph.gram_scale)
         gradient = build.op("Gemm", distance, "rows", "price")
         gradient = build.op("Add", gradient, build.op("Mul", z, "double_ridge"))
@@ -123,7 +123,7 @@ def _gaps_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, gone: st
     minus_step = op("Add", op("Mul", op("Mul", turned(diagonal), "rho"), inverse), "identity")
     double_step = op("Sub", op("Mul", "relaxation_rest", "identity"), op("Mul", "two", minus_step))
     z = v = op("Reshape", start, "vector")
-    for steps in first_and_rest(graph.steps_with_gaps):
+    for steps in stretches(graph.steps_with_gaps):
         distance = op("Add", known, op("Mul", op("MatMul", z, basis), "gram_scale"))
         price = op("Mul", share, op("Add", "price", op("Mul", z, "double_ridge")))
         gradient = op("Add", op("MatMul", op("Mul", distance, seen), "rows"), price)
