@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, FileFormatError, TopologyError
+from torchface.errors import AlignmentError, FileFormatError
 from torchface.geometry.alignment import similarity_transform
 from torchface.io import load_mesh, load_rig
 from torchface.io.ict_facekit import region
@@ -66,8 +66,6 @@ def register_scans(
         TorchfaceError: the template, ``out`` or a setting is of no use.
     """
     mesh = load_template(template, part)
-    if len(mesh.faces) == 0:
-        raise TopologyError(f"{template}: found {len(mesh.vertices)} vertices and no triangle, expected a face's mesh")
     report = register_corpus(
         mesh,
         scans,

@@ -15,9 +15,15 @@ from torchface.io import load_mesh, load_rig, save_rig
 from torchface.landmarks.correspondences import AutomaticLandmarks
 from torchface.landmarks.detector_files import load_detector
 from torchface.mesh import Mesh
-from torchface.modeling import bake_normal_map, detail_maps, transfer_with_report
-from torchface.modeling.detail import NormalMap
-from torchface.modeling.example_rigging import ExampleRig, rig_from_examples
+from torchface.modeling import (
+    ExampleRig,
+    NormalMap,
+    bake_normal_map,
+    detail_maps,
+    open_eyes,
+    rig_from_examples,
+    transfer_with_report,
+)
 from torchface.modeling.scanned_examples import seen_example
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
@@ -145,11 +151,13 @@ def rig_actor(
     job = _Actor(rig, options, say)
     say("registering the neutral scan")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size)
-    neutral = _at_rest(rig, job.posed(rig, shown), _upright(registration, rig.neutral))
+    neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
     neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     say(f"transferring {len(rig.names)} shapes")
     transferred = transfer_with_report(rig, neutral)
-    actor, learned, used = transferred.rig, None, ()
+    actor: BlendshapeRig = transferred.rig
+    learned: ExampleRig | None = None
+    used: tuple[str, ...] = ()
     if expressions:
         learned, used = job.learned(actor, neutral, registration.matched, expressions)
         actor = learned.rig
@@ -171,9 +179,7 @@ class _Actor:
     def posed(rig: BlendshapeRig, weights: Tensor) -> Mesh:
         return rig.neutral.with_vertices(rig(weights[None].to(rig.deltas))[0])
 
-    def registered(
-        self, mesh: Mesh, scan: Path, landmarks: Path | None, texture_size: int | None = None
-    ) -> Registration:
+    def registered(self, mesh: Mesh, scan: Path, landmarks: Path | None, texture_size: int) -> Registration:
         options = self.options
         read = load_mesh(scan, options.unit)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
@@ -230,13 +236,14 @@ def _upright(registration: Registration, template: Mesh) -> Mesh:
     return in_place_of(registration.mesh, template, registration.matched.double())
 
 
-def _at_rest(rig: BlendshapeRig, shown: Mesh, found: Mesh) -> Mesh:
-    """The face at rest of a scan that shows the template in a pose: the way back, by deformation transfer."""
-    back = rig.vertices - shown.vertices
-    if not back.any():
+def _at_rest(rig: BlendshapeRig, weights: Tensor, found: Mesh) -> Mesh:
+    """The face at rest of a scan that shows some of the template's shapes."""
+    shown = [rig.names[i] for i in weights.nonzero()[:, 0].tolist()]
+    if not shown:
         return found
-    way = transfer_with_report(BlendshapeRig(shown, back[None], ("rest",)), found).rig
-    return found.with_vertices(found.vertices + way.deltas[0].to(found.vertices))
+    # What opens closed eyes takes any shapes back; these are as strong as the scan shows them.
+    as_shown = BlendshapeRig(rig.neutral, rig.deltas * weights.to(rig.deltas)[:, None, None], rig.names)
+    return open_eyes(as_shown, found, shown)
 
 
 def _detail_scans(folder: Path, rig: BlendshapeRig) -> list[Expression]:

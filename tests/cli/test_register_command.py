@@ -1,0 +1,87 @@
+"""``torchface register`` on files as a user brings them."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchface.cli import main
+from torchface.io import load_mesh, save_mesh, save_rig
+from torchface.io.picks import Correspondences, save_correspondences
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+PICKS = torch.arange(26, 600, 41)
+
+
+@pytest.fixture
+def brought(dome_rig: BlendshapeRig, tmp_path: Path) -> Path:
+    """A template rig, two scans with correspondences, and one that is none."""
+    save_rig(dome_rig, tmp_path / "template.glb")
+    (tmp_path / "scans").mkdir()
+    for i, name in enumerate(("anna", "ben")):
+        moved = dome_rig.vertices * torch.tensor([1.02, 0.98, 1 + 0.05 * i]) + 30.0 * i
+        save_mesh(dome_rig.neutral.with_vertices(moved), tmp_path / "scans" / f"{name}.obj")
+        labels = tuple(map(str, PICKS.tolist()))
+        pairs = Correspondences(PICKS, moved[PICKS], labels, dome_rig.neutral.fingerprint())
+        save_correspondences(pairs, tmp_path / "scans" / f"{name}.json")
+    (tmp_path / "scans" / "crate.stl").write_bytes(b"solid")
+    return tmp_path
+
+
+def test_results_table_and_contact_sheet_are_written(
+    brought: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scans, out = brought / "scans", brought / "new" / "out"
+    words = ["register", str(brought / "template.glb"), str(scans), "--out", str(out), "--landmarks", str(scans)]
+    main(words)
+    told = capsys.readouterr()
+    assert "2 of 3 scans registered" in told.err
+    assert "skipped crate.stl" in told.err
+    assert told.out.split() == [str(out / "summary.csv"), str(out / "contact_sheet.png")]
+    found = load_mesh(out / "ben.glb")
+    true = load_mesh(scans / "ben.obj")
+    assert torch.equal(found.faces, dome_rig.neutral.faces)
+    assert float((found.vertices - true.vertices).norm(dim=-1).median()) < 0.3
+    with (out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["name"], row["status"], row["landmarks"]) for row in rows] == [
+        ("anna", "registered", "14"),
+        ("ben", "registered", "14"),
+        ("crate", "skipped", "0"),
+    ]
+    sheet = np.asarray(Image.open(out / "contact_sheet.png").convert("L")).astype(int)
+    third = sheet.shape[1] // 3
+    # The face of a registered scan has light and shade, the cell of a skipped one is plain.
+    spread = [np.ptp(sheet[8:170, third * i + 8 : third * i + 120]) for i in range(3)]
+    assert min(spread[:2]) > 60
+    assert spread[2] == 0
+    before = (out / "ben.glb").stat().st_mtime_ns
+    main(words)
+    assert "3 known from an earlier run" in capsys.readouterr().err.replace("\n", " ")
+    assert (out / "ben.glb").stat().st_mtime_ns == before
+
+
+def test_mistakes_end_with_a_message_and_status_2(brought: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    template, scans, out = str(brought / "template.glb"), str(brought / "scans"), str(brought / "out")
+    (brought / "empty").mkdir()
+    points = Mesh(torch.rand(5, 3), torch.zeros(0, 3, dtype=torch.int64))
+    save_mesh(points, brought / "points.ply")
+    cases = [
+        ([template, str(brought / "empty"), "--out", out], "found no scan in the folder"),
+        ([template, str(brought / "scans" / "crate.stl"), "--out", out], "none of 1 scans could be registered"),
+        ([str(brought / "points.ply"), scans, "--out", out], "no face, expected at least one"),
+        ([str(brought / "none.obj"), scans, "--out", out], "none.obj"),
+        ([template, scans, "--out", template], "cannot be made"),
+        ([template, scans, "--out", scans], "expected another folder"),
+        ([template, scans, "--out", out, "--unit", "yards"], "yards"),
+    ]
+    for words, message in cases:
+        with pytest.raises(SystemExit) as ended:
+            main(["register", *words, "--quiet"])
+        assert ended.value.code == 2
+        told = capsys.readouterr().err.replace("\n", " ")
+        assert message in told, (words, told)
