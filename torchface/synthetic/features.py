@@ -206,8 +206,8 @@ def ear_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
         (0.46, 0.42 * rim - 4.0 * hollow), (0.30, 0.28 * rim - 6.0),
     ):  # fmt: skip
         # In front the ear grows out of the cheek: there each loop lies inside the one before.
-        size = size * back + (1 - back) * min(size, 0.98 - 0.045 * len(rings))
-        spot = centre + (size * tall)[:, None] * upward + (size * wide)[:, None] * forward
+        reach = size * back + (1 - back) * min(size, 0.98 - 0.045 * len(rings))
+        spot = centre + (reach * tall)[:, None] * upward + (reach * wide)[:, None] * forward
         root = 67.0 + 0.65 * (base - 67.0) * (1 - back)
         spot[:, 0] = root + height
         rings.append(spot)
