@@ -11,6 +11,7 @@ import torch
 import tyro
 
 from torchface import Mesh, TorchfaceError, load_mesh
+from torchface.io.files import write_file
 from torchface.landmarks import (
     TWELVE,
     CylinderLayout,
@@ -121,11 +122,12 @@ def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErro
     effective.update({key: str(value) for key, value in effective.items() if isinstance(value, Path)})
     save_detector(detector, settings.out, {"settings": effective, "errors": table})
     rows = "\n".join(f"| {key} | {value:.2f} |" for key, value in table.items())
-    (settings.out / "CARD.md").write_text(
+    card = (
         f"# UV landmarks ({settings.appearance})\n\n"
         f"Twelve face landmarks, lip and lid lines of raw scans. Learned from {len(names)} annotated scans, "
         f"tested on {len(errors)} others.\n\n| measured | value |\n| --- | --- |\n{rows}\n"
     )
+    write_file(settings.out / "CARD.md", card.encode())
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ _AXIS_BEHIND_EYES = 70.0
 _MAP = CylinderLayout(size=128, pitch=2.8)
 _ABOVE_EYES, _BELOW_MOUTH, _HALF_ANGLE = 32.0, 22.0, 1.15
 _ROUNDS = 2
-_WORST_MISFIT = 5.0
+_WORST_MISFIT = 3.5
 _LAST_REACHES = (8.0, 6.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0)
 
 
@@ -131,7 +131,7 @@ class FaceFrame(nn.Module):
         if rest > _WORST_MISFIT:
             raise ValueRangeError(
                 f"scan: found no face; the likeliest place differs from the mean face by {rest:.1f} mm on average, "
-                f"expected at most {_WORST_MISFIT:.0f} (are the units millimetres?)"
+                f"expected at most {_WORST_MISFIT} (are the units millimetres?)"
             )
         return self._refined(sample, pose.inverse())
 

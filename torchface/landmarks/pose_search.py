@@ -22,7 +22,7 @@ class PoseSearch:
 
     Args:
         rolls: turns about the nose's direction that are tried.
-        pitches: tilts of the nose's direction that are tried, degrees.
+        tilt: the nose's direction is tried as it is, and tilted up, down, left and right by so many degrees.
         survivors: how many hypotheses go on after a first look, and after a first refinement.
         first_reaches: how far a point's match may lie in each round of the first refinement, millimetres.
         reaches: the same for the last one.
@@ -30,9 +30,9 @@ class PoseSearch:
     """
 
     rolls: int = 24
-    pitches: tuple[float, ...] = (-18.0, 0.0, 18.0)
-    survivors: tuple[int, int] = (240, 12)
-    first_reaches: tuple[float, ...] = (25.0, 22.0, 19.0, 16.0)
+    tilt: float = 18.0
+    survivors: tuple[int, int] = (700, 30)
+    first_reaches: tuple[float, ...] = (25.0, 22.0, 19.0, 16.0, 14.0, 12.0)
     reaches: tuple[float, ...] = (25.0, 20.0, 16.0, 12.0, 12.0, 9.0, 9.0, 7.0, 7.0, 6.0, 6.0, 5.0, 5.0, 5.0, 5.0)
     largest_scale: float = 1.2
 
@@ -41,11 +41,12 @@ def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates, search: P
     """Poses that bring a nose at ``nose`` (3,), looking along ``direction`` (3,), onto each candidate, every roll."""
     rotations = []
     base = _frame(direction[None])[0]
-    for pitch in search.pitches:
-        tilted = _frame(found.directions)
+    lean = math.radians(search.tilt)
+    across = _frame(found.directions)
+    for axis, angle in ((0, 0.0), (0, lean), (0, -lean), (1, lean), (1, -lean)):
         for k in range(search.rolls):
-            turn = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(math.radians(pitch), 0)
-            rotations.append(tilted @ turn @ base.T)
+            turn = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(angle, axis)
+            rotations.append(across @ turn @ base.T)
     rotation = torch.cat(rotations)
     target = found.points.repeat(len(rotations), 1)
     translation = target - (rotation @ nose)
