@@ -63,8 +63,8 @@ class Schedule:
 
     stages: tuple[Stage, ...]
     nodes: int = 300
-    gradient_length: float = 10.0
-    sliding: float = 0.01
+    gradient_length: float = 30.0
+    sliding: float = 0.03
     largest_angle: float = 60.0
     opening: float = 10.0
 
@@ -75,22 +75,22 @@ class Schedule:
 
 DEFAULT_SCHEDULE = Schedule(
     (
-        Stage(Level.GRAPH, 30.0, 10.0, 30.0, samples=2000, iterations=4),
-        Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=2000, iterations=3),
-        Stage(Level.GRAPH, 2.0, 4.0, 12.0, samples=2000, iterations=2),
-        Stage(Level.GRAPH, 0.5, 1.0, 8.0, samples=2000, iterations=2),
-        Stage(Level.TRANSLATIONS, 0.3, 0.3, 5.0, iterations=2),
+        Stage(Level.GRAPH, 18.0, 10.0, 30.0, samples=2000, iterations=4),
+        Stage(Level.GRAPH, 5.0, 10.0, 20.0, samples=2000, iterations=3),
+        Stage(Level.GRAPH, 1.2, 5.0, 12.0, samples=2000, iterations=2),
+        Stage(Level.GRAPH, 0.3, 2.0, 8.0, samples=2000, iterations=2),
+        Stage(Level.TRANSLATIONS, 0.3, 1.0, 5.0, iterations=2),
     )
 )
 """For heads of any resolution."""
 
 FULL_SCHEDULE = Schedule(
     (
-        Stage(Level.VERTICES, 30.0, 10.0, 30.0, iterations=4),
-        Stage(Level.VERTICES, 8.0, 8.0, 20.0),
-        Stage(Level.VERTICES, 2.0, 4.0, 12.0, iterations=2),
-        Stage(Level.VERTICES, 0.5, 1.0, 8.0, iterations=2),
-        Stage(Level.VERTICES, 0.3, 0.3, 5.0, iterations=2),
+        Stage(Level.VERTICES, 18.0, 10.0, 30.0, iterations=4),
+        Stage(Level.VERTICES, 5.0, 10.0, 20.0),
+        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2),
+        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2),
+        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2),
     )
 )
 """An affine map a vertex from start to end, as in the paper: slower, and the measure for the default."""
