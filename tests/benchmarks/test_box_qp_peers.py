@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -16,6 +16,15 @@ from torchface.capture import MarkerSolver
 from torchface.optim import BoxQP, box_qp
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """The peers solve on one thread, so ours does too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def energies(capture: Capture, missing: float = 0.0) -> tuple[MarkerSolver, Tensor, Tensor, Tensor, Tensor]:
