@@ -126,13 +126,13 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
     kept: dict[str, int] = {}
     kills = 0
     settings = {"landmarks": scans, "schedule": SHORT, "texture_size": 0}
-    for _ in range(8):
+    for number in range(1, 11):
         process = context.Process(target=register_corpus, args=(template, [scans], out), kwargs=settings)
         process.start()
         limit = time.monotonic() + 60
         while not (out / ".lock").exists() and time.monotonic() < limit:
             time.sleep(0.01)
-        process.join(chance.uniform(0.05, 0.8))
+        process.join(chance.uniform(0.02, 0.12 * number))
         if process.is_alive():
             assert process.pid is not None
             os.kill(process.pid, signal.SIGKILL)
@@ -148,7 +148,7 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
             assert (out / name).stat().st_mtime_ns == when  # what was finished is not made again
         kept = {path.with_suffix(".glb").name: 0 for path in out.glob("s*.json")}
         kept = {name: (out / name).stat().st_mtime_ns for name in kept}
-    assert kills >= 3
+    assert kills >= 2
     end = run(template, scans, out)
     assert [entry.name for entry in end.registered] == [entry.name for entry in done.registered]
     assert sum(entry.reused for entry in end.entries) >= len(kept)

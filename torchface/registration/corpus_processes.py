@@ -18,6 +18,7 @@ from torchface.errors import ValueRangeError
 from torchface.registration.corpus_job import CorpusJob
 from torchface.registration.corpus_record import CorpusEntry, CorpusTask
 
+_MOST_STILLBORN = 3
 _THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -29,10 +30,11 @@ def in_processes(job: CorpusJob, tasks: Sequence[CorpusTask], count: int) -> Ite
     this process, however it ends.
 
     Raises:
-        ValueRangeError: a process does not start.
+        ValueRangeError: processes do not start.
     """
     left = deque(tasks)
     workers: dict[Connection, _Worker] = {}
+    stillborn = 0
     try:
         for _ in range(min(count, len(tasks))):
             worker = _Worker(job)
@@ -42,6 +44,13 @@ def in_processes(job: CorpusJob, tasks: Sequence[CorpusTask], count: int) -> Ite
                 worker = workers[pipe]  # type: ignore[index]
                 entry = worker.answer()
                 if not worker.alive:
+                    stillborn += not worker.started
+                    if stillborn > _MOST_STILLBORN:
+                        raise ValueRangeError(
+                            f"jobs: {stillborn} processes ended before they began, the last with {worker.end()}; "
+                            "expected them to import the calling script, which must call register_corpus under "
+                            'if __name__ == "__main__", and enough memory'
+                        )
                     del workers[worker.pipe]
                     worker.stop()
                     if left:
@@ -91,19 +100,17 @@ class _Worker:
     def _died(self) -> CorpusEntry | None:
         self.process.join(5)
         self.alive = False
-        code = self.process.exitcode
-        how = f"signal {-code}" if code is not None and code < 0 else f"status {code}"
-        if not self.started:
-            raise ValueRangeError(
-                f"jobs: a process ended with {how} before it began; expected it to import the calling script, which "
-                'must call register_corpus under if __name__ == "__main__", and enough memory'
-            )
         if self.task is None:
             return None
-        why = "; the memory may not have sufficed" if code == -signal.SIGKILL else ""
+        why = "; the memory may not have sufficed" if self.process.exitcode == -signal.SIGKILL else ""
         return CorpusEntry(
-            self.task.name, self.task.scan, error=f"the process that registered it ended with {how}{why}"
+            self.task.name, self.task.scan, error=f"the process that registered it ended with {self.end()}{why}"
         )
+
+    def end(self) -> str:
+        """How a dead process ended."""
+        code = self.process.exitcode
+        return f"signal {-code}" if code is not None and code < 0 else f"status {code}"
 
     def stop(self) -> None:
         self.pipe.close()
