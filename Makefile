@@ -8,21 +8,23 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test bench fuzz lint clean
 
 $(STAMP): pyproject.toml constraints.txt
+	@echo "installing into $(VENV), a few minutes"
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(RUN) -m pip install --quiet --constraint constraints.txt --editable .
 	touch $@
 
 $(VENV)/.installed-%: $(STAMP)
+	@echo "installing what '$*' needs"
 	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
 	touch $@
 
-test: $(STAMP)
+test: $(VENV)/.installed-test
 	$(RUN) -m pytest
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s
 
-fuzz: $(STAMP)
+fuzz: $(VENV)/.installed-test
 	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k mutated
 
 lint: $(VENV)/.installed-lint
@@ -32,7 +34,7 @@ lint: $(VENV)/.installed-lint
 	$(VENV)/bin/lint-imports
 
 demo: $(STAMP)
-	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template $(TEMPLATE)) $(if $(TAKE),--take $(TAKE)) $(if $(TARGET),--target $(TARGET))
+	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")
 
 clean:
 	rm -rf $(VENV) out

@@ -47,8 +47,7 @@ def main() -> None:
     from PIL import Image
 
     save_picture(performer_sheet(), HERE / "images" / "performer.jpg")
-    frame = sorted((HERE.parent / "out" / "demo").glob("frame_*.png"))[0]
-    with Image.open(frame) as image:
+    with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_picture(from_pillow(image), HERE / "images" / "demo.jpg")
 
 

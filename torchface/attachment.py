@@ -84,8 +84,8 @@ class Attachment:
         """Raises ``TopologyError`` where this attachment cannot belong to ``mesh``."""
         if self.fingerprint is not None and self.fingerprint != mesh.fingerprint():
             raise TopologyError(
-                f"attachment: made for topology {self.fingerprint}, the mesh has {mesh.fingerprint()} "
-                "(vertex count, hash of the triangles)"
+                f"attachment: found marker sites made for topology {self.fingerprint}, expected the mesh's own, "
+                f"{mesh.fingerprint()} (vertex count, hash of the triangles)"
             )
         if len(self.triangles) and (int(self.triangles.min()) < 0 or int(self.triangles.max()) >= len(mesh.faces)):
             raise TopologyError(
@@ -155,4 +155,7 @@ class Attachment:
         except OSError as error:
             raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, KeyError, TypeError, RuntimeError, RecursionError, OverflowError) as error:
-            raise FileFormatError(f"{path}: not an attachment ({type(error).__name__}: {error})") from error
+            raise FileFormatError(
+                f"{path}: not an attachment ({type(error).__name__}: {error}); "
+                "expected the JSON that Attachment.save writes"
+            ) from error

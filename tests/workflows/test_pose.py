@@ -31,6 +31,11 @@ def test_what_cannot_be_posed_is_said(dome_rig: BlendshapeRig, tmp_path: Path) -
         load_posed(tmp_path / "mesh.obj", {"jawOpen": 1.0})
     with pytest.raises(NameMismatchError, match="found tongueOut; expected shapes of the rig: jawOpen"):
         load_posed(tmp_path / "rig.glb", {"tongueOut": 1.0})
+    with pytest.raises(NameMismatchError, match=r"found jawOpn; expected shapes of the rig: did you mean jawOpen\?"):
+        load_posed(tmp_path / "rig.glb", {"jawOpn": 1.0})
+    save_mesh(dome_rig.neutral, tmp_path / "plain.glb")
+    at_rest = load_posed(tmp_path / "plain.glb", {}).mesh.vertices
+    torch.testing.assert_close(at_rest, dome_rig.vertices, atol=1e-3, rtol=0)
     for word in ("jawOpen", "=1", "jawOpen=wide", "jawOpen=nan", "jawOpen=1e9"):
         with pytest.raises(ValueRangeError, match="expected NAME=NUMBER"):
             pose_weights([word])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from torchface.cli.progress import console
 
 
-def info(path: Positional[Path], attachment: Path | None = None, part: str | None = None) -> None:
+def info(
+    path: Annotated[Positional[Path], arg(metavar="FILE")], attachment: Path | None = None, part: str | None = None
+) -> None:
     """Say what a file holds: a rig, mesh, take, attachment or solver.
 
     Args:

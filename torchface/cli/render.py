@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from torchface.cli.progress import steps
 
 
 def render(
-    path: Positional[Path],
+    path: Annotated[Positional[Path], arg(metavar="FILE")],
     out: Path = Path("out/render.png"),
     weights: tuple[str, ...] = (),
     take: Path | None = None,

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from torchface.cli.progress import console, steps
 
 
 def solve(
-    rig: Positional[Path],
-    take: Positional[Path],
+    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    take: Annotated[Positional[Path], arg(metavar="TAKE")],
     attachment: Path,
     out: Path = Path("out/weights.csv"),
     animation: Path | None = None,

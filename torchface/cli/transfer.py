@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from torchface.cli.progress import console, steps
 
 
 def transfer(
-    template: Positional[Path],
-    neutral: Positional[Path],
+    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")],
+    neutral: Annotated[Positional[Path], arg(metavar="NEUTRAL")],
     out: Path,
     part: str | None = None,
     unit: str | None = None,

@@ -3,6 +3,7 @@
 from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save_rig
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.images import load_image, save_image, save_image16
+from torchface.io.landmarks import load_landmark_points
 from torchface.io.meshes import load_mesh, save_mesh
 from torchface.io.normal_maps import load_normal_map, save_normal_map
 from torchface.io.rigs import load_obj_folder, load_rig
@@ -15,6 +16,7 @@ __all__ = [
     "load_ict_facekit",
     "load_identity_modes",
     "load_image",
+    "load_landmark_points",
     "load_mesh",
     "load_normal_map",
     "load_obj_folder",

@@ -23,10 +23,19 @@ def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tens
 
 def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
     """The image (3,H,W) with a line of text under it."""
-    strip = Image.new("RGB", (image.shape[2], size + 10), "white")
+    return torch.cat([image, _line(image.shape[2], text, size)], dim=1)
+
+
+def headed(image: Tensor, text: str, size: int = 16) -> Tensor:
+    """The image (3,H,W) with a line of text over it."""
+    return torch.cat([_line(image.shape[2], text, size), image], dim=1)
+
+
+def _line(width: int, text: str, size: int) -> Tensor:
+    strip = Image.new("RGB", (width, size + 10), "white")
     draw = ImageDraw.Draw(strip)
-    draw.text((image.shape[2] / 2, (size + 10) / 2), text, fill="black", font=ImageFont.load_default(size), anchor="mm")
-    return torch.cat([image, from_pillow(strip)], dim=1)
+    draw.text((width / 2, (size + 10) / 2), text, fill="black", font=ImageFont.load_default(size), anchor="mm")
+    return from_pillow(strip)
 
 
 def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:

@@ -23,7 +23,7 @@ def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 
     points, room, shift = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
         # Landmarks end at the brows: leave room for the forehead, and turn about a point inside the head.
-        points, room, shift = mesh.vertices[mesh.annotations.landmarks], 1.8, (0.0, 0.12, -0.12)
+        points, room, shift = mesh.vertices[mesh.annotations.landmarks], 1.9, (0.0, 0.12, -0.35)
     elif mesh.annotations is not None and "face" in mesh.annotations.regions:
         points, room = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)

@@ -7,7 +7,7 @@ to disk as C3D, comes back, is solved with the transferred rig, and what came ba
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver
+from torchface.capture.markers import Observability, observability
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error
 from torchface.io import (
@@ -24,6 +25,7 @@ from torchface.io import (
     load_rig,
     load_take,
     save_animation,
+    save_mesh,
     save_rig,
     save_take,
 )
@@ -79,6 +81,7 @@ class DemoResult:
         weight_error, mesh_error: against the truth; the mesh's over ``face`` (V,).
         marker_rmse: (T,), millimetres, against the markers as seen.
         face: mask (V,) of the vertices that ``mesh_error`` is about.
+        seen: what the markers can tell of the rig.
         solver: how the exported solver compares.
         files: what was written, by purpose.
     """
@@ -93,6 +96,7 @@ class DemoResult:
     mesh_error: MeshError
     marker_rmse: Tensor
     face: Tensor
+    seen: Observability
     solver: SolverReport
     files: dict[str, Path]
 
@@ -184,35 +188,40 @@ def run_demo(
     say = progress or (lambda line: None)
     out.mkdir(parents=True, exist_ok=True)
     files = {
-        "rig": out / "actor.glb",
-        "attachment": out / "attachment.json",
-        "take": out / "take.c3d",
-        "weights": out / "weights.csv",
-        "animation": out / "animation.glb",
-        "solver": out / "solver.onnx",
+        "template rig": out / "template.glb",
+        "new head": out / "neutral.obj",
+        "transferred rig": out / "actor.glb",
+        "marker sites": out / "attachment.json",
+        "marker take": out / "take.c3d",
+        "solved weights": out / "weights.csv",
+        "animated rig": out / "animation.glb",
+        "solver for applications": out / "solver.onnx",
     }
     say("transferring the template's shapes to the new head")
     transferred = transfer_with_report(scene.template, scene.head)
     rig = transferred.rig
-    save_rig(rig, files["rig"])
+    save_rig(scene.template, files["template rig"])
+    save_mesh(replace(scene.head, texture=None), files["new head"])
+    save_rig(rig, files["transferred rig"])
     say("filming the markers")
     attachment = place_markers(scene.truth, markers)
-    attachment.save(files["attachment"])
+    attachment.save(files["marker sites"])
     generator = torch.Generator().manual_seed(seed)
     recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
-    save_take(recording.take, files["take"])
+    save_take(recording.take, files["marker take"])
     say("solving the take")
-    solved = MarkerSolver(rig, attachment).solve_take(load_take(files["take"]))
+    marker_solver = MarkerSolver(rig, attachment)
+    solved = marker_solver.solve_take(load_take(files["marker take"]))
     weights = solved.weights
     markers_seen = recording.take.markers
     assert weights is not None
     assert markers_seen is not None
     say("writing weights, animation and solver")
-    save_live_link(solved, files["weights"])
-    save_animation(rig, solved, files["animation"])
+    save_live_link(solved, files["solved weights"])
+    save_animation(rig, solved, files["animated rig"])
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
     seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
-    solver = export_solver(rig, attachment, files["solver"], markers=seen)
+    solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
     say("comparing with the truth")
     face = face_mask(scene.head)
     return DemoResult(
@@ -226,6 +235,7 @@ def run_demo(
         mesh_error(rig, weights.values[..., 0], scene.truth, scene.weights, face),
         marker_rmse(rig, attachment, weights.values[..., 0], markers_seen.values),
         face,
+        observability(marker_solver),
         solver,
         files,
     )

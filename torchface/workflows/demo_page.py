@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.rendering.compositing import caption, sheet
+from torchface.rendering.compositing import caption, headed, sheet
 from torchface.shape_names import ARKIT, mapping
 from torchface.viz.curves import error_curve, named_bars, weight_curves
 from torchface.viz.faces import FRONT, THREE_QUARTER, face_views, heat_map
 from torchface.viz.markers import marker_views
 from torchface.viz.page import Section, Table, write_page
-from torchface.workflows.demo import DemoResult
+from torchface.workflows.demo import FLAWS, DemoResult
 
 _POSES: dict[str, dict[str, float]] = {
     "neutral": {},
@@ -29,26 +29,35 @@ _POSES: dict[str, dict[str, float]] = {
 def result_rows(result: DemoResult) -> list[tuple[str, str]]:
     """The figures of a demo, one a row: what, value."""
     weights, mesh = result.weight_error, result.mesh_error
-    worst = int(weights.mean.argmax())
     names = result.scene.truth.names
     markers = result.recording.take.markers
     assert markers is not None
-    seen = torch.isfinite(markers.values).all(-1)
-    used = torch.isfinite(weights.correlation)
+    sampled = torch.isfinite(markers.values).all(-1).float()
+    told = _told_apart(result)
+    worst = int(told[weights.mean[told].argmax()])
+    curves = weights.correlation[told]
+    noise = (3**0.5) * FLAWS.noise
     return [
         ("frames", f"{len(result.weights)} at {result.scene.fps:g} a second"),
         ("shapes, vertices", f"{len(names)}, {len(result.scene.head.vertices):,}"),
-        ("markers, share not seen", f"{seen.shape[1]}, {100 * (1 - float(seen.float().mean())):.1f} %"),
-        ("weight error, mean", f"{float(weights.mean.mean()):.4f}"),
-        ("weight error, shape with the largest mean", f"{float(weights.mean[worst]):.4f} ({names[worst]})"),
-        ("correlation with the true curve, median shape", f"{float(weights.correlation[used].median()):.4f}"),
-        ("marker RMSE, median frame", f"{float(result.marker_rmse.nanmedian()):.3f} mm"),
+        ("markers, share of samples missing", f"{sampled.shape[1]}, {100 * (1 - float(sampled.mean())):.1f} %"),
+        ("shapes that these markers tell apart", f"{len(told)}"),
+        ("weight error of those, mean", f"{float(weights.mean[told].mean()):.4f}"),
+        ("weight error of those, worst", f"{float(weights.mean[worst]):.4f} ({names[worst]})"),
+        ("their correlation with the true curve, median", f"{float(curves[torch.isfinite(curves)].median()):.4f}"),
+        ("weight error of all shapes, mean", f"{float(weights.mean.mean()):.4f}"),
+        ("marker RMSE, median frame", f"{float(result.marker_rmse.nanmedian()):.3f} mm (noise alone: {noise:.2f} mm)"),
         ("mesh error, mean over face and take", f"{mesh.mean:.3f} mm"),
         ("mesh error as a share of the motion", f"{100 * mesh.relative:.1f} %"),
-        ("mesh error, worst vertex and frame", f"{float(mesh.vertex_largest[result.face].max()):.2f} mm")
-        if mesh.vertex_largest.shape == result.face.shape
-        else ("mesh error, worst vertex and frame", f"{float(mesh.vertex_largest.max()):.2f} mm"),
+        ("mesh error, worst vertex of any frame", f"{float(mesh.vertex_largest.max()):.2f} mm"),
     ]
+
+
+def _told_apart(result: DemoResult) -> Tensor:
+    """Rows of the shapes that the markers see and do not confuse with others, (K,); all where they confuse all."""
+    lost = {*result.seen.unseen, *result.seen.ambiguous}
+    told = [i for i, name in enumerate(result.rig.names) if name not in lost]
+    return torch.tensor(told or list(range(len(result.rig.names))))
 
 
 def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], None] | None = None) -> Path:
@@ -58,17 +67,23 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
     say("rendering the rig")
     rig_picture = _rig_picture(result)
     say("rendering the performance")
-    frames = _telling_frames(scene.weights)
-    performance = [(f"frame_{frame:05d}.png", _frame_picture(result, frame)) for frame in frames]
+    frames = _telling_frames(result)
+    performance = [(f"frame_{i + 1}.png", _frame_picture(result, frame)) for i, frame in enumerate(frames)]
     say("drawing curves")
-    on_mesh = result.attachment.on(scene.head.faces, result.rig(result.weights[frames]))
+    on_mesh = result.attachment.on(scene.head.faces, result.rig(result.weights[frames[:1]]))[0]
     markers = result.recording.take.markers
     assert markers is not None
+    told = _told_apart(result)
+    names = [scene.truth.names[i] for i in told]
     sections = [
         Section(
             "What was true and what came back",
-            "The take was filmed from the head's true rig; the solver knew only the rig transferred from the template.",
-            [Table(("", "value"), result_rows(result)), Table(("exported solver", ""), result.solver.rows())],
+            "The take was filmed from the head's true rig; the solver knew only the rig transferred from the template. "
+            f"What no marker can show, no solve can return: {result.seen}.",
+            [
+                Table(("the solved take", "value"), result_rows(result)),
+                Table(("solver.onnx", ""), result.solver.rows()),
+            ],
         ),
         Section(
             "The rig",
@@ -77,28 +92,30 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
         ),
         Section(
             "The performance",
-            "True face, solved face, and the distance between them in millimetres.",
+            "Above the true and the solved face, below the distance between them. Eyes that no marker follows stay "
+            "where they are.",
             pictures=performance,
         ),
         Section(
             "Markers",
-            "Seen markers and the points of the solved mesh that stand for them.",
+            "Seen markers and the points of the solved mesh that stand for them, then their distance over the take; "
+            f"noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
             pictures=[
-                (f"markers_{frame:05d}.png", marker_views(markers.values[frame], on_mesh[i], f"frame {frame},"))
-                for i, frame in enumerate(frames[:1])
-            ]
-            + [("marker_rmse.png", error_curve(result.marker_rmse, scene.fps))],
+                ("markers.png", marker_views(markers.values[frames[0]], on_mesh, f"frame {frames[0]},")),
+                ("marker_rmse.png", error_curve(result.marker_rmse, scene.fps)),
+            ],
         ),
         Section(
             "Weights",
+            "The shapes that the markers tell apart: their sum, the curves that move most, the error of each.",
             pictures=[
-                ("weights.png", weight_curves(result.weights, scene.weights, scene.truth.names, scene.fps)),
-                ("weight_error.png", named_bars(result.weight_error.mean, scene.truth.names, "mean absolute error")),
+                ("weights.png", weight_curves(result.weights[:, told], scene.weights[:, told], names, scene.fps)),
+                ("weight_error.png", named_bars(result.weight_error.mean[told], names, "mean absolute error")),
             ],
         ),
         Section(
             "Files",
-            tables=[Table(("for", "file"), [(purpose, path.name) for purpose, path in result.files.items()])],
+            tables=[Table(("what it is", "file"), [(purpose, path.name) for purpose, path in result.files.items()])],
         ),
     ]
     return write_page(out, scene.title, sections)
@@ -128,11 +145,13 @@ def _rig_picture(result: DemoResult) -> Tensor:
     return sheet([*upper, *lower], len(upper))
 
 
-def _telling_frames(weights: Tensor, count: int = 3) -> list[int]:
-    """The frame that moves most, then those that differ most from the frames chosen before."""
-    chosen = [int(weights.square().sum(1).argmax())]
+def _telling_frames(result: DemoResult, count: int = 3) -> list[int]:
+    """The frame in which the markers are farthest from rest, then those that differ most from the ones before."""
+    moved = result.recording.markers.flatten(1)
+    rest = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices).flatten()
+    chosen = [int((moved - rest).norm(dim=1).argmax())]
     for _ in range(count - 1):  # each choice depends on the one before
-        chosen.append(int(torch.cdist(weights, weights[chosen]).amin(1).argmax()))
+        chosen.append(int(torch.cdist(moved, moved[chosen]).amin(1).argmax()))
     return chosen
 
 
@@ -143,8 +162,8 @@ def _frame_picture(result: DemoResult, frame: int) -> Tensor:
     error = (true.vertices - solved.vertices).norm(dim=1)
     views = (FRONT, THREE_QUARTER)
     row = [
-        caption(face_views(true, views, width=240, height=300, framed_by=head), f"true, frame {frame}"),
-        caption(face_views(solved, views, width=240, height=300, framed_by=head), "solved"),
+        headed(face_views(true, views, width=240, height=300, framed_by=head), f"true, frame {frame}"),
+        headed(face_views(solved, views, width=240, height=300, framed_by=head), "solved"),
     ]
-    heat = heat_map(solved, error, 2.0, "mm", width=240, height=300)
-    return sheet([sheet(row, 2), heat], 1)
+    heat = heat_map(solved, error, 2.0, "distance, mm", width=240, height=300)
+    return sheet([sheet(row, 2), headed(heat, "distance between them")], 1)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import torch
 
-from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_mesh, load_rig, load_take
 from torchface.io.ict_facekit import region
 from torchface.mesh import Mesh, submesh
@@ -62,18 +63,21 @@ def load_posed(
     if path.suffix.lower() in _MESH_ONLY:
         if weights or take is not None:
             raise NameMismatchError(f"{path}: found a mesh without shapes; a pose needs a rig (.glb or a folder)")
-        mesh = load_mesh(path)
-        mesh = mesh if part is None else submesh(mesh, region(mesh, part)).mesh
-        return Posed(mesh, mesh)
-    rig = load_rig(path, part=part)
+        return _at_rest(path, part)
+    try:
+        rig = load_rig(path, part=part)
+    except FileFormatError:
+        if path.is_dir() or weights or take is not None:
+            raise
+        return _at_rest(path, part)  # a .glb without shapes is a mesh; what is no mesh either raises its own error
     if take is None:
         names = tuple(weights)
         matrix = mapping(names, rig.names)
         unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
         if unknown:
-            raise NameMismatchError(
-                f"weights: found {', '.join(unknown)}; expected shapes of the rig: {', '.join(rig.names[:8])}, ..."
-            )
+            near = sorted({close for name in unknown for close in get_close_matches(name, rig.names, 2)})
+            known = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(rig.names[:8])}, ..."
+            raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {known}")
         row = matrix @ torch.tensor([weights[name] for name in names])
     else:
         track = load_take(take).weights
@@ -83,3 +87,9 @@ def load_posed(
             raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
         row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
     return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
+
+
+def _at_rest(path: Path, part: str | None) -> Posed:
+    mesh = load_mesh(path)
+    mesh = mesh if part is None else submesh(mesh, region(mesh, part)).mesh
+    return Posed(mesh, mesh)
