@@ -50,7 +50,7 @@ def named_bars(values: Tensor, names: Sequence[str], label: str) -> Tensor:
     order = values.argsort().tolist()
     figure = Figure(figsize=(6, 0.5 + 0.17 * len(order)), dpi=100, layout="constrained")
     axes = figure.subplots()
-    axes.barh([names[i] for i in order], values[order], color=SOLVED)
+    axes.barh([names[i] for i in order], values[order].tolist(), color=SOLVED)
     axes.tick_params(axis="y", labelsize=7)
     axes.set_xlabel(label)
     axes.margins(y=0.005)

@@ -18,7 +18,7 @@ from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.io import load_rig, load_take, save_animation
 from torchface.io.live_link import save_live_link
 from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
+from torchface.take import Take, Track, require_seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,7 @@ def solve_take(
     played = load_take(take)
     if played.markers is None:
         raise ValueRangeError(f"{take}: found no markers, expected a marker take (.c3d, .trc, .csv)")
+    require_seen(played)
     alignment = None if neutral_frame is None else align_by_frame(loaded, where, played.markers, neutral_frame)
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     solver = MarkerSolver(loaded, where, alignment, **terms)
