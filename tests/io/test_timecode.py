@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from torchface.errors import FileFormatError
@@ -38,6 +38,7 @@ def test_the_clock_counts_real_time() -> None:
     st.sampled_from(_RATES),
     st.lists(st.integers(1, 9), min_size=5, max_size=40).map(lambda steps: [1] * 150 + steps + [1] * 5),
 )
+@example(24000 / 1001, [1] * 163 + [8] + [9] * 13 + [1] * 5)
 def test_gaps_are_where_frames_were_dropped(fps: float, steps: list[int]) -> None:
     frames = [0]
     for step in steps:

@@ -86,7 +86,9 @@ def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
     falls = (rise == 1) & (within < 0) & ~(drop & (seconds[1:] % 60 == 0))  # where numbers are dropped FF falls less
     wraps = (frames[:-1] - frames[1:])[falls]
     if len(steps) and len(wraps):
-        base = round(float(np.median(wraps) + np.median(steps)))
+        # Where frames were dropped FF falls by less: only the largest falls tell the base.
+        typical = float(np.median(steps))
+        base = round(float(np.median(wraps[wraps > wraps.max() - typical])) + typical)
         if base > frames.max():
             return base
     first = 30 if drop else 60
