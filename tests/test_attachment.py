@@ -62,7 +62,7 @@ def test_other_meshes_are_refused() -> None:
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        ("", "not an attachment"),
+        ("", "found an empty file, expected content"),
         ("[1, 2]", "no field"),
         ('{"format": "torchface.attachment/1"}', "KeyError"),
         ("[" * 100_000, "RecursionError"),

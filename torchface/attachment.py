@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.files import read_file, write_file
 from torchface.mesh import Mesh
 
 _FORMAT = "torchface.attachment/1"
@@ -116,7 +116,6 @@ class Attachment:
 
     def save(self, path: str | Path) -> None:
         """Writes JSON; the file appears only when it is complete."""
-        path = Path(path)
         document = {
             "format": _FORMAT,
             "fingerprint": self.fingerprint,
@@ -125,9 +124,7 @@ class Attachment:
             "barycentric": self.barycentric.tolist(),
             "residual": None if self.residual is None else self.residual.tolist(),
         }
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-        temporary.write_text(json.dumps(document, indent=1), encoding="utf-8")
-        os.replace(temporary, path)
+        write_file(path, json.dumps(document, indent=1).encode())
 
     @staticmethod
     def load(path: str | Path) -> Attachment:
@@ -138,10 +135,7 @@ class Attachment:
         """
         path = Path(path)
         try:
-            size = path.stat().st_size
-            if size > _LARGEST_FILE:
-                raise FileFormatError(f"{path}: found {size} bytes, expected an attachment of at most {_LARGEST_FILE}")
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = json.loads(read_file(path, _LARGEST_FILE))
             if not isinstance(document, dict) or document.get("format") != _FORMAT:
                 raise FileFormatError(f'{path}: no field "format": "{_FORMAT}"; expected an attachment saved as JSON')
             residual = document.get("residual")
@@ -152,8 +146,6 @@ class Attachment:
                 None if residual is None else torch.tensor(residual, dtype=torch.float32).reshape(-1, 3),
                 document.get("fingerprint"),
             )
-        except OSError as error:
-            raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, KeyError, TypeError, RuntimeError, RecursionError, OverflowError) as error:
             raise FileFormatError(
                 f"{path}: not an attachment ({type(error).__name__}: {error}); "

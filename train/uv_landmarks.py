@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from torchface import Mesh, TorchfaceError, load_mesh
-from torchface.io.files import write_file
+from torchface.files import write_file
 from torchface.landmarks import (
     TWELVE,
     CylinderLayout,

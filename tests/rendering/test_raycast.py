@@ -1,11 +1,15 @@
 """Rays hit what they should, as trimesh says too; a picture shows the mesh where the camera projects it."""
 
+from pathlib import Path
+
+import pytest
 import torch
 import trimesh
 
+from torchface.errors import FileFormatError
 from torchface.geometry.camera import look_at
 from torchface.mesh import Mesh
-from torchface.rendering.compositing import heat_colors, sheet
+from torchface.rendering.compositing import heat_colors, save_picture, sheet
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import Lighting, render, sample_texture
 
@@ -68,6 +72,12 @@ def test_texture_is_sampled_with_its_first_row_on_top() -> None:
     texture[0, 0] = 1
     colors = sample_texture(texture, torch.tensor([[0.5, 0.99], [0.5, 0.01]]))
     torch.testing.assert_close(colors[:, 0], torch.tensor([1.0, 0.0]))
+
+
+def test_pictures_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"found the ending '.gif', expected .png or .jpg"):
+        save_picture(torch.zeros(3, 4, 4), tmp_path / "a.gif")
+    assert not list(tmp_path.iterdir())
 
 
 def test_sheet_keeps_every_picture_whole() -> None:

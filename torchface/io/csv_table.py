@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 
 LARGEST_TABLE = 2**29
 """Bytes of text; two hours of 60 fps Live Link Face stay below."""

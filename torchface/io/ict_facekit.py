@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
-from torchface.io.files import read_file
+from torchface.files import read_file
 from torchface.io.mirror import mirror_by_parts
 from torchface.io.obj import face_bytes, read_obj, read_obj_vertices
 from torchface.mesh import Annotations, Mesh

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.io.png16 import encode_png16, from_steps, holds_png16, read_png16
 
 _PIXELS_ALWAYS = 4096 * 4096

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
-from torchface.io.files import read_file
+from torchface.files import read_file
 from torchface.io.picks import load_correspondences
 
 _LARGEST_FILE = 16 * 2**20

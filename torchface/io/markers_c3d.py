@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files import read_file, write_file
 from torchface.io.c3d_sections import BLOCK, MIPS, Header, Parameter, Sections, floats, pack_sections, read_sections
 from torchface.io.csv_table import quoted
-from torchface.io.files import read_file, write_file
 from torchface.io.frame_rates import check_rate, frame_numbers, simplest_rate
 from torchface.io.markers import marker_take, markers_to_write, millimetres, unique_labels
 from torchface.take import Take

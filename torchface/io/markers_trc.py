@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files import read_file, write_file
 from torchface.io.csv_table import LARGEST_TABLE, number_texts, parse_number, quoted
-from torchface.io.files import read_file, write_file
 from torchface.io.frame_rates import check_rate, frame_numbers, numbering
 from torchface.io.markers import marker_take, markers_to_write, millimetres, unique_labels
 from torchface.take import Take

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.io.files import finite_vertices, millimetres_per, read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.io.images import encode_png, load_image
+from torchface.io.lengths import finite_vertices, millimetres_per
 from torchface.io.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh
 

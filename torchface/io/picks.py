@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.mesh import Mesh
 
 _LANDMARKS, _CORRESPONDENCES = "torchface.landmarks/1", "torchface.correspondences/1"

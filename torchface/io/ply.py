@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.io.files import finite_vertices, millimetres_per, read_file, write_file
+from torchface.files import read_file, write_file
+from torchface.io.lengths import finite_vertices, millimetres_per
 from torchface.io.ply_tables import Element, Lists, read_tables
 from torchface.io.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from torchface.errors import FileFormatError
-from torchface.io.files import read_file
+from torchface.files import read_file
 from torchface.io.gltf import read_gltf_rig
 from torchface.io.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.obj import face_bytes, read_obj, read_obj_vertices

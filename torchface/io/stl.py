@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchface.errors import FileFormatError
-from torchface.io.files import finite_vertices, millimetres_per, read_file, write_file
+from torchface.files import read_file, write_file
+from torchface.io.lengths import finite_vertices, millimetres_per
 from torchface.mesh import Mesh
 
 _HEADER = 84

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.landmarks.twelve import TWELVE
 
 _FORMAT = "torchface.scan-annotations/1"

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchface.errors import FileFormatError, MissingExtraError, TorchfaceError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.landmarks.uv import UVLandmarkDetector
 
 KIND = "uv_landmarks"

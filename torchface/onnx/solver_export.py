@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture.markers.solve import RIDGE, SPARSITY, MarkerSolver
 from torchface.errors import ValueRangeError
+from torchface.files import write_file
 from torchface.geometry.alignment import Similarity
 from torchface.onnx.solver import STEPS, STEPS_WITH_GAPS, SolverGraph
 from torchface.onnx.solver_model import solver_model
@@ -137,9 +137,7 @@ def export_solver(
             )
     content = model.SerializeToString()
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    write_file(path, content)
     return SolverReport(
         path,
         len(content),

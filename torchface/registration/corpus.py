@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.files import millimetres_per, write_file
+from torchface.files import write_file
+from torchface.io.lengths import millimetres_per
 from torchface.mesh import Mesh
 from torchface.registration.corpus_cluster import import_ray, on_cluster
 from torchface.registration.corpus_job import CorpusJob

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchface.errors import FileFormatError
-from torchface.io.files import read_file, write_file
+from torchface.files import read_file, write_file
 from torchface.registration.record import RegistrationRecord
 
 _FORMAT = "torchface.registered-scan/1"

@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.io.files import millimetres_per, read_file
+from torchface.files import read_file
 from torchface.io.landmarks import load_landmark_points
+from torchface.io.lengths import millimetres_per
 from torchface.io.picks import load_correspondences
 from torchface.mesh import Mesh
 from torchface.registration.preparation import Landmarks

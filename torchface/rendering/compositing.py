@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
+
+from torchface.errors import FileFormatError
+from torchface.files import write_file
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
@@ -69,9 +72,16 @@ def from_figure(figure: Figure) -> Tensor:
 
 
 def save_picture(image: Tensor, path: str | Path) -> None:
-    """Writes (3,H,W) as PNG or JPEG by the path's ending; the file appears only when it is complete."""
+    """Writes (3,H,W) as PNG or JPEG by the path's ending; the file appears only when it is complete.
+
+    Raises:
+        FileFormatError: another ending, or a folder that cannot be written to.
+    """
     path = Path(path)
+    kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+    if path.suffix.lower() not in kinds:
+        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected .png or .jpg")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    to_pillow(image).save(temporary)
-    os.replace(temporary, path)
+    content = BytesIO()
+    to_pillow(image).save(content, kinds[path.suffix.lower()])
+    write_file(path, content.getvalue())

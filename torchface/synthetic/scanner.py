@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files import write_file
 from torchface.geometry.operators import components, corners
 from torchface.geometry.proximity import SurfaceIndex
-from torchface.io.files import write_file
 from torchface.io.meshes import save_mesh
 from torchface.landmarks.annotations import ScanAnnotation, save_annotations
 from torchface.landmarks.contours import evenly_spaced

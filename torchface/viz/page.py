@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import html
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
+from torchface.files import write_file
 from torchface.rendering.compositing import save_picture
 
 _STYLE = """
@@ -63,9 +63,7 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
             size = f'width="{picture.shape[2]}" height="{picture.shape[1]}"'
             parts.append(f'<img src="{html.escape(name)}" alt="{html.escape(section.title)}" {size}>\n')
     page = folder / "index.html"
-    temporary = folder / f".index.{os.getpid()}.html"
-    temporary.write_text("".join(parts), encoding="utf-8")
-    os.replace(temporary, page)
+    write_file(page, "".join(parts).encode())
     return page
 
 

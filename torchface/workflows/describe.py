@@ -10,8 +10,8 @@ import torch
 from torchface.attachment import Attachment
 from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
+from torchface.files import read_file
 from torchface.io import load_mesh, load_rig, load_take
-from torchface.io.files import read_file
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.io.files import millimetres_per
 from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.extras import read_annotations, read_polygons
 from torchface.io.gltf.primitives import Part, read_part
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.gltf.welding import weld
 from torchface.io.images import decode_image
+from torchface.io.lengths import millimetres_per
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 

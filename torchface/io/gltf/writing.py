@@ -14,13 +14,13 @@ from torch import Tensor
 from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.normal_maps import DetailMaps
 from torchface.geometry.operators import vertex_normals
-from torchface.io.files import millimetres_per
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.container import write_document
 from torchface.io.gltf.detail import corner_tangents, write_detail
 from torchface.io.gltf.extras import write_extras
 from torchface.io.gltf.primitives import decode_srgb
 from torchface.io.images import encode_png
+from torchface.io.lengths import millimetres_per
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
