@@ -98,11 +98,12 @@ def fit(
     say("learning the face frame")
     frame = FaceFrame.fit(scans, points)
     layout = CylinderLayout().resized(settings.size)
-    images, pixels = [], []
-    for scan, truth in zip(scans, points, strict=True):
+    images, pixels, lines = [], [], []
+    for scan, truth, annotation in zip(scans, points, annotations, strict=True):
         head = unwrap(scan, frame.locate(scan), layout)
         images.append(appearance_image(head, settings.appearance))
         pixels.append(layout.pixels(head.pose.apply(truth[None])[0]))
+        lines.append({name: layout.pixels(head.pose.apply(line[None])[0]) for name, line in annotation.lines.items()})
         say(f"unwrapped {len(images)} of {len(scans)}")
     return UVLandmarkDetector.fit(
         torch.stack(images),
@@ -111,6 +112,7 @@ def fit(
         settings.appearance,
         settings.detector,
         frame,
+        lines,
         lambda done, total: say(f"scored {done} of {total}"),
     )
 

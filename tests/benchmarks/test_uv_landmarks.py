@@ -47,10 +47,14 @@ def detectors(scans: list[tuple[Mesh, ScanAnnotation]]) -> dict[str, UVLandmarkD
     frame = FaceFrame.fit([scan for scan, _ in learn], points)
     heads = [unwrap(scan, frame.locate(scan)) for scan, _ in learn]
     layout = CylinderLayout()
+    lines = [
+        {name: layout.pixels(h.pose.apply(line[None])[0]) for name, line in truth.lines.items()}
+        for h, (_, truth) in zip(heads, learn, strict=True)
+    ]
     pixels = torch.stack([layout.pixels(h.pose.apply(p[None])[0]) for h, p in zip(heads, points, strict=True)]).float()
     return {
         kind: UVLandmarkDetector.fit(
-            torch.stack([appearance_image(h, kind) for h in heads]), pixels, TWELVE, kind, frame=frame
+            torch.stack([appearance_image(h, kind) for h in heads]), pixels, TWELVE, kind, frame=frame, lines=lines
         )
         for kind in ("texture", "relief")
     }

@@ -10,6 +10,7 @@ import torch
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.contours import TraceSettings, evenly_spaced, trace_contour
+from torchface.landmarks.line_shape import LineShape
 from torchface.landmarks.smoothing import gaussian_blur
 
 COLUMNS = torch.arange(60.0, 161.0)
@@ -51,20 +52,33 @@ def test_no_single_column_can_do_better() -> None:
     found = trace_contour(image, left, right, settings)
     top = 104 - settings.border
     box = gaussian_blur(image[:, top : 110 + settings.border + 1, 60:161][None], settings.blurs[-1])[0, 0].double()
-    grey = ((box - box.min()) / float(box.numpy().std())).numpy()
+    rows, width = np.arange(len(box)), settings.line_width
+    grey = box.numpy()
+    grey = grey - np.minimum(grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(rows) - 1)])
+    grey = (grey - grey.min()) / grey.std()
     path = (found.points[:, 1] - top).long().numpy()
-    along = np.linspace(0, 1, 101)
-    arc = (110 - top) - 6 * along + settings.sags[0] * 4 * along * (1 - along) * 101
+    course, spread = LineShape.arc(0.08, settings.spread).rows(left, right, COLUMNS)
     limit = grey[path, np.arange(101)].mean() + grey[path, np.arange(101)].std()
-    rows = np.arange(len(grey))
     for c in range(1, 100):
-        cost = settings.dark * grey[:, c] + settings.near / 101**2 * (rows - arc[c]) ** 2
+        cost = settings.dark * grey[:, c] + settings.near * ((rows - float(course[c]) + top) / float(spread[c])) ** 2
         for n in (c - 1, c + 1):
-            cost = (
-                cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2 + settings.smooth * (rows - path[n]) ** 2
-            )
-        allowed = grey[:, c] <= limit
-        assert cost[path[c]] <= cost[allowed if allowed.any() else slice(None)].min() + 1e-9
+            cost = cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2
+            cost = cost + settings.smooth * (rows - path[n]) ** 2
+        cost = cost + 4.0 * (grey[:, c] > limit)
+        assert cost[path[c]] <= cost.min() + 1e-9
+
+
+def test_the_usual_course_is_learned_and_decides_between_two_lines() -> None:
+    lines = [torch.stack([COLUMNS, planted(sag)[1]], dim=-1) for sag in (5.0, 6.0, 7.0)]
+    shape = LineShape.fit(lines)
+    rows, spread = shape.rows(torch.tensor([60.0, 110.0]), torch.tensor([160.0, 104.0]), COLUMNS)
+    assert (rows - planted(6.0)[1]).abs().max() < 0.2
+    assert (spread >= 2.0 - 1e-6).all()
+    image, truth = planted(6.0)
+    y = torch.arange(220.0)[:, None]
+    image[0, :, 60:161] -= 0.45 * torch.exp(-0.5 * ((y - truth - 25) / 2.0) ** 2)  # darker, elsewhere
+    found = trace_contour(image, torch.tensor([60.0, 113.0]), torch.tensor([160.0, 101.0]), shape=shape)
+    assert (found.points[:, 1] - truth)[found.kept].abs().mean() < 1.0
 
 
 def test_what_is_brighter_than_the_line_is_marked() -> None:

@@ -15,8 +15,7 @@ from torchface.geometry.proximity import SurfaceIndex
 from torchface.io import load_mesh
 from torchface.io.landmarks import load_landmark_points
 from torchface.landmarks.annotations import load_annotations
-from torchface.landmarks.scan import LINES
-from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
+from torchface.landmarks.twelve import LINES, TWELVE, twelve_from_ibug
 from torchface.mesh import Mesh
 from torchface.rendering.shading import sample_texture
 from torchface.synthetic import performer

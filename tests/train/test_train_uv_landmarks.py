@@ -27,7 +27,7 @@ from torchface.landmarks import (
 from torchface.landmarks.correspondences import template_features
 from torchface.landmarks.evaluation import landmark_errors
 from torchface.landmarks.hog import HogLayout
-from torchface.landmarks.scan import LINES
+from torchface.landmarks.twelve import LINES
 from torchface.synthetic import draw_identities, head, performer
 from torchface.synthetic.photographs import Photography
 from torchface.synthetic.scanner import ScannerSettings, eyes_closed, write_scans

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.line_shape import LineShape
 from torchface.landmarks.smoothing import gaussian_blur
+
+_BRIGHT = 4.0  # standard deviations; were such rows forbidden, a column without others would jump to any dark spot
 
 
 @dataclass(frozen=True)
@@ -22,20 +25,25 @@ class TraceSettings:
         similar: weight of neighbours having the same intensity.
         dark: weight of being dark.
         smooth: weight of neighbours lying level, a squared pixel.
-        near: weight of staying near the arc that the line starts as, a squared share of the line's length.
+        near: weight of staying near the course that the line starts with, a squared standard deviation.
+        line_width: intensity is measured against that so many pixels above and below.
         blurs: standard deviations of the blur under which the line is found first, and then finer.
-        sags: the line starts as an arc that sags by these shares of its length; the best end wins.
+        sags: where no usual course is known, the line starts as an arc that sags by these shares of its length; the
+            best end wins.
+        spread: the standard deviation about such an arc, a share of its length.
         sweeps: at most so many a blur; fewer when nothing moves any more.
         loose_ends: a corner is only known to within so many pixels up or down.
     """
 
     border: int = 50
     similar: float = 1.0
-    dark: float = 1.0
+    dark: float = 2.0
     smooth: float = 0.1
-    near: float = 60.0
-    blurs: tuple[float, ...] = (2.0,)
-    sags: tuple[float, ...] = (-0.08, 0.0, 0.08, 0.16)
+    near: float = 1.0
+    line_width: int = 5
+    blurs: tuple[float, ...] = (1.0,)
+    sags: tuple[float, ...] = (-0.06, 0.0, 0.06, 0.12)
+    spread: float = 0.07
     sweeps: int = 15
     loose_ends: int = 8
 
@@ -69,24 +77,33 @@ def evenly_spaced(points: Tensor, count: int) -> Tensor:
     return points[after - 1] + share[:, None] * (points[after] - points[after - 1])
 
 
-def trace_contour(image: Tensor, left: Tensor, right: Tensor, settings: TraceSettings | None = None) -> Contour:
+def trace_contour(
+    image: Tensor,
+    left: Tensor,
+    right: Tensor,
+    settings: TraceSettings | None = None,
+    shape: LineShape | None = None,
+) -> Contour:
     r"""Traces the dark line between two corners.
 
-    A line has one row :math:`y_c` a column c; with I the intensity over its standard deviation in the box,
+    A line has one row :math:`y_c` a column c; with I the intensity (how much brighter than the darker of what lies
+    above and below) over its standard deviation in the box,
 
     .. math:: E = \sum_{c=1}^{N} a\,(I_c - I_{c+1})^2 + b\, I_c + s\,(y_c - y_{c+1})^2
-        + \tfrac{d}{N^2} (y_c - y^0_c)^2 ,
+        + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
 
-    with :math:`y^0` the arc that it starts as; the thesis starts from the straight line, which is one of them.
+    with :math:`y^0` the course that it starts with. The thesis starts from the straight line and has no last term; here
+    the start is the mean of annotated lines where there were any, else the straight line and an arc.
 
     Iterated conditional modes goes from the left corner to the right one and gives every column the row that is best
     for its two neighbours as they are, again and again until nothing moves. Rows brighter than the present line's
-    mean by more than one standard deviation are not considered.
+    mean by more than one standard deviation cost extra; those that are left at the end are marked, not kept.
 
     Args:
         image: grey (1,S,S) or colours (3,S,S) in [0,1].
         left, right: corners, (2,) pixels; the left one further left by two pixels at least.
         settings: weights and limits.
+        shape: how the line usually runs.
 
     Raises:
         ShapeError: not an image.
@@ -96,18 +113,16 @@ def trace_contour(image: Tensor, left: Tensor, right: Tensor, settings: TraceSet
     """
     settings = settings or TraceSettings()
     box, rows, columns = _box(image, left, right, settings.border)
-    ends = np.array([float(left[1]) - rows[0], float(right[1]) - rows[0]])
-    along = np.linspace(0.0, 1.0, len(columns))
-    straight = ends[0] + along * (ends[1] - ends[0])
-    arc = 4 * along * (1 - along) * len(columns)
-    starts = np.stack([straight + sag * arc for sag in settings.sags])
+    shapes = [LineShape.arc(sag, settings.spread) for sag in settings.sags] if shape is None else [shape]
+    courses = [one.rows(left, right, torch.from_numpy(columns)) for one in shapes]
+    starts = np.stack([course.numpy() for course, _ in courses]) - rows[0]
+    pulls = settings.near / np.stack([spread.numpy() for _, spread in courses]) ** 2
     path = starts.round().clip(0, len(rows) - 1).astype(np.int64)
     grey = np.zeros(0)
     for blur in settings.blurs:  # each goes on from where the coarser one ended
-        grey = gaussian_blur(box[None, None], blur)[0, 0].double().numpy()
-        grey = (grey - grey.min()) / max(float(grey.std()), 1e-6)
-        path = _sweep(grey, path, starts, settings)
-    energies = _energy(grey, path, starts, settings)
+        grey = _valleys(gaussian_blur(box[None, None], blur)[0, 0].double().numpy(), settings.line_width)
+        path = _sweep(grey, path, starts, pulls, settings)
+    energies = _energy(grey, path, starts, pulls, settings)
     best = int(energies.argmin())
     line = path[best]
     shade = grey[line, np.arange(len(line))]
@@ -138,14 +153,22 @@ def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tenso
     return box, np.arange(top, bottom + 1), np.arange(first, last + 1)
 
 
-def _sweep(grey: NDArray, path: NDArray, starts: NDArray, settings: TraceSettings) -> NDArray:
+def _valleys(grey: NDArray, width: int) -> NDArray:
+    """How much brighter a pixel is than the darker of those ``width`` above and below it, in standard deviations: low
+    on dark lines, not on dark patches, shadows and their edges."""
+    rows = np.arange(len(grey))
+    above, below = grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(grey) - 1)]
+    valley = grey - np.minimum(above, below)
+    return (valley - valley.min()) / max(float(valley.std()), 1e-6)
+
+
+def _sweep(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
     """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
     path = path.copy()
     lines = np.arange(len(path))
     count = path.shape[1]
     row = np.arange(len(grey), dtype=np.float64)
     outside = np.abs(row[:, None] - starts[0, [0, -1]]) > settings.loose_ends
-    pull = settings.near / count**2
     # The order is the method: a column's choice is what the next column starts from. Hence a loop, and NumPy, whose
     # small operations take a fifth of torch's time.
     for _ in range(settings.sweeps):
@@ -154,13 +177,13 @@ def _sweep(grey: NDArray, path: NDArray, starts: NDArray, settings: TraceSetting
         limit = shades.mean(1) + shades.std(1)
         for c in range(count):
             here = grey[:, c]
-            cost = settings.dark * here + pull * (row - starts[:, c, None]) ** 2
+            cost = settings.dark * here + pulls[:, c, None] * (row - starts[:, c, None]) ** 2
             for n in (c - 1, c + 1):
                 if 0 <= n < count:
                     there = grey[path[:, n], n]
                     cost += settings.similar * (here - there[:, None]) ** 2
                     cost += settings.smooth * (row - path[:, n, None]) ** 2
-            cost[here > limit[:, None]] += 1e6
+            cost[here > limit[:, None]] += _BRIGHT
             if c in (0, count - 1):
                 cost[:, outside[:, 0 if c == 0 else 1]] += 1e9
             path[lines, c] = cost.argmin(1)
@@ -169,9 +192,9 @@ def _sweep(grey: NDArray, path: NDArray, starts: NDArray, settings: TraceSetting
     return path
 
 
-def _energy(grey: NDArray, path: NDArray, starts: NDArray, settings: TraceSettings) -> NDArray:
+def _energy(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
     """Mean energy a column of lines (S,N)."""
     shades = grey[path, np.arange(path.shape[1])]
     total = settings.dark * shades.sum(1) + settings.similar * (np.diff(shades, axis=1) ** 2).sum(1)
-    total = total + settings.near / path.shape[1] ** 2 * ((path - starts) ** 2).sum(1)
+    total = total + (pulls * (path - starts) ** 2).sum(1)
     return (total + settings.smooth * (np.diff(path, axis=1) ** 2).sum(1)) / path.shape[1]

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.alignment import Similarity
-from torchface.landmarks.scan import LINES, ScanLandmarks, scan_landmarks
-from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
+from torchface.landmarks.scan import ScanLandmarks, scan_landmarks
+from torchface.landmarks.twelve import LINES, TWELVE, twelve_from_ibug
 from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.mesh import Mesh
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchface.landmarks.annotations import ScanAnnotation
 from torchface.landmarks.contours import evenly_spaced
-from torchface.landmarks.scan import LINES, ScanLandmarks
+from torchface.landmarks.scan import ScanLandmarks
+from torchface.landmarks.twelve import LINES
 from torchface.mesh import Mesh
 
 _FOUND, _TRUE = (1.0, 0.1, 0.1), (0.1, 0.9, 0.2)

@@ -32,7 +32,7 @@ class HogLayout:
     window: int = 32
     cell: int = 8
     bins: int = 9
-    stride: int = 2
+    stride: int = 4
 
     def __post_init__(self) -> None:
         if min(self.window, self.cell, self.bins, self.stride) < 1 or self.window % (2 * self.cell):

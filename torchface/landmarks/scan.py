@@ -11,16 +11,11 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.landmarks.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
+from torchface.landmarks.line_shape import LineShape
 from torchface.landmarks.relief import relief
+from torchface.landmarks.twelve import LINES
 from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.mesh import Mesh
-
-LINES = {
-    "right_lids": ("right_eye_outer", "right_eye_inner"),
-    "left_lids": ("left_eye_inner", "left_eye_outer"),
-    "lips": ("right_mouth_corner", "left_mouth_corner"),
-}
-"""The traced lines and the landmarks at their ends, the one on the picture's left first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +98,19 @@ def scan_landmarks(
         found = detector(image[None])
     pixels = found.pixels[0]
     points, _ = head.surface_points(scan, pixels)
-    contours = trace_lines(image, dict(zip(detector.names, pixels, strict=True)), trace)
+    contours = trace_lines(image, dict(zip(detector.names, pixels, strict=True)), trace, detector.line_shapes())
     return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
 
 
-def trace_lines(image: Tensor, corners: dict[str, Tensor], trace: TraceSettings | None = None) -> dict[str, Contour]:
+def trace_lines(
+    image: Tensor,
+    corners: dict[str, Tensor],
+    trace: TraceSettings | None = None,
+    shapes: dict[str, LineShape] | None = None,
+) -> dict[str, Contour]:
     """Every line of ``LINES`` whose two corners (2,) are there, the one on the left further left."""
-    found = {}
+    found, usual = {}, shapes or {}
     for name, (left, right) in LINES.items():
         if left in corners and right in corners and float(corners[right][0] - corners[left][0]) >= 3:
-            found[name] = trace_contour(image, corners[left], corners[right], trace)
+            found[name] = trace_contour(image, corners[left], corners[right], trace, usual.get(name))
     return found

@@ -26,6 +26,13 @@ TWELVE = (
 MIRRORED = (0, 1, 5, 4, 3, 2, 7, 6, 9, 8, 10, 11)
 """The landmark on the other side of the face."""
 
+LINES = {
+    "right_lids": ("right_eye_outer", "right_eye_inner"),
+    "left_lids": ("left_eye_inner", "left_eye_outer"),
+    "lips": ("right_mouth_corner", "left_mouth_corner"),
+}
+"""The traced lines and the landmarks at their ends, the one on the picture's left first."""
+
 _IBUG = {
     "nose": 30,
     "between_eyes": 27,

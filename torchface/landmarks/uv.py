@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,9 +13,10 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.hog import HogLayout, cell_map, similarity, windows
+from torchface.landmarks.line_shape import STATIONS, LineShape
 from torchface.landmarks.mean_shift import mean_shift
 from torchface.landmarks.smoothing import unsharp
-from torchface.landmarks.twelve import TWELVE
+from torchface.landmarks.twelve import LINES, TWELVE
 
 _FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
 _PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that
@@ -88,6 +90,7 @@ class UVLandmarkDetector(nn.Module):
     prior_mean: Tensor
     prior_covariance: Tensor
     noise: Tensor
+    courses: Tensor
 
     def __init__(
         self,
@@ -112,6 +115,7 @@ class UVLandmarkDetector(nn.Module):
         self.register_buffer("prior_mean", torch.zeros(count, 2))
         self.register_buffer("prior_covariance", torch.zeros(count, 2, 2))
         self.register_buffer("noise", torch.zeros(count))
+        self.register_buffer("courses", torch.zeros(len(LINES), 2, STATIONS))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -134,6 +138,7 @@ class UVLandmarkDetector(nn.Module):
         appearance: str = "texture",
         settings: DetectorSettings | None = None,
         frame: FaceFrame | None = None,
+        lines: Sequence[Mapping[str, Tensor]] | None = None,
         progress: Any = None,
     ) -> UVLandmarkDetector:
         """Learns from annotated images.
@@ -145,6 +150,8 @@ class UVLandmarkDetector(nn.Module):
             appearance: what the images show, "texture" or "relief".
             settings: how to match.
             frame: the frame the images were unwrapped in, kept for ``scan_landmarks``.
+            lines: pixels of each image's lip and lid lines by name, (N,2) from left to right, where known:
+                tracing starts from their mean.
             progress: called with the number of images done and in all.
 
         Raises:
@@ -165,6 +172,7 @@ class UVLandmarkDetector(nn.Module):
         self.filters[~torch.isfinite(landmarks).all(-1).T] = 0.0
         self._fit_scores(maps, landmarks, progress)
         self._fit_noise(maps, landmarks)
+        self._fit_courses(lines or [])
         return self
 
     def forward(self, images: Tensor) -> UVLandmarks:
@@ -292,6 +300,18 @@ class UVLandmarkDetector(nn.Module):
         # The median of a chi-squared variable with two degrees of freedom is 2 ln 2.
         middle = products.nanmedian(0).values / (2 * math.log(2))
         self.noise.copy_(torch.nan_to_num(middle, nan=float(self.size)))
+
+    def line_shapes(self) -> dict[str, LineShape]:
+        """How the lines usually run, those that were annotated in training."""
+        known = zip(LINES, self.courses, strict=True)
+        return {name: LineShape(offset, spread) for name, (offset, spread) in known if bool((spread > 0).all())}
+
+    def _fit_courses(self, lines: Sequence[Mapping[str, Tensor]]) -> None:
+        for row, name in enumerate(LINES):
+            own = [one[name] for one in lines if name in one]
+            if len(own) >= 2:
+                shape = LineShape.fit(own)
+                self.courses[row] = torch.stack([shape.offset, shape.spread]).to(self.courses)
 
     def _raw_cells(self, images: Tensor) -> Tensor:
         sharp = unsharp(images.float(), self.settings.unsharp_sigma, self.settings.unsharp_amount)

@@ -19,8 +19,7 @@ from torchface.io.meshes import save_mesh
 from torchface.landmarks.annotations import ScanAnnotation, save_annotations
 from torchface.landmarks.contours import evenly_spaced
 from torchface.landmarks.correspondences import template_features
-from torchface.landmarks.scan import LINES
-from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
+from torchface.landmarks.twelve import LINES, TWELVE, twelve_from_ibug
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.dressing import Dress, dressed
