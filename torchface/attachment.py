@@ -70,7 +70,8 @@ class Attachment:
             )
         faces = mesh.faces.cpu()
         corner_of = torch.full((len(mesh.vertices),), -1, dtype=torch.int64)
-        corner_of[faces.flatten()] = torch.arange(faces.numel())
+        # A vertex has many corners: the last one, whatever the threads do.
+        corner_of.scatter_reduce_(0, faces.flatten(), torch.arange(faces.numel()), "amax")
         corners = corner_of[ids]
         if (corners < 0).any():
             loose = ids[corners < 0].tolist()

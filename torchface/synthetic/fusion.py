@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -181,18 +182,19 @@ def _shell(points: Tensor, normals: Tensor, origin: Tensor, voxel: float, shape:
     strides = torch.tensor([int(shape[1] * shape[2]), int(shape[2]), 1])
     home = ((points - origin) / voxel).round().long()
     count = int(shape.prod())
-    owner = torch.full((count,), -1, dtype=torch.int32)
-    owner[(home * strides).sum(1)] = torch.arange(len(points), dtype=torch.int32)
+    # numpy: where several points share a voxel the last one wins, always; torch's threads would race.
+    owner = np.full(count, -1, dtype=np.int32)
+    owner[(home * strides).sum(1).numpy()] = np.arange(len(points), dtype=np.int32)
     for _ in range(_LAYERS):  # grows by one voxel a round
-        filled = (owner >= 0).nonzero()[:, 0]
+        filled = np.flatnonzero(owner >= 0)
         held = owner[filled]
         for step in strides.tolist():
             for move in (step, -step):
                 to = filled + move
                 free = owner[to] < 0
                 owner[to[free]] = held[free]
-    cells = (owner >= 0).nonzero()[:, 0]
-    return cells, normals[owner[cells].long()]
+    cells = np.flatnonzero(owner >= 0)
+    return torch.from_numpy(cells), normals[torch.from_numpy(owner[cells].astype(np.int64))]
 
 
 def _unravel(indices: Tensor, shape: Tensor) -> Tensor:
