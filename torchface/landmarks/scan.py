@@ -17,6 +17,8 @@ from torchface.landmarks.twelve import LINES
 from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.mesh import Mesh
 
+_BROAD_SCALE, _BROAD_CONTRAST = 3.0, 16.0  # millimetres; facets of coarse scans and their noise are smaller
+
 
 @dataclass(frozen=True, eq=False)
 class ScanLandmarks:
@@ -61,7 +63,7 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
         ValueRangeError: a texture is wanted and the scan has no colours.
     """
     if appearance == "relief":
-        return relief(head)
+        return relief(head, _BROAD_SCALE, _BROAD_CONTRAST)
     if head.texture is None:
         raise ValueRangeError(
             "scan: found no texture and no vertex colours, expected some: this detector learned from textures; "
@@ -98,7 +100,9 @@ def scan_landmarks(
         found = detector(image[None])
     pixels = found.pixels[0]
     points, _ = head.surface_points(scan, pixels)
-    contours = trace_lines(image, dict(zip(detector.names, pixels, strict=True)), trace, detector.line_shapes())
+    # Lips and lids are finer than what tells a landmark from its surroundings.
+    fine = relief(head) if detector.appearance == "relief" else image
+    contours = trace_lines(fine, dict(zip(detector.names, pixels, strict=True)), trace, detector.line_shapes())
     return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
 
 
