@@ -2,6 +2,8 @@
 
 from torchface.modeling.detail import BakeStatistics, NormalMap, bake_normal_map, detail_maps
 from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
+from torchface.modeling.head_model import HeadModel, Heads
+from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.open_eyes import open_eyes
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
@@ -9,6 +11,9 @@ from torchface.modeling.transfer import TransferredRig, TransferReport, transfer
 __all__ = [
     "BakeStatistics",
     "ExampleRig",
+    "HeadModel",
+    "Heads",
+    "MorphableModel",
     "NormalMap",
     "RiggingSchedule",
     "ScanAlignment",
