@@ -1,0 +1,19 @@
+"""Rotations from vectors agree with scipy's, also where the angle is tiny."""
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from torchface.geometry.rotations import cross_matrix, rotation_matrix
+
+
+def test_agrees_with_scipy() -> None:
+    vectors = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double()
+    vectors[:10] *= 1e-7
+    vectors[10] = 0.0
+    expected = torch.from_numpy(Rotation.from_rotvec(vectors.numpy()).as_matrix())
+    torch.testing.assert_close(rotation_matrix(vectors), expected, rtol=0, atol=1e-14)
+
+
+def test_cross_matrix_multiplies_as_the_cross_product() -> None:
+    a, b = torch.randn(2, 4, 3, generator=torch.Generator().manual_seed(1)).double()
+    torch.testing.assert_close((cross_matrix(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b))

@@ -1,0 +1,202 @@
+"""Where a camera stands, from points that it sees: the perspective-n-point problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, ValueRangeError
+from torchface.geometry.rotations import cross_matrix, rotation_matrix
+
+_FEWEST = 4
+_NEAREST = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
+_FLAT = 1e-2  # relative; points that extend less in their third direction are flat for the start
+_START_ROUNDS, _ROUNDS, _DONE = 10, 60, 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """World to camera for a batch.
+
+    Args:
+        rotation: (B,3,3).
+        translation: (B,3), millimetres.
+        errors: reprojection, weighted root mean square, (B,), pixels.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    errors: Tensor
+
+
+def solve_pnp(
+    points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None = None, start: Pose | None = None
+) -> Pose:
+    r"""The poses in which a camera sees points where they are seen, with least squared error.
+
+    .. math:: \min_{R,t} \sum_i w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \quad R \in SO(3)
+
+    Started by iterated scaled orthography (POSIT; for flat points from both of its mirrored answers), refined by
+    Levenberg's method in float64.
+
+    Args:
+        points: :math:`x`, (B,N,3) or (N,3) for all, millimetres.
+        pixels: :math:`q`, (B,N,2); a NaN row counts as not seen.
+        intrinsics: K, (B,3,3) or (3,3).
+        weights: non-negative, (B,N) or (N,); equal if absent.
+        start: poses to refine instead of looking for them.
+
+    Returns:
+        ``Pose(rotation (B,3,3), translation (B,3), errors (B,))`` in float64.
+
+    Raises:
+        ShapeError: the shapes do not fit each other.
+        ValueRangeError: fewer than four points are seen, or a point or weight is not finite.
+        AlignmentError: the points seen lie on a line, or no pose has them all in front of the camera.
+
+    Source: thesis 3.2.5, equation 12; DeMenthon and Davis 1995.
+    """
+    x, q, K, w = _checked(points, pixels, intrinsics, weights)
+    inverse = torch.linalg.inv(K)
+    rays = torch.nn.functional.pad(q, (0, 1), value=1.0) @ inverse.transpose(-1, -2)
+    starts = [start] if start is not None else _orthographic_starts(x, rays[..., :2] / rays[..., 2:], w)
+    best: Pose | None = None
+    for one in starts:  # two at most
+        pose = _refined(x, q, K, w, one.rotation.double(), one.translation.double())
+        if best is None:
+            best = pose
+            continue
+        better = pose.errors < best.errors
+        best = Pose(
+            torch.where(better[:, None, None], pose.rotation, best.rotation),
+            torch.where(better[:, None], pose.translation, best.translation),
+            torch.where(better, pose.errors, best.errors),
+        )
+    assert best is not None
+    if not torch.isfinite(best.errors).all():
+        bad = (~torch.isfinite(best.errors)).nonzero()[:, 0].tolist()
+        raise AlignmentError(f"solve_pnp: found no pose with all points in front of the camera in views {bad[:5]}")
+    return best
+
+
+def pixel_jacobian(seen: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (B,N,2) of points (B,N,3) in the camera's frame, and what moves them: (B,N,2,3)."""
+    image = seen @ intrinsics.transpose(-1, -2)
+    depth = image[..., 2:]
+    pixels = image[..., :2] / depth
+    rows = intrinsics[..., None, :2, :] - pixels[..., None] * intrinsics[..., None, 2:, :]
+    return pixels, rows / depth[..., None]
+
+
+def _checked(
+    points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    count = pixels.shape[1] if pixels.ndim == 3 else -1
+    fits = pixels.ndim == 3 and pixels.shape[2] == 2 and points.shape[-2:] == (count, 3)
+    if not fits or points.ndim not in (2, 3) or (points.ndim == 3 and len(points) != len(pixels)):
+        raise ShapeError(
+            f"solve_pnp: found points {tuple(points.shape)} and pixels {tuple(pixels.shape)}, expected (B,N,3) or "
+            "(N,3), and (B,N,2)"
+        )
+    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim > 3 or intrinsics.shape[:-2] not in ((), (len(pixels),)):
+        raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3) or ({len(pixels)},3,3)")
+    q = pixels.detach().double()
+    seen = torch.isfinite(q).all(-1)
+    w = torch.ones_like(seen, dtype=torch.float64) if weights is None else weights.detach().double().expand(seen.shape)
+    if not torch.isfinite(w).all() or (w < 0).any():
+        raise ValueRangeError("solve_pnp: found a negative or infinite weight, expected finite ones of at least 0")
+    w = w * seen
+    if int((w > 0).sum(1).min()) < _FEWEST:
+        raise ValueRangeError(
+            f"solve_pnp: found {int((w > 0).sum(1).min())} points seen in view {int((w > 0).sum(1).argmin())}, "
+            f"expected at least {_FEWEST}"
+        )
+    x = points.detach().double().expand(len(q), -1, -1)
+    if not torch.isfinite(x[w > 0]).all():
+        raise ValueRangeError("solve_pnp: found NaN or infinite points, expected finite millimetres")
+    x = torch.where((w > 0)[..., None], x, 0.0)
+    return x, torch.where(seen[..., None], q, 0.0), intrinsics.detach().double().expand(len(q), 3, 3), w
+
+
+def _orthographic_starts(x: Tensor, rays: Tensor, w: Tensor) -> list[Pose]:
+    """Both answers where points are flat, else one: rays (B,N,2) are pixels of a camera with K = I."""
+    share = (w / w.sum(1, keepdim=True))[..., None]
+    centre = (share * x).sum(1, keepdim=True)
+    away = (x - centre) * share.sqrt()
+    u, singular, vh = torch.linalg.svd(away, full_matrices=False)
+    if (singular[:, 1] < 1e-6 * singular[:, 0]).any() or (singular[:, 0] == 0).any():
+        raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
+    flat = singular[:, 2] < _FLAT * singular[:, 0]
+    kept = torch.where(flat[:, None] & (torch.arange(3) == 2), torch.inf, singular)
+    inverse = vh.transpose(-1, -2) @ (u / kept[:, None, :]).transpose(-1, -2)
+    normal = vh[:, 2]
+    starts = []
+    for sign in (1.0, -1.0) if bool(flat.any()) else (1.0,):
+        deeper = torch.zeros_like(x[..., 0])
+        for _ in range(_START_ROUNDS):  # each round corrects for perspective with the depths of the one before
+            goal = rays * (1 + deeper)[..., None]
+            middle = (share * goal).sum(1, keepdim=True)
+            ij = (inverse @ ((goal - middle) * share.sqrt())).transpose(-1, -2)
+            i, j = (ij + torch.where(flat[:, None, None], _out_of_plane(ij, normal, sign), 0.0)).unbind(1)
+            scale = (i.norm(dim=-1) * j.norm(dim=-1)).sqrt().clamp(min=1e-12)
+            rows = torch.stack([i, j, torch.linalg.cross(i, j) / scale[:, None]], dim=1) / scale[:, None, None]
+            a, _, b = torch.linalg.svd(rows)
+            rotation = a @ b
+            deeper = ((x - centre) @ rotation[:, 2, :, None])[..., 0] * scale[:, None]
+            deeper = deeper.clamp(-0.5, 0.5)
+        depth = 1 / scale
+        place = torch.cat([middle[:, 0] * depth[:, None], depth[:, None]], dim=1)
+        translation = place - (rotation @ centre.transpose(-1, -2))[..., 0]
+        # In front of the camera, whatever the first guess was.
+        lack = _NEAREST * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
+        translation[:, 2] += 2 * lack.clamp(min=0)
+        starts.append(Pose(rotation, translation, torch.full_like(depth, torch.inf)))
+    return starts
+
+
+def _out_of_plane(ij: Tensor, normal: Tensor, sign: float) -> Tensor:
+    """What flat points do not tell of the two rows (B,2,3): (λ, μ) times the normal, so that they are orthonormal."""
+    i, j = ij.unbind(1)
+    product, difference = -(i * j).sum(-1), j.square().sum(-1) - i.square().sum(-1)
+    first = (0.5 * (difference + (difference.square() + 4 * product.square()).sqrt())).clamp(min=0).sqrt()
+    second = torch.where(first > 1e-12, product / first.clamp(min=1e-12), (-difference).clamp(min=0).sqrt())
+    return sign * torch.stack([first, second], dim=1)[..., None] * normal[:, None]
+
+
+def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor) -> Pose:
+    nearest = _NEAREST * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
+    damping = torch.full_like(translation[:, 0], 1e-4)
+    error = _error(x, q, K, w, rotation, translation, nearest)
+    for _ in range(_ROUNDS):
+        seen = x @ rotation.transpose(-1, -2)
+        pixels, by_place = pixel_jacobian(seen + translation[:, None], K)
+        jacobian = torch.cat([by_place @ -cross_matrix(seen), by_place], dim=-1)
+        weighted = jacobian * w[..., None, None]
+        H = torch.einsum("bnij,bnik->bjk", weighted, jacobian)
+        g = torch.einsum("bnij,bni->bj", weighted, pixels - q)
+        H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-12)
+        step = -torch.linalg.solve(H, g)
+        turned, moved = rotation_matrix(step[:, :3]) @ rotation, translation + step[:, 3:]
+        found = _error(x, q, K, w, turned, moved, nearest)
+        better = found < error
+        rotation = torch.where(better[:, None, None], turned, rotation)
+        translation = torch.where(better[:, None], moved, translation)
+        settled = (better & (error - found < _DONE * error)) | (~better & (damping > 1e6)) | (error < 1e-20)
+        error = torch.where(better, found, error)
+        damping = torch.where(better, damping * 0.1, damping * 10).clamp(min=1e-12)
+        if bool(settled.all()):
+            break
+    return Pose(rotation, translation, (error / w.sum(1)).sqrt())
+
+
+def _error(
+    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, nearest: Tensor
+) -> Tensor:
+    """Weighted squared error (B,); infinite where a point lies behind the camera."""
+    seen = x @ rotation.transpose(-1, -2) + translation[:, None]
+    image = seen @ K.transpose(-1, -2)
+    squared = (image[..., :2] / image[..., 2:] - q).square().sum(-1) * w
+    behind = ((seen[..., 2] < nearest[:, None]) & (w > 0)).any(1)
+    return torch.where(w > 0, squared, 0.0).sum(1).masked_fill(behind, torch.inf)
