@@ -61,20 +61,13 @@ def solve_pnp(
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
     inverse = torch.linalg.inv(K)
     rays = torch.nn.functional.pad(q, (0, 1), value=1.0) @ inverse.transpose(-1, -2)
-    starts = [start] if start is not None else _orthographic_starts(x, rays[..., :2] / rays[..., 2:], w)
-    best: Pose | None = None
-    for one in starts:  # two at most
-        pose = _refined(x, q, K, w, one.rotation.double(), one.translation.double())
-        if best is None:
-            best = pose
-            continue
-        better = pose.errors < best.errors
-        best = Pose(
-            torch.where(better[:, None, None], pose.rotation, best.rotation),
-            torch.where(better[:, None], pose.translation, best.translation),
-            torch.where(better, pose.errors, best.errors),
-        )
-    assert best is not None
+    if start is not None:
+        best = _refined(x, q, K, w, start.rotation.double(), start.translation.double())
+    else:
+        rotation, translation, normal, flat = _orthographic_start(x, rays[..., :2] / rays[..., 2:], w)
+        best = _refined(x, q, K, w, rotation, translation)
+        if flat.any():
+            best = _better(best, _refined(x, q, K, w, *_mirrored(x, w, best, normal)))
     if not torch.isfinite(best.errors).all():
         bad = (~torch.isfinite(best.errors)).nonzero()[:, 0].tolist()
         raise AlignmentError(f"solve_pnp: found no pose with all points in front of the camera in views {bad[:5]}")
@@ -120,49 +113,67 @@ def _checked(
     return x, torch.where(seen[..., None], q, 0.0), intrinsics.detach().double().expand(len(q), 3, 3), w
 
 
-def _orthographic_starts(x: Tensor, rays: Tensor, w: Tensor) -> list[Pose]:
-    """Both answers where points are flat, else one: rays (B,N,2) are pixels of a camera with K = I."""
+def _orthographic_start(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rotation, translation, the direction (B,3) in which points extend least, and whether they are flat, (B,).
+
+    ``rays`` (B,N,2) are pixels of a camera with K = I.
+    """
     share = (w / w.sum(1, keepdim=True))[..., None]
     centre = (share * x).sum(1, keepdim=True)
-    away = (x - centre) * share.sqrt()
-    u, singular, vh = torch.linalg.svd(away, full_matrices=False)
-    if (singular[:, 1] < 1e-6 * singular[:, 0]).any() or (singular[:, 0] == 0).any():
+    u, singular, vh = torch.linalg.svd((x - centre) * share.sqrt(), full_matrices=False)
+    if (singular[:, 1] <= 1e-6 * singular[:, 0]).any():
         raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
     flat = singular[:, 2] < _FLAT * singular[:, 0]
     kept = torch.where(flat[:, None] & (torch.arange(3) == 2), torch.inf, singular)
     inverse = vh.transpose(-1, -2) @ (u / kept[:, None, :]).transpose(-1, -2)
     normal = vh[:, 2]
-    starts = []
-    for sign in (1.0, -1.0) if bool(flat.any()) else (1.0,):
-        deeper = torch.zeros_like(x[..., 0])
-        for _ in range(_START_ROUNDS):  # each round corrects for perspective with the depths of the one before
-            goal = rays * (1 + deeper)[..., None]
-            middle = (share * goal).sum(1, keepdim=True)
-            ij = (inverse @ ((goal - middle) * share.sqrt())).transpose(-1, -2)
-            i, j = (ij + torch.where(flat[:, None, None], _out_of_plane(ij, normal, sign), 0.0)).unbind(1)
-            scale = (i.norm(dim=-1) * j.norm(dim=-1)).sqrt().clamp(min=1e-12)
-            rows = torch.stack([i, j, torch.linalg.cross(i, j) / scale[:, None]], dim=1) / scale[:, None, None]
-            a, _, b = torch.linalg.svd(rows)
-            rotation = a @ b
-            deeper = ((x - centre) @ rotation[:, 2, :, None])[..., 0] * scale[:, None]
-            deeper = deeper.clamp(-0.5, 0.5)
-        depth = 1 / scale
-        place = torch.cat([middle[:, 0] * depth[:, None], depth[:, None]], dim=1)
-        translation = place - (rotation @ centre.transpose(-1, -2))[..., 0]
-        # In front of the camera, whatever the first guess was.
-        lack = _NEAREST * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
-        translation[:, 2] += 2 * lack.clamp(min=0)
-        starts.append(Pose(rotation, translation, torch.full_like(depth, torch.inf)))
-    return starts
+    deeper = torch.zeros_like(x[..., 0])
+    for _ in range(_START_ROUNDS):  # each round corrects for perspective with the depths of the one before
+        goal = rays * (1 + deeper)[..., None]
+        middle = (share * goal).sum(1, keepdim=True)
+        ij = (inverse @ ((goal - middle) * share.sqrt())).transpose(-1, -2)
+        i, j = (ij + torch.where(flat[:, None, None], _out_of_plane(ij, normal), 0.0)).unbind(1)
+        scale = (i.norm(dim=-1) * j.norm(dim=-1)).sqrt().clamp(min=1e-12)
+        rows = torch.stack([i, j, torch.linalg.cross(i, j) / scale[:, None]], dim=1) / scale[:, None, None]
+        a, _, b = torch.linalg.svd(rows)
+        rotation = a @ b
+        deeper = ((x - centre) @ rotation[:, 2, :, None])[..., 0] * scale[:, None]
+        deeper = deeper.clamp(-0.5, 0.5)
+    depth = 1 / scale[:, None]
+    translation = torch.cat([middle[:, 0] * depth, depth], dim=1) - (rotation @ centre.transpose(-1, -2))[..., 0]
+    # In front of the camera, whatever the first guess was.
+    lack = _NEAREST * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
+    translation[:, 2] += 2 * lack.clamp(min=0)
+    return rotation, translation, normal, flat
 
 
-def _out_of_plane(ij: Tensor, normal: Tensor, sign: float) -> Tensor:
+def _out_of_plane(ij: Tensor, normal: Tensor) -> Tensor:
     """What flat points do not tell of the two rows (B,2,3): (λ, μ) times the normal, so that they are orthonormal."""
     i, j = ij.unbind(1)
     product, difference = -(i * j).sum(-1), j.square().sum(-1) - i.square().sum(-1)
     first = (0.5 * (difference + (difference.square() + 4 * product.square()).sqrt())).clamp(min=0).sqrt()
     second = torch.where(first > 1e-12, product / first.clamp(min=1e-12), (-difference).clamp(min=0).sqrt())
-    return sign * torch.stack([first, second], dim=1)[..., None] * normal[:, None]
+    return torch.stack([first, second], dim=1)[..., None] * normal[:, None]
+
+
+def _mirrored(x: Tensor, w: Tensor, pose: Pose, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose in which flat points look nearly the same: tilted the other way about the line of sight."""
+    centre = (w[..., None] * x).sum(1) / w.sum(1, keepdim=True)
+    middle = (pose.rotation @ centre[..., None])[..., 0] + pose.translation
+    sight = torch.nn.functional.normalize(middle, dim=-1)
+    identity = torch.eye(3, dtype=x.dtype, device=x.device)
+    through, across = (identity - 2 * v[:, :, None] * v[:, None, :] for v in (sight, normal))
+    rotation = through @ pose.rotation @ across
+    return rotation, middle - (rotation @ centre[..., None])[..., 0]
+
+
+def _better(one: Pose, other: Pose) -> Pose:
+    better = other.errors < one.errors
+    return Pose(
+        torch.where(better[:, None, None], other.rotation, one.rotation),
+        torch.where(better[:, None], other.translation, one.translation),
+        torch.where(better, other.errors, one.errors),
+    )
 
 
 def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor) -> Pose:
