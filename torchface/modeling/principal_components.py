@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 
 _CHUNK = 4096
+_BLOCK = 64
 _NO_VARIANCE = 1e-12
 """Of the largest eigenvalue: what rounding leaves where there is nothing."""
 
@@ -56,28 +57,37 @@ def principal_components(samples: Tensor, count: int | None = None) -> Principal
     if samples.ndim != 2 or not samples.is_floating_point():
         raise ShapeError(f"samples: found {samples.dtype} {tuple(samples.shape)}, expected floats (M,D)")
     check_count(len(samples), count)
-    mean = samples.mean(0, dtype=torch.float64)
-    if not bool(torch.isfinite(mean).all()):
-        bad = int((~torch.isfinite(samples)).any(1).sum())
-        raise ValueRangeError(f"samples: {bad} of {len(samples)} hold NaN or infinity; expected none")
+    mean = samples.new_empty(samples.shape[1], dtype=torch.float64)
     gram = samples.new_zeros((len(samples), len(samples)), dtype=torch.float64)
     # In pieces: the samples in float64 all at once would be twice what is already in memory.
     for begin in range(0, samples.shape[1], _CHUNK):
-        piece = samples[:, begin : begin + _CHUNK].double() - mean[begin : begin + _CHUNK]
-        gram.addmm_(piece, piece.T)
-    spectrum = gram_spectrum(gram, count)
+        piece = samples[:, begin : begin + _CHUNK].double()
+        mean[begin : begin + _CHUNK] = piece.mean(0)
+        add_outer_product(gram, piece.sub_(mean[begin : begin + _CHUNK]))
+    if not bool(torch.isfinite(mean).all()):
+        bad = int((~torch.isfinite(samples)).any(1).sum())
+        raise ValueRangeError(f"samples: {bad} of {len(samples)} hold NaN or infinity; expected none")
+    spectrum = gram_spectrum(gram, rounding(samples), count)
     components = samples.new_empty((len(spectrum.values), samples.shape[1]), dtype=torch.float32)
-    toward = spectrum.vectors / spectrum.values.sqrt()
+    toward = (spectrum.vectors / spectrum.values.sqrt()).T.contiguous()
     for begin in range(0, samples.shape[1], _CHUNK):
-        piece = samples[:, begin : begin + _CHUNK].double() - mean[begin : begin + _CHUNK]
-        components[:, begin : begin + _CHUNK] = (toward.T @ piece).float()
+        piece = samples[:, begin : begin + _CHUNK].double().sub_(mean[begin : begin + _CHUNK])
+        components[:, begin : begin + _CHUNK] = toward @ piece
+    components.mul_(signs(components)[:, None])
     return PrincipalComponents(
         mean,
-        components * signs(components)[:, None],
+        components,
         (spectrum.values / (len(samples) - 1)).sqrt(),
         spectrum.trace / (len(samples) - 1),
         spectrum.rank,
     )
+
+
+def add_outer_product(gram: Tensor, piece: Tensor) -> None:
+    """Adds P Pᵀ of a piece (M,D) to the lower triangle of a matrix (M,M), block by block of rows."""
+    for begin in range(0, len(piece), _BLOCK):
+        end = begin + _BLOCK
+        gram[begin:end, :end].addmm_(piece[begin:end], piece[:end].T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,16 +100,26 @@ class GramSpectrum:
     rank: int
 
 
-def gram_spectrum(gram: Tensor, count: int | None = None) -> GramSpectrum:
-    """The largest eigenpairs, checked to be there.
+def rounding(samples: Tensor) -> float:
+    """An eigenvalue of the Gram matrix of samples (M,D) below which there is only their rounding."""
+    largest = float(torch.maximum(samples.max(), -samples.min()))
+    return (torch.finfo(samples.dtype).eps * largest) ** 2 * samples.shape[1]
+
+
+def gram_spectrum(gram: Tensor, floor: float, count: int | None = None) -> GramSpectrum:
+    """The largest eigenpairs of a matrix (M,M) whose lower triangle is filled, checked to be there.
+
+    Args:
+        gram: of centred samples, float64.
+        floor: an eigenvalue below this counts as none.
+        count: how many pairs; all above the floor if absent.
 
     Raises:
         ValueRangeError: the samples are all the same, or have fewer components than asked for.
     """
     values, vectors = torch.linalg.eigh(gram)
     values, vectors = values.flip(0), vectors.flip(1)
-    rank = int((values > _NO_VARIANCE * values[0]).sum()) if float(values[0]) > 0 else 0
-    rank = min(rank, len(gram) - 1)
+    rank = min(int((values > max(floor, _NO_VARIANCE * float(values[0]))).sum()), len(gram) - 1)
     check_rank(len(gram), rank, count)
     keep = rank if count is None else count
     return GramSpectrum(values[:keep], vectors[:, :keep], float(gram.diagonal().sum()), rank)
