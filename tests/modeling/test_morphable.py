@@ -174,7 +174,7 @@ def test_samples_that_teach_nothing_are_refused(samples: torch.Tensor) -> None:
         MorphableModel.fit(samples[:1].expand(3, -1, -1))
     with pytest.raises(ValueRangeError, match="found 14, expected 1 to 13 with 14 samples"):
         MorphableModel.fit(samples, 14)
-    with pytest.raises(ValueRangeError, match="found 5, expected at most 3.*duplicates"):
+    with pytest.raises(ValueRangeError, match=r"found 5, expected at most 3.*duplicates"):
         MorphableModel.fit(torch.cat([samples[:4], samples[:4]]), 5)
     assert MorphableModel.fit(torch.cat([samples[:4], samples[:4]])).count == 3
     broken = samples.clone()
