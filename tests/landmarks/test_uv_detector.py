@@ -95,7 +95,7 @@ def test_files_that_lie_are_refused(detector: UVLandmarkDetector, tmp_path: Path
     save_detector(detector, folder)
     text = (folder / "model.toml").read_text()
     (folder / "model.toml").write_text(text.replace("images = 8", "images = 800000000"))
-    with pytest.raises(FileFormatError, match="claims more"):
+    with pytest.raises(FileFormatError, match="do not fit"):
         load_detector(folder)
     (folder / "model.toml").write_text(text.replace("images = 8", "images = 7"))
     with pytest.raises(FileFormatError, match="do not fit"):
@@ -106,7 +106,7 @@ def test_files_that_lie_are_refused(detector: UVLandmarkDetector, tmp_path: Path
     (folder / "model.toml").write_text(text)
     state = (folder / "state.safetensors").read_bytes()
     (folder / "state.safetensors").write_bytes(state[: len(state) // 2])
-    with pytest.raises(FileFormatError, match="no readable state"):
+    with pytest.raises(FileFormatError, match="cut off"):
         load_detector(folder)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -70,10 +71,23 @@ class MarkerSolver(nn.Module):
         rest = attachment.on(faces, rig.vertices)
         if attachment.residual is not None:
             rest = rest + attachment.residual.to(rest)
-        self.names: tuple[str, ...] = rig.names
-        self.labels: tuple[str, ...] = tuple(attachment.labels or ())
+        basis = attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous()
+        self._hold(rig.names, tuple(attachment.labels or ()), basis, rest, alignment, sparsity, ridge)
+
+    def _hold(
+        self,
+        names: Sequence[str],
+        labels: Sequence[str],
+        basis: Tensor,
+        rest: Tensor,
+        alignment: Similarity | None,
+        sparsity: float,
+        ridge: float,
+    ) -> None:
+        self.names: tuple[str, ...] = tuple(names)
+        self.labels: tuple[str, ...] = tuple(labels)
         self.sparsity, self.ridge = float(sparsity), float(ridge)
-        self.register_buffer("basis", attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous())
+        self.register_buffer("basis", basis)
         self.register_buffer("rest", rest)
         if alignment is not None and alignment.scale.shape != (1,):
             raise ShapeError(f"alignment: found {tuple(alignment.scale.shape)} similarities, expected (1,)")
@@ -82,6 +96,40 @@ class MarkerSolver(nn.Module):
             self.register_buffer(f"alignment_{name}", moved)
         self._prepared: tuple[Tensor, float, float, BoxQP] | None = None
         self.regularization(self.rest)  # a negative weight is an error here, not at the first solve
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What :meth:`from_config` needs beside the state: plain values only."""
+        return {
+            "names": list(self.names),
+            "labels": list(self.labels),
+            "sparsity": self.sparsity,
+            "ridge": self.ridge,
+            "aligned": self.alignment is not None,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> MarkerSolver:
+        """A solver of zeros for the state to be loaded into, without the rig it came from.
+
+        Raises:
+            NameMismatchError: a name or a label is no text, or there twice.
+            ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite.
+        """
+        names, labels = config["names"], config["labels"]
+        for what, found in (("names", names), ("labels", labels)):
+            if (
+                not isinstance(found, list)
+                or not all(isinstance(n, str) for n in found)
+                or len(set(found)) < len(found)
+            ):
+                raise NameMismatchError(f"{what}: found {found!r:.80}, expected a list of distinct names")
+        self = cls.__new__(cls)
+        nn.Module.__init__(self)
+        alignment = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3)) if config["aligned"] else None
+        basis = torch.zeros(len(labels), 3, len(names))
+        self._hold(names, labels, basis, basis[..., 0], alignment, config["sparsity"], config["ridge"])
+        return self
 
     @property
     def alignment(self) -> Similarity | None:

@@ -1,0 +1,309 @@
+"""Models by name: they come back as they were, and nothing outside the zoo is reached or run."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import re
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import tomli_w
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mutation import check_reader
+from torch import Tensor, nn
+
+from torchface import Attachment, BlendshapeRig, TorchfaceError, zoo
+from torchface.capture import MarkerSolver
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.geometry.alignment import Similarity
+from torchface.landmarks import UVLandmarkDetector, load_detector, save_detector
+from torchface.modeling.head_model import HeadModel
+from torchface.modeling.morphable import MorphableModel
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+FACTS = {"licence": "MIT", "data": "nothing but noise", "metrics": {"error": 0.25}, "recipe": "python -m train.none"}
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def morphable() -> MorphableModel:
+    return MorphableModel.fit(noise(6, 30, 3))
+
+
+@pytest.fixture
+def solver(dome_rig: BlendshapeRig) -> MarkerSolver:
+    turn = torch.linalg.qr(noise(3, 3))[0]
+    alignment = Similarity(torch.tensor([0.8]), (turn * torch.linalg.det(turn))[None], torch.tensor([[1.0, 2, 3]]))
+    return MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)), alignment)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A user's own folder of models, with one in it."""
+    monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
+    zoo.save_model(morphable(), tmp_path / "home" / "mine", **FACTS)
+    return tmp_path / "home"
+
+
+def test_a_model_comes_back_as_it_was(home: Path) -> None:
+    assert "mine" in zoo.list_models()
+    model, again = morphable(), zoo.get_model("mine")
+    assert isinstance(again, MorphableModel)
+    assert again.config == model.config
+    assert not again.training
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(again.state_dict()[name], tensor)
+        assert again.state_dict()[name].dtype == tensor.dtype
+    coefficients = noise(3, model.count)
+    assert torch.equal(again(coefficients), model(coefficients))
+    assert torch.equal(zoo.get_model(home / "mine")(coefficients), model(coefficients))
+
+
+def test_a_solver_needs_no_rig_to_come_back(solver: MarkerSolver, tmp_path: Path) -> None:
+    zoo.save_model(solver, tmp_path / "solver", **FACTS)
+    again = zoo.get_model(tmp_path / "solver")
+    assert (again.names, again.labels) == (solver.names, solver.labels)
+    markers = solver.rest.expand(5, -1, -1) + 0.5 * noise(5, *solver.rest.shape)
+    markers[2, 4] = torch.nan
+    assert torch.equal(again(markers), solver(markers))
+
+
+def test_a_head_with_colours_comes_back(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    vertices = dome_rig.vertices
+    shape = MorphableModel.fit(vertices + noise(5, *vertices.shape))
+    color = MorphableModel.fit(torch.rand(5, *vertices.shape, generator=torch.Generator().manual_seed(1)))
+    head = HeadModel.on(dome_rig.neutral, shape, color)
+    zoo.save_model(head, tmp_path / "head", **FACTS)
+    again = zoo.get_model(tmp_path / "head")
+    first, second = (one.mesh(torch.ones(4), torch.ones(4)) for one in (head, again))
+    assert torch.equal(first.vertices, second.vertices)
+    assert torch.equal(first.colors, second.colors)
+    assert first.fingerprint() == second.fingerprint()
+
+
+def test_a_detector_is_saved_in_the_same_format(tmp_path: Path) -> None:
+    detector = UVLandmarkDetector(2, 64, ("left", "right"))
+    detector.filters.copy_(noise(*detector.filters.shape))
+    zoo.save_model(detector, tmp_path / "one", **FACTS)
+    save_detector(detector, tmp_path / "two", {"errors": {"mean": 1.5}})
+    for again in (load_detector(tmp_path / "one"), zoo.get_model(tmp_path / "two")):
+        assert again.config == detector.config
+        assert torch.equal(again.filters, detector.filters)
+    assert zoo.describe(tmp_path / "two").metrics == {"mean": 1.5}
+
+
+def test_half_precision_where_it_is_asked_for(tmp_path: Path) -> None:
+    model = morphable()
+    whole = zoo.save_model(model, tmp_path / "whole", **FACTS)
+    half = zoo.save_model(model, tmp_path / "half", **FACTS, half=["components"])
+    assert abs(whole.size - half.size - 2 * model.components.numel()) <= 8  # padding of the header
+    again = zoo.get_model(tmp_path / "half")
+    assert again.components.dtype == torch.float32
+    assert torch.equal(again.components, model.components.half().float())
+    assert torch.equal(again.mean, model.mean)
+    with pytest.raises(ValueRangeError, match="found modes"):
+        zoo.save_model(model, tmp_path / "none", **FACTS, half=["modes"])
+
+
+def test_the_description_is_what_was_said(home: Path) -> None:
+    found = zoo.describe("mine")
+    state = (home / "mine" / "state.safetensors").read_bytes()
+    assert (found.kind, found.name, found.size) == ("morphable", "mine", len(state))
+    assert found.sha256 == hashlib.sha256(state).hexdigest()
+    assert (found.licence, found.data, found.metrics, found.recipe) == tuple(FACTS.values())
+    assert found.url == (home / "mine").resolve().as_uri()
+    zoo.save_model(morphable(), home / "other", **FACTS, url="https://example.org/m", card="Good for tests.")
+    assert zoo.describe("other").url == "https://example.org/m"
+    card = (home / "other" / "CARD.md").read_text()
+    for words in ("# other", "Good for tests.", "nothing but noise", "MIT", "| error | 0.25 |", "python -m train.none"):
+        assert words in card
+
+
+def test_the_checkouts_models_go_before_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "checkout" / "torchface"
+    package.mkdir(parents=True)
+    monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
+    monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
+    folders = [package / "_models", tmp_path / "home", tmp_path / "checkout" / "models"]
+    for folder in folders:
+        zoo.save_model(morphable(), folder / "face", **FACTS)
+    zoo.save_model(morphable(), folders[1] / "own", **FACTS)
+    assert zoo.list_models() == ["face", "own"]
+    assert zoo.find("face") == folders[0] / "face"
+    (tmp_path / "checkout" / "pyproject.toml").touch()
+    assert zoo.find("face") == folders[2] / "face"
+    assert zoo.find("own") == folders[1] / "own"
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../mine", "mine/..", "a b", "-x", "m\0ine", "x" * 65, "nobody"])
+def test_a_name_that_is_none_is_refused(home: Path, name: str) -> None:
+    with pytest.raises(TorchfaceError, match=r"expected one"):
+        zoo.get_model(name)
+
+
+def test_links_that_lead_out_are_not_followed(home: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    shutil.copytree(home / "mine", outside)
+    (home / "linked").symlink_to(outside)
+    (home / "loop").symlink_to(home / "loop")
+    assert zoo.list_models() == sorted({"mine", *zoo.list_models()} - {"linked", "loop"})
+    with pytest.raises(NameMismatchError, match="linked"):
+        zoo.get_model("linked")
+    for name in ("model.toml", "state.safetensors"):
+        shutil.copytree(home / "mine", home / "half", dirs_exist_ok=True)
+        (home / "half" / name).unlink()
+        (home / "half" / name).symlink_to(outside / name)
+        with pytest.raises(FileFormatError, match=f"{name}: found a link that leads out"):
+            zoo.get_model("half")
+        (home / "half" / name).unlink()
+
+
+def test_what_is_no_model_cannot_be_saved(tmp_path: Path) -> None:
+    with pytest.raises(NameMismatchError, match=r"found a Linear, expected one of .*HeadModel"):
+        zoo.save_model(nn.Linear(2, 2), tmp_path / "x", **FACTS)
+    with pytest.raises(NameMismatchError, match="letters, digits"):
+        zoo.save_model(morphable(), tmp_path / "..", **FACTS)
+    broken = morphable()
+    broken.mean[3, 1] = torch.nan
+    with pytest.raises(ValueRangeError, match="mean: found NaN"):
+        zoo.save_model(broken, tmp_path / "x", **FACTS)
+    with pytest.raises(ValueRangeError, match="error = nan"):
+        zoo.save_model(morphable(), tmp_path / "x", **{**FACTS, "metrics": {"error": float("nan")}})
+    assert not (tmp_path / "x").exists()
+
+
+def _text(change: Callable[[str], str]) -> Callable[[Path], object]:
+    return lambda folder: (folder / "model.toml").write_text(change((folder / "model.toml").read_text()))
+
+
+def _state(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    return lambda folder: (folder / zoo.STATE).write_bytes(change((folder / zoo.STATE).read_bytes()))
+
+
+def _retold(tensors: dict[str, Tensor]) -> Callable[[Path], object]:
+    """Another state, with the size and hash that belong to it."""
+
+    def change(folder: Path) -> None:
+        state = safetensors.torch.save(tensors)
+        record = zoo.describe(folder)
+        text = (folder / "model.toml").read_text().replace(record.sha256, hashlib.sha256(state).hexdigest())
+        (folder / "model.toml").write_text(text.replace(f"\nsize = {record.size}\n", f"\nsize = {len(state)}\n"))
+        (folder / "state.safetensors").write_bytes(state)
+
+    return change
+
+
+def _claims_gigabytes(state: bytes) -> bytes:
+    header = json.dumps({"mean": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}).encode()
+    return (len(header).to_bytes(8, "little") + header).ljust(len(state), b"\0")
+
+
+STATE = morphable().state_dict()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_state(lambda data: data[:-4]), r"state.safetensors: found \d+ bytes, expected \d+: cut off"),
+        (_state(lambda data: data[:-1] + bytes([data[-1] ^ 1])), r"state.safetensors: found sha256 \w+, expected"),
+        (_state(lambda data: b"\xff" * len(data)), "state.safetensors: no readable state"),
+        (_state(_claims_gigabytes), r"state.safetensors: the header claims 4398046511104 bytes"),
+        (lambda folder: (folder / "state.safetensors").unlink(), "state.safetensors: found no such file"),
+        (lambda folder: (folder / "model.toml").write_text("= 1"), "model.toml: not TOML"),
+        (lambda folder: (folder / "model.toml").write_bytes(b"\xff\xfe"), "model.toml: not TOML"),
+        (_text(lambda text: text.replace("format = 1", "format = 2")), "format 2, made by a newer torchface"),
+        (_text(lambda text: text.replace("format = 1\n", "")), "found format = None, expected 1"),
+        (_text(lambda text: text.replace('"morphable"', '"os.system"')), "found kind 'os.system', expected 'head' or"),
+        (_text(lambda text: text.replace('"MIT"', "7")), "found licence = 7, expected text"),
+        (_text(lambda text: text.replace("error = 0.25", 'error = "low"')), "metrics = .*expected a table of numbers"),
+        (_text(lambda text: text.replace("vertices = 30", "vertices = 31")), "config and state do not fit"),
+        (_text(lambda text: text.replace("vertices = 30", "vertices = 300000000")), "config cannot be used|do not fit"),
+        (_text(lambda text: text.replace("vertices = 30\n", "")), "config cannot be used"),
+        (_retold({**STATE, "mean": STATE["mean"] * torch.inf}), "found NaN or infinity in mean"),
+        (_retold({**STATE, "mean": STATE["mean"].long()}), "mean: found torch.int64"),
+        (_retold({**STATE, "more": torch.zeros(2)}), "config and state do not fit .*more in one of them only"),
+    ],
+)  # fmt: skip
+def test_a_damaged_model_is_named(home: Path, damage: Callable[[Path], object], message: str) -> None:
+    damage(home / "mine")
+    with pytest.raises(FileFormatError, match=message):
+        zoo.get_model("mine")
+
+
+def test_pickles_are_refused(home: Path) -> None:
+    torch.save(STATE, home / "mine" / "state.safetensors")
+    data = (home / "mine" / "state.safetensors").read_bytes()
+    record = zoo.describe("mine")
+    text = (home / "mine" / "model.toml").read_text().replace(record.sha256, hashlib.sha256(data).hexdigest())
+    (home / "mine" / "model.toml").write_text(text.replace(f"size = {record.size}", f"size = {len(data)}"))
+    with pytest.raises(FileFormatError, match="no readable state"):
+        zoo.get_model("mine")
+
+
+_BETWEEN = b"\n# state follows\n"
+
+
+def read_bundle(path: Path) -> object:
+    """Reads a case as a description and a state, whose size and hash are made to fit."""
+    folder = path.parent / "model"
+    folder.mkdir(exist_ok=True)
+    text, _, state = path.read_bytes().partition(_BETWEEN)
+    text = re.sub(rb'sha256 = "\w{64}"', f'sha256 = "{hashlib.sha256(state).hexdigest()}"'.encode(), text)
+    (folder / "model.toml").write_bytes(re.sub(rb"\nsize = \d{3,}\n", f"\nsize = {len(state)}\n".encode(), text))
+    (folder / "state.safetensors").write_bytes(state)
+    return zoo.get_model(folder)
+
+
+def test_a_mutated_model_is_loaded_or_refused(solver: MarkerSolver, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    shape = MorphableModel.fit(dome_rig.vertices + noise(4, *dome_rig.vertices.shape))
+    detector = UVLandmarkDetector(2, 64, frame={"points": 9, "count": 12})
+    bundles = []
+    for model in (morphable(), solver, HeadModel.on(dome_rig.neutral, shape), detector):
+        folder = tmp_path / type(model).__name__
+        zoo.save_model(model, folder, **FACTS)
+        bundles.append(tmp_path / f"{folder.name}.bundle")
+        bundles[-1].write_bytes(
+            (folder / "model.toml").read_bytes() + _BETWEEN + (folder / "state.safetensors").read_bytes()
+        )
+    report = check_reader(read_bundle, bundles, ".bundle", cases=300)
+    assert report.refused > 200
+    assert report.read > 10
+
+
+_VALUES = st.recursive(
+    st.booleans() | st.integers() | st.text() | st.floats(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(field=st.sampled_from(["kind", "size", "config", "metrics", "format", "sha256", "licence"]), value=_VALUES)
+def test_no_value_of_a_field_breaks_the_reader(home: Path, field: str, value: object) -> None:
+    document = tomllib.loads((home / "mine" / "model.toml").read_text())
+    try:
+        text = tomli_w.dumps({**document, field: value}).encode()
+    except UnicodeError:  # half a surrogate pair
+        return
+    folder = home / "changed"
+    folder.mkdir(exist_ok=True)
+    (folder / "model.toml").write_bytes(text)
+    (folder / zoo.STATE).write_bytes((home / "mine" / zoo.STATE).read_bytes())
+    with contextlib.suppress(TorchfaceError):
+        zoo.get_model(folder)
+
+
+def test_torch_hub_gives_the_models_of_the_checkout(home: Path) -> None:
+    model = torch.hub.load(str(REPOSITORY), "mine", source="local")
+    assert isinstance(model, MorphableModel)
+    assert torch.equal(model.mean, morphable().mean)
