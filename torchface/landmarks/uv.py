@@ -130,6 +130,11 @@ class UVLandmarkDetector(nn.Module):
         }
 
     @classmethod
+    def from_config(cls, config: dict[str, Any]) -> UVLandmarkDetector:
+        """A detector of zeros for the state to be loaded into."""
+        return cls(**config)
+
+    @classmethod
     def fit(
         cls,
         images: Tensor,
