@@ -1,5 +1,5 @@
 """Blendshape weights from what cameras and marker systems saw."""
 
-from torchface.capture.markers import MarkerSolver
+from torchface.capture.markers import HybridSolver, MarkerSolver
 
-__all__ = ["MarkerSolver"]
+__all__ = ["HybridSolver", "MarkerSolver"]

@@ -132,6 +132,18 @@ def ridge_term(shapes: int, weight: float, like: Tensor, center: Tensor | None =
     return Quadratic(H, -2 * weight * center.to(like), weight * center.to(like).square().sum(-1))
 
 
+def pull_term(targets: Tensor, strength: Tensor) -> Quadratic:
+    r"""A pull of each weight toward a value of its own, :math:`E(w) = \sum_i \gamma_i (w_i - \tilde w_i)^2`.
+
+    Args:
+        targets: :math:`\tilde w`, (B,N).
+        strength: :math:`\gamma`, (B,N), mm² a marker for a squared weight of 1, not negative.
+
+    Source: thesis 4.1.8, equation 38.
+    """
+    return Quadratic(torch.diag_embed(2 * strength), -2 * strength * targets, (strength * targets.square()).sum(-1))
+
+
 def _check_weight(name: str, weight: float) -> None:
     if not 0 <= weight < float("inf"):
         raise ValueRangeError(f"{name}: found {weight}, expected a number that is not negative")

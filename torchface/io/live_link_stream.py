@@ -129,10 +129,10 @@ class LiveLinkSender:
         if not self._matrix.any():
             raise NameMismatchError(f"stream: found the shapes {', '.join(names[:5])}, expected some of ARKit's")
         try:
-            family, _, _, _, self._target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
             raise ValueRangeError(f"stream: found {address!r}, whose host is not known ({error})") from error
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket, self._target = socket.socket(family, socket.SOCK_DGRAM), target
         self._device = str(uuid.uuid4()).upper()
         self._subject, self._fps, self._sent = subject, fps, 0
 
