@@ -6,25 +6,39 @@ from torchface.io.images import load_image, save_image, save_image16
 from torchface.io.landmarks import load_landmark_points
 from torchface.io.meshes import load_mesh, save_mesh
 from torchface.io.normal_maps import load_normal_map, save_normal_map
+from torchface.io.picks import (
+    Correspondences,
+    LandmarkVertices,
+    load_correspondences,
+    load_landmarks,
+    save_correspondences,
+    save_landmarks,
+)
 from torchface.io.rigs import load_obj_folder, load_rig
 from torchface.io.takes import load_take, save_take
 
 __all__ = [
+    "Correspondences",
     "IdentityModes",
+    "LandmarkVertices",
     "ShapeMatch",
+    "load_correspondences",
     "load_detail_maps",
     "load_ict_facekit",
     "load_identity_modes",
     "load_image",
     "load_landmark_points",
+    "load_landmarks",
     "load_mesh",
     "load_normal_map",
     "load_obj_folder",
     "load_rig",
     "load_take",
     "save_animation",
+    "save_correspondences",
     "save_image",
     "save_image16",
+    "save_landmarks",
     "save_mesh",
     "save_normal_map",
     "save_rig",

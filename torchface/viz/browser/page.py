@@ -13,6 +13,7 @@ import torch
 
 from torchface.errors import MissingExtraError
 from torchface.mesh import Mesh
+from torchface.viz.browser.visitors import only_this_page
 
 if TYPE_CHECKING:
     import viser
@@ -44,14 +45,14 @@ def start_server(label: str, port: int = 8080) -> viser.ViserServer:
     """A page on ``http://127.0.0.1:PORT``, or on the next port that is free.
 
     Args:
-        label: heads the panel.
+        label: heads the panel, and names the browser's tab.
         port: the first to try; 0 takes any that is free.
 
     Raises:
         MissingExtraError: viser is not installed.
     """
     viser = import_viser()
-    with _quiet():
+    with _quiet(), only_this_page(f"{label} – torchface" if label != "torchface" else label):
         server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
     # Any page open in the browser could ask viser for a public tunnel to this one; there is none.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010

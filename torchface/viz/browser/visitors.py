@@ -1,0 +1,84 @@
+"""Who may speak to the page: the page itself, and no other that is open in the same browser."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from html import escape
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+_HOSTS = ("127.0.0.1", "localhost")
+_TITLE = b"<title>Viser</title>"
+_ALONE = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
+_starting = threading.Lock()
+
+Serve = Callable[["ServerConnection", "Request"], "Response | None"]
+
+
+def welcome(host: str | None, origin: str | None, port: int) -> bool:
+    """Whether a request may be answered.
+
+    A browser says in ``Origin`` which page opens a connection, and in ``Host`` by which name it found this machine: a
+    foreign page has another origin, and one whose name was made to point at 127.0.0.1 has another host. Programs that
+    are no browsers send no origin; they could do as they like anyway.
+
+    Args:
+        host: the request's ``Host``.
+        origin: its ``Origin``; None where it has none.
+        port: that it came to.
+    """
+    places = {f"{name}:{port}" for name in _HOSTS} | (set(_HOSTS) if port == 80 else set())
+    return host in places and (origin is None or origin in {f"http://{place}" for place in places})
+
+
+@contextmanager
+def only_this_page(title: str) -> Iterator[None]:
+    """Servers that viser starts meanwhile answer their own page alone, show it in no frame, and call it by ``title``.
+
+    viser hands its server's handshake to ``websockets`` and has no setting for either.
+    """
+    server = importlib.import_module("websockets.asyncio.server")
+    with _starting:
+        before = server.serve
+
+        def serve(*arguments: Any, process_request: Serve, **more: Any) -> Any:
+            return before(*arguments, process_request=_guarded(process_request, title), **more)
+
+        server.serve = serve
+        try:
+            yield
+        finally:
+            server.serve = before
+
+
+def _guarded(answer: Serve, title: str) -> Serve:
+    named = b"<title>" + escape(title).encode() + b"</title>"
+
+    def process(connection: ServerConnection, request: Request) -> Response | None:
+        # Twice the same header is nothing that a browser sends, and get() would raise.
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        port = connection.local_address[1]
+        if len(hosts) != 1 or len(origins) > 1 or not welcome(hosts[0], origins[0] if origins else None, port):
+            return connection.respond(HTTPStatus.FORBIDDEN, "This page is for this machine's own browser alone.\n")
+        document = request.path.partition("?")[0] in ("/", "/index.html")
+        if document and "Accept-Encoding" in request.headers:
+            # As it lies on disk: a packed one could not be given its title.
+            del request.headers["Accept-Encoding"]
+        response = answer(connection, request)
+        if response is not None:
+            for name, value in _ALONE.items():
+                response.headers[name] = value
+            if document and response.body is not None:
+                response.body = response.body.replace(_TITLE, named, 1)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    return process
