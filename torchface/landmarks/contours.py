@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.line_shape import LineShape
+from torchface.landmarks.line_shape import LineShape, unit_profiles
 from torchface.landmarks.smoothing import gaussian_blur
 
 _BRIGHT = 4.0  # standard deviations; were such rows forbidden, a column without others would jump to any dark spot
@@ -31,6 +32,9 @@ class TraceSettings:
         sags: where no usual course is known, the line starts as an arc that sags by these shares of its length; the
             best end wins.
         spread: the standard deviation about such an arc, a share of its length.
+        displacements: where corners are known to be loose, either end of the usual course is tried moved by so many
+            standard deviations; the best line wins, and every column pays for its displacement as for leaving the
+            course.
         sweeps: at most so many a blur; fewer when nothing moves any more.
         loose_ends: a corner is only known to within so many pixels up or down.
     """
@@ -44,6 +48,7 @@ class TraceSettings:
     blurs: tuple[float, ...] = (1.0,)
     sags: tuple[float, ...] = (-0.06, 0.0, 0.06, 0.12)
     spread: float = 0.07
+    displacements: tuple[float, ...] = (-2.0, -1.0, 0.0, 1.0, 2.0)
     sweeps: int = 15
     loose_ends: int = 8
 
@@ -114,21 +119,42 @@ def trace_contour(
     settings = settings or TraceSettings()
     box, rows, columns = _box(image, left, right, settings.border)
     shapes = [LineShape.arc(sag, settings.spread) for sag in settings.sags] if shape is None else [shape]
-    courses = [one.rows(left, right, torch.from_numpy(columns)) for one in shapes]
-    starts = np.stack([course.numpy() for course, _ in courses]) - rows[0]
-    pulls = settings.near / np.stack([spread.numpy() for _, spread in courses]) ** 2
+    starts, pulls, displaced = _starts(shapes, left, right, torch.from_numpy(columns), settings)
+    starts -= rows[0]
+    look = None if shape is None or shape.profile is None else shape.looks(left, right, torch.from_numpy(columns))
     path = starts.round().clip(0, len(rows) - 1).astype(np.int64)
     grey = np.zeros(0)
     for blur in settings.blurs:  # each goes on from where the coarser one ended
-        grey = _valleys(gaussian_blur(box[None, None], blur)[0, 0].double().numpy(), settings.line_width)
+        smooth = gaussian_blur(box[None, None], blur)[0, 0].double()
+        grey = _valleys(smooth.numpy(), settings.line_width) if look is None else _unlike(smooth, look)
         path = _sweep(grey, path, starts, pulls, settings)
-    energies = _energy(grey, path, starts, pulls, settings)
+    energies = _energy(grey, path, starts, pulls, settings) + displaced
     best = int(energies.argmin())
     line = path[best]
     shade = grey[line, np.arange(len(line))]
     kept = shade <= shade.mean() + shade.std()
     points = torch.stack([torch.from_numpy(columns).double(), torch.from_numpy(line + rows[0]).double()], dim=-1)
     return Contour(points, torch.from_numpy(kept), float(energies[best]))
+
+
+def _starts(
+    shapes: list[LineShape], left: Tensor, right: Tensor, columns: Tensor, settings: TraceSettings
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Courses (S,N) in image rows, the pulls toward them (S,N), and what the displacement of each costs, (S,).
+
+    Where corners are known to be loose, every shape is tried with either end moved up and down.
+    """
+    share = torch.linspace(0, 1, len(columns), dtype=torch.float64)
+    starts, pulls, costs = [], [], []
+    for shape in shapes:
+        rows, spread = shape.rows(left, right, columns)
+        tried = settings.displacements if shape.looseness > 0 else (0.0,)
+        for at_left, at_right in product(tried, tried):
+            displaced = at_left * (1 - share) + at_right * share
+            starts.append(rows + shape.looseness * displaced)
+            pulls.append(settings.near / spread**2)
+            costs.append(settings.near * float(displaced.square().mean()))
+    return torch.stack(starts).numpy(), torch.stack(pulls).numpy(), np.array(costs)
 
 
 def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tensor, NDArray, NDArray]:
@@ -162,13 +188,22 @@ def _valleys(grey: NDArray, width: int) -> NDArray:
     return (valley - valley.min()) / max(float(valley.std()), 1e-6)
 
 
+def _unlike(grey: Tensor, look: Tensor) -> NDArray:
+    """How little what lies round a pixel resembles the look (N,P) of the line in its column, in standard deviations."""
+    reach = look.shape[1] // 2
+    padded = torch.nn.functional.pad(grey[None, None], (0, 0, reach, reach), mode="replicate")[0, 0]
+    around = padded.unfold(0, look.shape[1], 1)
+    unlike = 1 - (unit_profiles(around) * look).sum(-1).numpy()
+    return unlike / max(float(unlike.std()), 1e-6)
+
+
 def _sweep(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
     """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
     path = path.copy()
     lines = np.arange(len(path))
     count = path.shape[1]
     row = np.arange(len(grey), dtype=np.float64)
-    outside = np.abs(row[:, None] - starts[0, [0, -1]]) > settings.loose_ends
+    outside = np.abs(row[:, None] - starts[:, None, [0, -1]]) > settings.loose_ends
     # The order is the method: a column's choice is what the next column starts from. Hence a loop, and NumPy, whose
     # small operations take a fifth of torch's time.
     for _ in range(settings.sweeps):
@@ -185,7 +220,7 @@ def _sweep(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settin
                     cost += settings.smooth * (row - path[:, n, None]) ** 2
             cost[here > limit[:, None]] += _BRIGHT
             if c in (0, count - 1):
-                cost[:, outside[:, 0 if c == 0 else 1]] += 1e9
+                cost[outside[:, :, 0 if c == 0 else 1]] += 1e9
             path[lines, c] = cost.argmin(1)
         if (path == before).all():
             break

@@ -72,6 +72,12 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
     return head.texture
 
 
+def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
+    """The picture (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
+    from its surroundings."""
+    return relief(head) if appearance == "relief" else appearance_image(head, appearance)
+
+
 def scan_landmarks(
     detector: UVLandmarkDetector,
     scan: Mesh,
@@ -100,9 +106,12 @@ def scan_landmarks(
         found = detector(image[None])
     pixels = found.pixels[0]
     points, _ = head.surface_points(scan, pixels)
-    # Lips and lids are finer than what tells a landmark from its surroundings.
-    fine = relief(head) if detector.appearance == "relief" else image
-    contours = trace_lines(fine, dict(zip(detector.names, pixels, strict=True)), trace, detector.line_shapes())
+    contours = trace_lines(
+        line_image(head, detector.appearance),
+        dict(zip(detector.names, pixels, strict=True)),
+        trace,
+        detector.line_shapes(),
+    )
     return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.hog import HogLayout, cell_map, similarity, windows
-from torchface.landmarks.line_shape import STATIONS, LineShape
+from torchface.landmarks.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.mean_shift import mean_shift
 from torchface.landmarks.smoothing import unsharp
 from torchface.landmarks.twelve import LINES, TWELVE
@@ -91,6 +91,8 @@ class UVLandmarkDetector(nn.Module):
     prior_covariance: Tensor
     noise: Tensor
     courses: Tensor
+    looks: Tensor
+    looseness: Tensor
 
     def __init__(
         self,
@@ -116,6 +118,8 @@ class UVLandmarkDetector(nn.Module):
         self.register_buffer("prior_covariance", torch.zeros(count, 2, 2))
         self.register_buffer("noise", torch.zeros(count))
         self.register_buffer("courses", torch.zeros(len(LINES), 2, STATIONS))
+        self.register_buffer("looks", torch.zeros(len(LINES), STATIONS, 2 * REACH + 1))
+        self.register_buffer("looseness", torch.zeros(count))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -144,6 +148,7 @@ class UVLandmarkDetector(nn.Module):
         settings: DetectorSettings | None = None,
         frame: FaceFrame | None = None,
         lines: Sequence[Mapping[str, Tensor]] | None = None,
+        line_images: Tensor | None = None,
         progress: Any = None,
     ) -> UVLandmarkDetector:
         """Learns from annotated images.
@@ -156,7 +161,8 @@ class UVLandmarkDetector(nn.Module):
             settings: how to match.
             frame: the frame the images were unwrapped in, kept for ``scan_landmarks``.
             lines: pixels of each image's lip and lid lines by name, (N,2) from left to right, where known:
-                tracing starts from their mean.
+                tracing starts from their mean and looks for what they look like.
+            line_images: the pictures that lines are traced in, (M,C,S,S), where they are others.
             progress: called with the number of images done and in all.
 
         Raises:
@@ -175,9 +181,8 @@ class UVLandmarkDetector(nn.Module):
         for i, cells in enumerate(maps):
             self.filters[:, i] = windows(cells - self.mean_cell[:, None, None], hog, places[i])
         self.filters[~torch.isfinite(landmarks).all(-1).T] = 0.0
-        self._fit_scores(maps, landmarks, progress)
-        self._fit_noise(maps, landmarks)
-        self._fit_courses(lines or [])
+        self._fit_noise(*self._fit_scores(maps, landmarks, progress), maps[0].shape[-1], landmarks)
+        self._fit_lines(lines or [], images if line_images is None else line_images)
         return self
 
     def forward(self, images: Tensor) -> UVLandmarks:
@@ -205,9 +210,17 @@ class UVLandmarkDetector(nn.Module):
             without: leave out the filter that comes from this training image.
         """
         scores = similarity(cells, self.filters[landmark], self.settings.hog)[0]
-        width = scores.shape[-1]
+        return self._votes(landmark, *self._best_scores(scores), scores.shape[-1], without)
+
+    def _best_scores(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        """Of score maps (M,h,w): the best of each (M,R), and their places in a row of all."""
         flat = scores.flatten(1)
-        best, place = flat.topk(min(self._kept_matches, flat.shape[1]), dim=1)
+        best = flat.topk(min(self._kept_matches, flat.shape[1]), dim=1)
+        return best.values, best.indices
+
+    def _votes(
+        self, landmark: int, best: Tensor, place: Tensor, width: int, without: int | None
+    ) -> tuple[Tensor, Tensor]:
         good = (best >= self.settings.similarity_threshold) & self._more_likely_good(landmark, best)
         if without is not None:
             good[without] = False
@@ -220,17 +233,20 @@ class UVLandmarkDetector(nn.Module):
         return max(4, round(self.settings.responses / self.settings.hog.stride**2))
 
     def _locate(self, landmark: int, cells: Tensor) -> tuple[Tensor, Tensor]:
-        best, share = self._best_cluster(landmark, cells)
+        best, share = self._best_cluster(landmark, *self.matches(landmark, cells))
+        return self._weighed(landmark, best, share), share
+
+    def _weighed(self, landmark: int, place: Tensor, share: Tensor) -> Tensor:
+        """A found place between itself and the usual one."""
         if float(share) <= 0:
-            return best, share
+            return place
         mean, covariance = self.prior_mean[landmark], self.prior_covariance[landmark]
         error = self.noise[landmark] / share * torch.eye(2, dtype=mean.dtype, device=mean.device)
         # The share of all matches is both the cluster's size and how sure it is of itself.
-        return mean + covariance @ torch.linalg.solve(covariance + error, best - mean), share
+        return mean + covariance @ torch.linalg.solve(covariance + error, place - mean)
 
-    def _best_cluster(self, landmark: int, cells: Tensor, without: int | None = None) -> tuple[Tensor, Tensor]:
-        """Centre of the best cluster, and its share of all the matches that there could be."""
-        points, votes = self.matches(landmark, cells, without)
+    def _best_cluster(self, landmark: int, points: Tensor, votes: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre of the best cluster of matches, and its share of all the matches that there could be."""
         mean, covariance = self.prior_mean[landmark], self.prior_covariance[landmark]
         if len(points) == 0:
             return mean, mean.new_zeros(())
@@ -262,11 +278,14 @@ class UVLandmarkDetector(nn.Module):
         self.prior_mean.copy_(mean)
         self.prior_covariance.copy_(covariance + _PRIOR_FLOOR**2 * torch.eye(2, dtype=covariance.dtype))
 
-    def _fit_scores(self, maps: list[Tensor], landmarks: Tensor, progress: Any) -> None:
-        """Count, sum and sum of squares of good and bad scores a filter, over the images it does not come from."""
+    def _fit_scores(self, maps: list[Tensor], landmarks: Tensor, progress: Any) -> tuple[Tensor, Tensor]:
+        """Mean and spread of good and bad scores a filter, over the images it does not come from; gives every filter's
+        best scores (M,L,M,R) in every image, and their places."""
         settings, count = self.settings, len(maps)
         sums = torch.zeros(2, len(self.names), count, 3, dtype=torch.float64)
         height, width = maps[0].shape[1:]
+        best = torch.zeros(count, len(self.names), count, min(self._kept_matches, height * width))
+        place = torch.zeros(best.shape, dtype=torch.int64)
         rows, columns = (settings.hog.positions(torch.arange(n)) for n in (height, width))
         for i, cells in enumerate(maps):
             centred = (cells - self.mean_cell[:, None, None])[None]
@@ -275,6 +294,7 @@ class UVLandmarkDetector(nn.Module):
                 if not bool(torch.isfinite(landmarks[i, k]).all()):
                     continue
                 scores = similarity(centred, self.filters[k, others], settings.hog)[0]
+                best[i, k, others], place[i, k, others] = self._best_scores(scores)
                 away = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
                 near = away <= settings.good_radius**2
                 kept = scores >= settings.similarity_threshold
@@ -291,32 +311,46 @@ class UVLandmarkDetector(nn.Module):
             table.copy_(torch.stack([mean, spread], dim=-1))
         # A filter that never matched where it should have: nothing it finds counts as good.
         self.good[..., 0][sums[0, ..., 0] == 0] = 2.0
+        return best, place
 
-    def _fit_noise(self, maps: list[Tensor], landmarks: Tensor) -> None:
-        """Squared error a coordinate, times the cluster's share: its median over images that are searched with the
-        filters of the others, and so deaf to single failures."""
-        products = torch.full((len(maps), len(self.names)), torch.nan)
-        for i, cells in enumerate(maps):
-            centred = (cells - self.mean_cell[:, None, None])[None]
-            for k in range(len(self.names)):
-                place, share = self._best_cluster(k, centred, without=i)
-                if float(share) > 0:
-                    products[i, k] = (place - landmarks[i, k]).square().sum() * share
+    def _fit_noise(self, best: Tensor, place: Tensor, width: int, landmarks: Tensor) -> None:
+        """How far off landmarks are, from images that are searched with the filters of the others: the squared error a
+        coordinate of the clusters, times their share, and the error of the rows in the end. Medians: deaf to single
+        failures."""
+        images, count = landmarks.shape[:2]
+        places, shares = self.prior_mean.repeat(images, 1, 1), torch.zeros(images, count)
+        for i in range(images):
+            for k in range(count):
+                votes = self._votes(k, best[i, k], place[i, k], width, without=i)
+                places[i, k], shares[i, k] = self._best_cluster(k, *votes)
+        products = (places - landmarks).square().sum(-1) * shares
+        products[shares <= 0] = torch.nan
         # The median of a chi-squared variable with two degrees of freedom is 2 ln 2.
         middle = products.nanmedian(0).values / (2 * math.log(2))
         self.noise.copy_(torch.nan_to_num(middle, nan=float(self.size)))
+        for i in range(images):
+            for k in range(count):
+                places[i, k] = self._weighed(k, places[i, k], shares[i, k])
+        # 1.48 medians of the absolute value are a normal variable's standard deviation.
+        self.looseness.copy_(1.48 * (places - landmarks)[..., 1].abs().nanmedian(0).values)
 
     def line_shapes(self) -> dict[str, LineShape]:
-        """How the lines usually run, those that were annotated in training."""
-        known = zip(LINES, self.courses, strict=True)
-        return {name: LineShape(offset, spread) for name, (offset, spread) in known if bool((spread > 0).all())}
+        """How the lines usually run and look, those that were annotated in training."""
+        shapes = {}
+        for row, (name, ends) in enumerate(LINES.items()):
+            offset, spread = self.courses[row]
+            if bool((spread > 0).all()) and all(end in self.names for end in ends):
+                loose = max(float(self.looseness[self.names.index(end)]) for end in ends)
+                shapes[name] = LineShape(offset, spread, loose, self.looks[row])
+        return shapes
 
-    def _fit_courses(self, lines: Sequence[Mapping[str, Tensor]]) -> None:
+    def _fit_lines(self, lines: Sequence[Mapping[str, Tensor]], images: Tensor) -> None:
         for row, name in enumerate(LINES):
-            own = [one[name] for one in lines if name in one]
-            if len(own) >= 2:
-                shape = LineShape.fit(own)
+            known = [(one[name], image) for one, image in zip(lines, images, strict=False) if name in one]
+            if len(known) >= 2:
+                shape = LineShape.fit([line for line, _ in known], [image for _, image in known])
                 self.courses[row] = torch.stack([shape.offset, shape.spread]).to(self.courses)
+                self.looks[row] = shape.profile.to(self.looks)
 
     def _raw_cells(self, images: Tensor) -> Tensor:
         sharp = unsharp(images.float(), self.settings.unsharp_sigma, self.settings.unsharp_amount)
