@@ -1,0 +1,101 @@
+"""Grey videos come back as they were written; what is no whole video is refused in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.io.video import open_video, write_video
+
+
+@pytest.fixture(scope="module")
+def frames() -> torch.Tensor:
+    return torch.randint(0, 256, (20, 60, 80), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
+def test_frames_come_back_bit_for_bit(suffix: str, frames: torch.Tensor, tmp_path: Path) -> None:
+    written = write_video(frames.split(7), tmp_path / f"a{suffix}", 60.0)
+    video = open_video(written.path)
+    assert video == written
+    assert (video.fps, video.width, video.height, video.count) == (60.0, 80, 60, 20)
+    chunks = list(video.chunks(8))
+    assert [len(chunk) for chunk in chunks] == [8, 8, 4]
+    assert torch.equal(torch.cat(chunks), frames)
+    assert torch.equal(video.frame(13), frames[13])
+    assert {path.name for path in tmp_path.iterdir()} == {f"a{suffix}"}  # no temporary file stays
+
+
+def test_floats_become_the_nearest_of_256_greys(tmp_path: Path) -> None:
+    ramp = torch.linspace(-0.1, 1.1, 64 * 48).view(48, 64)
+    video = write_video([ramp, ramp], tmp_path / "ramp.avi", 25.0)
+    assert (video.frame(1) / 255 - ramp.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_a_broken_video_is_refused(frames: torch.Tensor, tmp_path: Path) -> None:
+    path = tmp_path / "whole.avi"
+    write_video([frames], path, 60.0)
+    content = path.read_bytes()
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(content[: len(content) // 2])
+    with pytest.raises(FileFormatError, match=r"frames could be decoded, expected 20"):
+        list(open_video(cut).chunks())
+    for name, start, message in (
+        ("empty.avi", b"", "0 bytes"),
+        ("header.avi", content[:64], "cannot be opened"),
+        ("text.avi", b"this is no video, whatever its name says", "at its start"),
+        ("playlist.avi", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "at its start"),
+    ):
+        (tmp_path / name).write_bytes(start)
+        with pytest.raises(FileFormatError, match=message):
+            open_video(tmp_path / name)
+    with pytest.raises(FileFormatError, match="no such file"):
+        open_video(tmp_path / "missing_%03d.png")
+
+
+def test_damaged_bytes_end_in_an_error_or_in_frames(frames: torch.Tensor, tmp_path: Path) -> None:
+    path = tmp_path / "whole.avi"
+    write_video([frames[:4]], path, 60.0)
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    generator = np.random.default_rng(0)
+    read = 0
+    for _ in range(60):
+        damaged = content.copy()
+        places = generator.integers(0, len(damaged), 8)
+        places[:4] = generator.integers(0, 400, 4)  # the headers
+        damaged[places] = generator.integers(0, 256, 8)
+        (tmp_path / "damaged.avi").write_bytes(damaged.tobytes())
+        try:
+            for chunk in open_video(tmp_path / "damaged.avi").chunks():
+                assert chunk.dtype == torch.uint8
+                read += 1
+        except FileFormatError:
+            pass
+    assert read > 5
+
+
+def test_what_cannot_be_written_is_said(frames: torch.Tensor, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="ending"):
+        write_video([frames], tmp_path / "a.gif", 60.0)
+    with pytest.raises(ShapeError, match="no frame"):
+        write_video([], tmp_path / "a.avi", 60.0)
+    with pytest.raises(ShapeError, match="as the first"):
+        write_video([frames, frames[:, :30]], tmp_path / "a.avi", 60.0)
+    with pytest.raises(ValueRangeError, match="fps"):
+        write_video([frames], tmp_path / "a.avi", float("nan"))
+    with pytest.raises(FileFormatError, match="cannot be written"):
+        write_video([frames], tmp_path / "missing" / "a.avi", 60.0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.real
+def test_a_real_video_is_read_whole(data: Path) -> None:
+    video = open_video(data / "video" / "single_face.mp4")
+    assert (video.width, video.height, video.count) == (640, 360, 72)
+    frames = torch.cat(list(video.chunks(32)))
+    assert frames.shape == (72, 360, 640)
+    assert 0.1 < (frames / 255).mean() < 0.9
