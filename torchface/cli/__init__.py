@@ -19,6 +19,7 @@ from torchface.cli.pick import pick
 from torchface.cli.progress import console
 from torchface.cli.register import register
 from torchface.cli.render import render
+from torchface.cli.retarget import retarget
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
 from torchface.cli.transfer import transfer
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "rig": rig,
     "transfer": transfer,
     "solve": solve,
+    "retarget": retarget,
     "render": render,
     "info": info,
     "view": view,

@@ -1,0 +1,49 @@
+"""``torchface retarget``: one rig's weights on another rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import console, steps
+
+_MOST_NAMES = 12
+
+
+def retarget(
+    weights: Annotated[Positional[Path], arg(metavar="WEIGHTS")],
+    to: Path,
+    from_: Annotated[Path | None, arg(name="from")] = None,
+    table: Path | None = None,
+    out: Path = Path("out/retargeted.csv"),
+    animation: Path | None = None,
+    part: str | None = None,
+    quiet: bool = False,
+) -> None:
+    """Carry weights over to another rig by what its shapes are called, or by a table.
+
+    Args:
+        weights: Live Link Face CSV, or frame,time,<shape>,...
+        to: The rig that shall move: .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        from_: The rig that the weights were solved on; its shapes must all be known to the table or by name. Without
+            it the names in WEIGHTS are taken as they are.
+        table: Mapping table, TOML: a [shape] of the target rig each, with sum = {source = factor} and/or
+            product = [sources], and gain, lower, upper.
+        out: The weights to write: CSV with the target's shape names.
+        animation: Also write the target rig with this animation as .glb.
+        part: Keep this region of the target rig only, such as face.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.retarget import retarget_weights
+
+    with steps(quiet) as step:
+        done = retarget_weights(weights, to, from_, table, out, animation, part, step)
+    driven = len(done.shapes.to_names) - len(done.shapes.still)
+    console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
+    for what, names in (("nothing drives", done.shapes.still), ("drives nothing:", done.shapes.unused)):
+        if names:
+            more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+            console.print(f"{what} {', '.join(names[:_MOST_NAMES])}{more}", highlight=False)
+    print(out)
