@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.geometry.contact import ContactFinder
 from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Annotations, Mesh
-from torchface.modeling.contact import ContactFinder
 from torchface.modeling.seams import find_seams
 from torchface.modeling.transfer import transfer_with_report
 from torchface.rig import BlendshapeRig
@@ -83,7 +83,7 @@ def lips() -> BlendshapeRig:
 
 def test_the_finder_pairs_the_rims_of_a_closed_slit_and_nothing_else() -> None:
     rig = lids()
-    finder = ContactFinder(rig.neutral)
+    finder = ContactFinder(rig.neutral.faces, len(rig.vertices))
     assert len(finder.find(rig.vertices, 1.5).pairs) == 0
     found = finder.find(rig.vertices + rig.deltas[0], 1.5)
     rows = found.pairs // COLUMNS
@@ -136,14 +136,15 @@ def test_named_contacts_are_used_instead_of_searched_ones() -> None:
     columns = torch.arange(10, 21)
     named = torch.stack([front * COLUMNS + columns, (ROWS - 1 - front) * COLUMNS + columns.flip(0)], dim=1)
     mesh = replace(rig.neutral, annotations=Annotations(contacts=named))
-    found = ContactFinder(mesh).find(mesh.vertices + rig.deltas[0], 1.5)
+    finder = ContactFinder(mesh.faces, len(mesh.vertices), named)
+    found = finder.find(mesh.vertices + rig.deltas[0], 1.5)
     assert bool(torch.isin(found.pairs[:, 0], named[:, 0]).all())
     assert bool(torch.isin(found.pairs[:, 1], named[:, 1]).all())
     # The partner is who lies opposite in the pose, not who was named in the same row.
     assert bool((found.pairs[:, 0] % COLUMNS == found.pairs[:, 1] % COLUMNS).all())
     target = mesh.with_vertices(slit(13.0))
     result = transfer_with_report(BlendshapeRig(mesh, rig.deltas, rig.names), target)
-    assert result.report.contacts["shut"] == len(ContactFinder(mesh).find(mesh.vertices + rig.deltas[0], 3.0).pairs)
+    assert result.report.contacts["shut"] == len(finder.find(mesh.vertices + rig.deltas[0], 3.0).pairs)
 
 
 def test_lips_of_another_mouth_open_and_close_by_as_much() -> None:
@@ -163,7 +164,8 @@ def test_lips_of_another_mouth_open_and_close_by_as_much() -> None:
 def test_the_lids_of_random_heads_close(ict_folder: Path) -> None:
     rig = load_ict_facekit(ict_folder, ["eyeBlink_L"], part="face")
     modes = load_identity_modes(ict_folder, part="face")
-    template = ContactFinder(rig.neutral).find(rig.vertices + rig.deltas[0], 1.0, rig.deltas[0].norm(dim=-1) > 1.0)
+    finder = ContactFinder(rig.neutral.faces, len(rig.vertices))
+    template = finder.find(rig.vertices + rig.deltas[0], 1.0, rig.deltas[0].norm(dim=-1) > 1.0)
     apart = (rig.vertices[template.pairs[:, 0]] - rig.vertices[template.pairs[:, 1]]).norm(dim=-1)
     upper, lower = template.pairs[apart > 4].T
     assert len(upper) > 15

@@ -10,8 +10,8 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from torchface.geometry.contact import ContactFinder, ContactPairs
 from torchface.geometry.operators import edges, vertex_normals
-from torchface.modeling.contact import ContactFinder, ContactPairs
 from torchface.rig import BlendshapeRig
 
 REST_REACH = 1.5
@@ -55,7 +55,8 @@ def find_seams(rig: BlendshapeRig, moving: Tensor) -> Seams:
     """
     neutral = rig.neutral
     vertices, deltas = neutral.vertices.detach().double().cpu(), rig.deltas.detach().double().cpu()
-    finder = ContactFinder(neutral)
+    named = None if neutral.annotations is None else neutral.annotations.contacts
+    finder = ContactFinder(neutral.faces, len(vertices), named)
     rest = finder.find(vertices, REST_REACH)
     # Across the corner of an eye the two lids are only a few edges apart.
     posed = [
