@@ -31,8 +31,8 @@ def skin_texture(size: int = 1024) -> Tensor:
     Args:
         size: pixels a side.
     """
-    covered, points, marks = _texels(size)
-    color = _paint(points, marks)
+    covered, values = texel_values(size, torch.cat([mean_vertices().float(), _vertex_marks()], dim=1))
+    color = _paint(values[:, :3], values[:, 3:])
     image = torch.zeros(size * size, 3)
     image[covered] = color
     # What no triangle covers repeats its nearest neighbour, so that no border colour bleeds in.
@@ -41,8 +41,8 @@ def skin_texture(size: int = 1024) -> Tensor:
     return image.permute(2, 0, 1).contiguous()
 
 
-def _texels(size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Which texels a triangle covers (size²,), and for those the mean head's point (N,3) and marks (N,8)."""
+def texel_values(size: int, table: Tensor) -> tuple[Tensor, Tensor]:
+    """Which texels a triangle covers (size²,), and for those the values (N,C) of a table (V,C) of the vertices."""
     flat, t = unwrapping(), topology()
     uv_faces, faces = fan_triangulation(flat.quads), fan_triangulation(t.quads)
     page = torch.cat([flat.uvs.double() * size, torch.zeros(len(flat.uvs), 1, dtype=torch.float64)], dim=1)
@@ -52,9 +52,7 @@ def _texels(size: int) -> tuple[Tensor, Tensor, Tensor]:
     hits = RayCaster(page, uv_faces).cast(starts, torch.tensor([0.0, 0.0, -1.0]).double().expand_as(starts))
     covered = hits.triangle >= 0
     corners, barycentric = faces[hits.triangle[covered]], hits.barycentric[covered].float()
-    table = torch.cat([mean_vertices().float(), _vertex_marks()], dim=1)
-    values = (table[corners] * barycentric[..., None]).sum(1)
-    return covered, values[:, :3], values[:, 3:]
+    return covered, (table[corners] * barycentric[..., None]).sum(1)
 
 
 def _vertex_marks() -> Tensor:
