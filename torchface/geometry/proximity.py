@@ -132,23 +132,7 @@ class SurfaceIndex:
         ap = queries.T - a
         d1, d2 = _dot(ab, ap), _dot(ac, ap)
         ab2, ac2, abac = _dot(ab, ab), _dot(ac, ac), _dot(ab, ac)
-        determinant = ab2 * ac2 - abac * abac
-        v, w = ac2 * d1 - abac * d2, ab2 * d2 - abac * d1
-        inside = (v >= 0) & (w >= 0) & (v + w <= determinant) & (determinant > 1e-14 * ab2 * ac2)
-        # Outside, the nearest point lies on one of three edges: the best of the three projections. How good v and w
-        # are is told up to the constant |ap|².
-        on_ab = (d1 / ab2.clamp(min=_TINY)).clamp(0, 1)
-        on_ac = (d2 / ac2.clamp(min=_TINY)).clamp(0, 1)
-        on_bc = ((d2 - d1 + ab2 - abac) / (ab2 + ac2 - 2 * abac).clamp(min=_TINY)).clamp(0, 1)
-        along_ab = on_ab * (on_ab * ab2 - 2 * d1)
-        along_ac = on_ac * (on_ac * ac2 - 2 * d2)
-        rest = 1 - on_bc
-        along_bc = rest * (rest * ab2 - 2 * d1) + on_bc * (on_bc * ac2 - 2 * d2) + 2 * rest * on_bc * abac
-        safe = torch.where(inside, determinant, 1.0)
-        on_bc_best = along_bc < torch.minimum(along_ab, along_ac)
-        ab_best = along_ab <= along_ac
-        v = torch.where(inside, v / safe, torch.where(on_bc_best, rest, torch.where(ab_best, on_ab, 0.0)))
-        w = torch.where(inside, w / safe, torch.where(on_bc_best, on_bc, torch.where(ab_best, 0.0, on_ac)))
+        v, w = triangle_coordinates(ab2, ac2, abac, d1, d2)
         left = ap - v * ab - w * ac
         return v, w, _dot(left, left)
 
@@ -171,6 +155,38 @@ class SurfaceIndex:
         at_edge = (surface.barycentric < _ON_EDGE) & edge[surface.triangle]
         at_vertex = (surface.barycentric > 1 - _ON_EDGE) & vertex[surface.triangle]
         return (at_edge | at_vertex).any(-1)
+
+
+def triangle_coordinates(ab2: Tensor, ac2: Tensor, abac: Tensor, d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
+    r"""The nearest point :math:`a + v\,ab + w\,ac` of a triangle, from inner products alone.
+
+    The triangle may lie in a space of any dimension.
+
+    Args:
+        ab2, ac2, abac: :math:`ab \cdot ab,\ ac \cdot ac,\ ab \cdot ac` of its edges, any shape.
+        d1, d2: :math:`ab \cdot (p - a)` and :math:`ac \cdot (p - a)` of the query p.
+
+    Returns:
+        v and w, each of that shape.
+    """
+    determinant = ab2 * ac2 - abac * abac
+    v, w = ac2 * d1 - abac * d2, ab2 * d2 - abac * d1
+    inside = (v >= 0) & (w >= 0) & (v + w <= determinant) & (determinant > 1e-14 * ab2 * ac2)
+    # Outside, the nearest point lies on one of three edges: the best of the three projections. How good v and w
+    # are is told up to the constant |ap|².
+    on_ab = (d1 / ab2.clamp(min=_TINY)).clamp(0, 1)
+    on_ac = (d2 / ac2.clamp(min=_TINY)).clamp(0, 1)
+    on_bc = ((d2 - d1 + ab2 - abac) / (ab2 + ac2 - 2 * abac).clamp(min=_TINY)).clamp(0, 1)
+    along_ab = on_ab * (on_ab * ab2 - 2 * d1)
+    along_ac = on_ac * (on_ac * ac2 - 2 * d2)
+    rest = 1 - on_bc
+    along_bc = rest * (rest * ab2 - 2 * d1) + on_bc * (on_bc * ac2 - 2 * d2) + 2 * rest * on_bc * abac
+    safe = torch.where(inside, determinant, 1.0)
+    on_bc_best = along_bc < torch.minimum(along_ab, along_ac)
+    ab_best = along_ab <= along_ac
+    v = torch.where(inside, v / safe, torch.where(on_bc_best, rest, torch.where(ab_best, on_ab, 0.0)))
+    w = torch.where(inside, w / safe, torch.where(on_bc_best, on_bc, torch.where(ab_best, 0.0, on_ac)))
+    return v, w
 
 
 def _cover(a: Tensor, ab: Tensor, ac: Tensor) -> tuple[Tensor, Tensor, Tensor]:
