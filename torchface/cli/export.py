@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from torchface.cli.progress import console, steps
+
+if TYPE_CHECKING:
+    from torchface.onnx import SolverReport
 
 
 def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: bool = False) -> None:
@@ -24,15 +29,40 @@ def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quie
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
+    from torchface.onnx import export_solver
+
+    _write_solver(export_solver, rig, attachment, out, part, quiet)
+
+
+def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: bool = False) -> None:
+    """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
+
+    As `torchface export solver`, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
+    `gamma` (B,N), how much that counts (0 to 4; 0 leaves a frame to its markers).
+
+    Args:
+        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        attachment: Where the markers sit, as JSON.
+        out: The .onnx file to write.
+        part: Keep this region of the rig only, such as face.
+        quiet: Show no progress.
+    """
+    from torchface.onnx import export_hybrid_solver
+
+    _write_solver(export_hybrid_solver, rig, attachment, out, part, quiet)
+
+
+def _write_solver(
+    export: Callable[..., SolverReport], rig: Path, attachment: Path, out: Path, part: str | None, quiet: bool
+) -> None:
     from torchface.attachment import Attachment
     from torchface.io import load_rig
-    from torchface.onnx import export_solver
 
     with steps(quiet) as step:
         step("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
         step("exporting and checking")
-        report = export_solver(loaded, where, out)
+        report = export(loaded, where, out)
     table = Table(show_header=False)
     for row in report.rows():
         table.add_row(*row)
@@ -40,4 +70,4 @@ def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quie
     print(out)
 
 
-EXPORTS = {"solver": solver}
+EXPORTS = {"solver": solver, "hybrid-solver": hybrid_solver}

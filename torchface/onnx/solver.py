@@ -52,6 +52,8 @@ class SolverGraph(nn.Module):
     Source: thesis 4.1.4.
     """
 
+    inputs: tuple[str, ...] = ("markers", "previous")
+
     rest: Tensor
     rows: Tensor
     price: Tensor
@@ -139,14 +141,21 @@ class SolverGraph(nn.Module):
         gradient = torch.addmm(self.price, distance, self.rows) + self.double_ridge * w
         return torch.addmm(torch.addmm((RELAXATION - 1) * w, w, -self.step), gradient, self.offset)
 
-    def _with_gaps(self, offset: Tensor, missing: Tensor, z: Tensor) -> Tensor:
+    def _with_gaps(
+        self, offset: Tensor, missing: Tensor, z: Tensor, pull: Tensor | None = None, target: Tensor | None = None
+    ) -> Tensor:
+        """Frames with an H of their own: markers (B,M,1) are missing, or weights are pulled (B,N) to targets (B,N)."""
         identity = torch.eye(len(self.names), dtype=z.dtype, device=z.device)
         seen = 1 - missing.to(offset)  # (B,M,1)
         share = seen.mean(1, keepdim=True)  # (B,1,1)
         known = torch.where(missing, 0.0, offset).flatten(1)[:, None]  # (B,1,3M)
         seen = seen.expand_as(offset).flatten(1)[:, None]
         kept = seen.transpose(1, 2) * self.rows  # (B,3M,N)
-        H = self.gram_scale * (kept.transpose(1, 2) @ self.rows) + (self.double_ridge * identity) * share
+        ridge = z.new_full((1, 1, len(self.names)), self.double_ridge)
+        price = self.price
+        if pull is not None and target is not None:
+            ridge, price = ridge + pull[:, None], price - (pull * target)[:, None]
+        H = self.gram_scale * (kept.transpose(1, 2) @ self.rows) + (ridge * identity) * share
         diagonal = (H * identity).sum(1, keepdim=True)  # (B,1,N)
         diagonal = diagonal.clamp(min=self.smallest_diagonal)
         scale = diagonal.rsqrt()
@@ -161,7 +170,7 @@ class SolverGraph(nn.Module):
         for steps in stretches(self.steps_with_gaps):
             w = z
             distance = (known + self.gram_scale * (w @ self.rows.T)) * seen
-            gradient = distance @ self.rows + share * (self.price + self.double_ridge * w)
+            gradient = distance @ self.rows + share * (price + ridge * w)
             constant = gradient @ offset + w @ minus_step + (RELAXATION - 1) * w
             for _ in range(steps):
                 v = constant + v @ minus_step + z @ double_step

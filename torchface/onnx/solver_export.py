@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture.markers.hybrid import GAMMA, HybridSolver
 from torchface.capture.markers.solve import RIDGE, SPARSITY, MarkerSolver
 from torchface.errors import ValueRangeError
 from torchface.files import write_file
 from torchface.geometry.alignment import Similarity
+from torchface.onnx.hybrid import HybridGraph
 from torchface.onnx.solver import STEPS, STEPS_WITH_GAPS, SolverGraph
 from torchface.onnx.solver_model import solver_model
 from torchface.rig import BlendshapeRig
@@ -126,9 +128,49 @@ def export_solver(
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
     graph = SolverGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    return _export(graph, solver, frames, (), path)
+
+
+def export_hybrid_solver(
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    path: str | Path,
+    alignment: Similarity | None = None,
+    sparsity: float = SPARSITY,
+    ridge: float = RIDGE,
+    steps: int = STEPS,
+    steps_with_gaps: int = STEPS_WITH_GAPS,
+    markers: Tensor | None = None,
+) -> SolverReport:
+    """Writes the hybrid solve of one rig and layout as ONNX, and checks it.
+
+    The graph has two inputs more than :func:`export_solver`'s: ``predicted`` (B,N), the weights that a classifier
+    says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
+    computes what the other graph does. It is checked with random predictions for a seventh of the weights.
+
+    Args, Raises: as :func:`export_solver`.
+    """
+    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
+    frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
+    graph = HybridGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    generator = torch.Generator().manual_seed(1)
+    shape = (len(frames), len(solver.names))
+    predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
+    gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
+    return _export(graph, HybridSolver(solver), frames, (predicted, gamma), path)
+
+
+def _export(
+    graph: SolverGraph,
+    solver: MarkerSolver | HybridSolver,
+    frames: Tensor,
+    more: tuple[Tensor, ...],
+    path: str | Path,
+) -> SolverReport:
+    """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
     model = solver_model(graph)
     session = _session(model)
-    gaps = tuple(_gap(session, graph, solver, frames, missing) for missing in (0.0, 0.1, 0.3))
+    gaps = tuple(_gap(session, graph, solver, frames, more, missing) for missing in (0.0, 0.1, 0.3))
     for gap in gaps:
         allowed = max(_PARITY, _ROUNDINGS * gap.rounding)
         if not gap.parity <= allowed:
@@ -142,11 +184,11 @@ def export_solver(
         path,
         len(content),
         graph.rho,
-        steps,
-        steps_with_gaps,
+        graph.steps,
+        graph.steps_with_gaps,
         gaps,
-        _milliseconds(session, frames),
-        _milliseconds(session, hide_markers(frames, 0.3)),
+        _milliseconds(session, frames, more),
+        _milliseconds(session, hide_markers(frames, 0.3), more),
     )
 
 
@@ -194,36 +236,44 @@ def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
-def _run(session: onnxruntime.InferenceSession, markers: Tensor, previous: Tensor) -> Tensor:
-    (weights,) = session.run(None, {"markers": markers.numpy(), "previous": previous.numpy()})
+def _run(session: onnxruntime.InferenceSession, markers: Tensor, previous: Tensor, more: tuple[Tensor, ...]) -> Tensor:
+    names = (entry.name for entry in session.get_inputs())
+    inputs = zip(names, (markers, previous, *more), strict=True)
+    (weights,) = session.run(None, {name: value.numpy() for name, value in inputs})
     return torch.from_numpy(np.asarray(weights))
 
 
 def _gap(
-    session: onnxruntime.InferenceSession, graph: SolverGraph, solver: MarkerSolver, frames: Tensor, missing: float
+    session: onnxruntime.InferenceSession,
+    graph: SolverGraph,
+    solver: MarkerSolver | HybridSolver,
+    frames: Tensor,
+    more: tuple[Tensor, ...],
+    missing: float,
 ) -> SolverGap:
     """Cold and, from the weights of the frame before, warm: the worse of the two."""
     markers = hide_markers(frames, missing)
     exact = copy.deepcopy(solver).double()
-    energy = exact.energy(markers.double())
-    optimum = exact(markers.double())
+    precise_more = tuple(value.double() for value in more)
+    energy = exact.energy(markers.double(), *precise_more)
+    optimum = exact(markers.double(), *precise_more)
     least = energy.value(optimum)
     starts = (torch.zeros_like(optimum).float(), optimum.roll(1, 0).float())
-    solved = [_run(session, markers, start) for start in starts]
-    here = [graph(markers, start) for start in starts]
+    solved = [_run(session, markers, start, more) for start in starts]
+    here = [graph(markers, start, *more) for start in starts]
     parity = max(float((own - weights).abs().max()) for own, weights in zip(here, solved, strict=True))
     double = copy.deepcopy(graph).double()
-    precise = [double(markers.double(), start.double()) for start in starts]
+    precise = [double(markers.double(), start.double(), *precise_more) for start in starts]
     rounding = max(float((own - weights).abs().max()) for own, weights in zip(here, precise, strict=True))
     gaps = torch.stack([(energy.value(weights.double()) - least) / least for weights in solved])
     return SolverGap(missing, float(gaps.max()), float(gaps.median()), parity, rounding)
 
 
-def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor) -> float:
+def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor, more: tuple[Tensor, ...]) -> float:
     previous = torch.zeros(1, session.get_inputs()[1].shape[1])
     times = []
-    for frame in frames.split(1):
+    for frame, *others in zip(frames.split(1), *(value.split(1) for value in more), strict=True):
         begin = time.perf_counter()
-        previous = _run(session, frame, previous)
+        previous = _run(session, frame, previous, tuple(others))
         times.append(time.perf_counter() - begin)
     return 1000 * float(np.median(times))

@@ -7,6 +7,7 @@ import torch
 
 from torchface import __version__
 from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.hybrid import HybridGraph
 from torchface.onnx.solver import NEWTON_START, SolverGraph, stretches
 from torchface.optim.splitting import RELAXATION
 
@@ -14,8 +15,8 @@ from torchface.optim.splitting import RELAXATION
 def solver_model(graph: SolverGraph) -> onnx.ModelProto:
     """The graph as ONNX: plain operators, two branches of unrolled steps under one ``If``.
 
-    Built node by node: at batch 1 the number of nodes is what costs, and a step needs only three (two products and a
-    clamp) where a traced graph has six.
+    A ``HybridGraph`` has two inputs more. Built node by node: at batch 1 the number of nodes is what costs, and a step
+    needs only three (two products and a clamp) where a traced graph has six.
     """
     markers, shapes = len(graph.labels), len(graph.names)
     build = GraphBuilder()
@@ -31,21 +32,27 @@ def solver_model(graph: SolverGraph) -> onnx.ModelProto:
     offset = build.op("Sub", "rest", "markers")
     missing = build.op("IsNaN", offset)
     gone = build.op("ReduceMax", build.op("Cast", missing, to=onnx.TensorProto.FLOAT), axes=[2], keepdims=1)
-    any_gone = build.op("Cast", build.op("ReduceMax", gone, keepdims=0), to=onnx.TensorProto.BOOL)
+    own = build.op("ReduceMax", gone, keepdims=0)
+    hybrid, pull, target = isinstance(graph, HybridGraph), None, None
+    if hybrid:
+        pull = build.op("Mul", "gamma", build.constant("pull_scale", 2 / markers))
+        led = build.op("Greater", pull, "zero")
+        target = build.op("Where", led, build.op("Clip", "predicted", "zero", "one"), "zero")
+        own = build.op("Max", own, build.op("ReduceMax", build.op("Cast", led, to=onnx.TensorProto.FLOAT), keepdims=0))
     start = build.op("Clip", "previous", "zero", "one")
     build.op(
         "If",
-        any_gone,
-        then_branch=_gaps_branch(build, graph, offset, gone, start),
+        build.op("Cast", own, to=onnx.TensorProto.BOOL),
+        then_branch=_gaps_branch(build, graph, offset, gone, start, pull, target),
         else_branch=_complete_branch(build, graph, offset, start),
         output="weights",
     )
     return build.model(
-        "marker_solver",
-        {"markers": ("batch", markers, 3), "previous": ("batch", shapes)},
+        "hybrid_solver" if hybrid else "marker_solver",
+        {name: ("batch", shapes) if name != "markers" else ("batch", markers, 3) for name in graph.inputs},
         {"weights": ("batch", shapes)},
         {
-            "task": "solver",
+            "task": "hybrid_solver" if hybrid else "solver",
             "shape_names": list(graph.names),
             "marker_labels": list(graph.labels),
             "units": "millimetres",
@@ -78,7 +85,15 @@ def _constant(build: GraphBuilder, w: str, gradient: str) -> str:
     return build.op("Gemm", gradient, "offset", back)
 
 
-def _gaps_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, gone: str, start: str) -> onnx.GraphProto:
+def _gaps_branch(
+    parent: GraphBuilder,
+    graph: SolverGraph,
+    offset: str,
+    gone: str,
+    start: str,
+    pull: str | None,
+    target: str | None,
+) -> onnx.GraphProto:
     build = GraphBuilder(parent)
     shapes = len(graph.names)
     for name, value in (
@@ -108,7 +123,11 @@ def _gaps_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, gone: st
     seen = op("Reshape", op("Expand", seen, "three"), "wide")
     basis = op("Transpose", "rows", perm=[1, 0])
     H = op("Mul", op("MatMul", op("Mul", seen, basis), "rows"), "gram_scale")
-    H = op("Add", H, op("Mul", op("Mul", "double_ridge", "identity"), share))
+    ridge, first_price = "double_ridge", "price"
+    if pull is not None and target is not None:
+        ridge = op("Reshape", op("Add", pull, "double_ridge"), "vector")
+        first_price = op("Sub", "price", op("Reshape", op("Mul", pull, target), "vector"))
+    H = op("Add", H, op("Mul", op("Mul", ridge, "identity"), share))
     diagonal = op("ReduceMax", op("Mul", H, "identity"), axes=[1], keepdims=1)
     diagonal = op("Max", diagonal, "smallest")
     scale = op("Div", "one", op("Sqrt", diagonal))
@@ -125,7 +144,7 @@ def _gaps_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, gone: st
     z = v = op("Reshape", start, "vector")
     for steps in stretches(graph.steps_with_gaps):
         distance = op("Add", known, op("Mul", op("MatMul", z, basis), "gram_scale"))
-        price = op("Mul", share, op("Add", "price", op("Mul", z, "double_ridge")))
+        price = op("Mul", share, op("Add", first_price, op("Mul", z, ridge)))
         gradient = op("Add", op("MatMul", op("Mul", distance, seen), "rows"), price)
         back = op("Add", op("MatMul", z, minus_step), op("Mul", z, "relaxation_less_one"))
         constant = op("Add", op("MatMul", gradient, inverse), back)
