@@ -1,0 +1,45 @@
+"""A take goes out frame by frame in its own time."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+import torch
+
+from torchface import BlendshapeRig
+from torchface.capture import MarkerSolver
+from torchface.errors import ValueRangeError
+from torchface.io.live_link_stream import decode_frame
+from torchface.onnx.live import LiveMarkerSolver
+from torchface.onnx.solver_export import random_frames
+from torchface.shape_names import ARKIT
+from torchface.synthetic.marker_stage import place_markers
+from torchface.workflows.stream import stream_markers
+
+
+def test_what_arrives_is_what_was_solved_in_time(dome_rig: BlendshapeRig) -> None:
+    solver = MarkerSolver(dome_rig, place_markers(dome_rig, 30))
+    markers = random_frames(solver, 20)
+    now = [100.0]
+
+    def wait(seconds: float) -> None:
+        now[0] += seconds
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        address = f"udp://127.0.0.1:{receiver.getsockname()[1]}"
+        report = stream_markers(LiveMarkerSolver(solver), markers, 60.0, address, lambda: now[0], wait)
+        frames = [decode_frame(receiver.recv(2048)) for _ in range(20)]
+    assert [frame.frame for frame in frames] == list(range(20))
+    assert now[0] == pytest.approx(100 + 19 / 60)
+    jaw = torch.stack([frame.weights[ARKIT.index("jawOpen")] for frame in frames])
+    assert torch.equal(jaw, report.weights[:, dome_rig.names.index("jawOpen")])
+    torch.testing.assert_close(report.weights, solver(markers), rtol=0, atol=2e-3)
+
+
+def test_no_frames(dome_rig: BlendshapeRig) -> None:
+    live = LiveMarkerSolver(MarkerSolver(dome_rig, place_markers(dome_rig, 30)))
+    with pytest.raises(ValueRangeError, match="no frame"):
+        stream_markers(live, [], 60.0, "udp://127.0.0.1:11111")
