@@ -16,6 +16,7 @@ from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
 from torchface.registration.correspondence import evenly_spread, exposed_vertices
 from torchface.registration.deformer import Deformer, LandmarkPull
+from torchface.registration.model_start import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
 from torchface.registration.preparation import (
     Landmarks,
     PreparedScan,
@@ -48,6 +49,7 @@ class Registration:
         distance: of each vertex to the scan, (V,) float64, millimetres; beyond 10 mm it may be a little too long.
         matched: which vertices' places the scan tells, (V,) bool; the others follow their neighbours.
         record: what was done.
+        coefficients: of the model that the registration started from, (K,), where one was given.
     """
 
     mesh: Mesh
@@ -55,6 +57,7 @@ class Registration:
     distance: Tensor
     matched: Tensor
     record: RegistrationRecord
+    coefficients: Tensor | None = None
 
 
 def register(
@@ -63,6 +66,7 @@ def register(
     landmarks: Landmarks | None = None,
     *,
     detector: Detector | None = None,
+    model: ShapeModel | HasShape | None = None,
     schedule: Schedule = DEFAULT_SCHEDULE,
     texture_size: int = 1024,
     progress: Callable[[str], None] | None = None,
@@ -83,6 +87,9 @@ def register(
         scan: millimetres; any topology and pose, with holes, hair, collar, crumbs, either side out.
         landmarks: template vertex ids (L,) int64 and scan points (L,3); at least three, NaN rows are skipped.
         detector: asked for landmarks where none are given, once the template lies on the scan.
+        model: of faces in the template's topology (a ``MorphableModel`` or ``HeadModel``). It is fitted to the scan
+            first and the template bends from there: what the model knows no longer slides along the surface. The
+            schedule's first stage, which does the same roughly, is left out.
         schedule: which steps, see ``Schedule``.
         texture_size: texels a side of the texture that is made where the scan has colours and the template
             texture coordinates; 0 makes none.
@@ -93,7 +100,7 @@ def register(
 
     Raises:
         ShapeError: landmarks of the wrong shape, or fewer than three that can be used.
-        TopologyError: an empty or tiny mesh, or a landmark on no vertex of the template.
+        TopologyError: an empty or tiny mesh, a landmark on no vertex of the template, or a model of another topology.
         ValueRangeError: another unit than millimetres, landmarks on a line, or a scan that does not show the face.
         AlignmentError: the landmarks do not fit, or no pose is found without them.
 
@@ -103,28 +110,29 @@ def register(
     if texture_size < 0 or texture_size > 16384:
         raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")
     check_template(template)
+    shape = None if model is None else shape_model(model, template)
     say("checking the scan")
     prepared = prepare_scan(scan, template)
     say("laying the template on the scan")
     start = _start(template, scan, prepared, landmarks, detector, schedule)
-    deformer = Deformer(
-        start.pose.apply(template.vertices.detach().cpu().double())[0],
-        template.faces.cpu(),
-        start.surface,
-        start.pull,
-        schedule,
-    )
+    laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
+    fit, stages_left = None, schedule.stages
+    if shape is not None:
+        say("fitting the model")
+        fit = _model_fit(shape, template, laid, start, schedule)
+        laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
+    deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, schedule)
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
-    for number, stage in enumerate(schedule.stages, 1):
-        say(f"bending, stage {number} of {len(schedule.stages)}")
+    for number, stage in enumerate(stages_left, 1):
+        say(f"bending, stage {number} of {len(stages_left)}")
         stages.append(deformer.run(stage, number))
     say("measuring")
     nearest = _nearest(start.surface, deformer.current)
     matched = _matched(deformer, start.surface, nearest, schedule)
     vertices = deformer.current.to(template.vertices)
     mesh = replace(template, vertices=vertices, colors=None, texture=None)
-    notes = [*start.notes, *_final_notes(template, scan, deformer, texture_size)]
+    notes = [*start.notes, *_model_notes(fit), *_final_notes(template, scan, deformer, texture_size)]
     if has_colors(scan):
         say("resampling the scan's colours")
         mesh = _colored(mesh, ScanColors(scan, *_surface_parts(start.prepared)), nearest, matched, texture_size)
@@ -138,7 +146,8 @@ def register(
         time.perf_counter() - begin,
     )
     device = template.vertices.device
-    return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record)
+    coefficients = None if fit is None else fit.coefficients.to(template.vertices)
+    return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +191,20 @@ def _start(
     targets = ScanPoints(prepared.vertices, prepared.faces)
     pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
     return _Start(by, pose, LandmarkPull(ids, points), prepared, surface, (*prepared.notes, *notes))
+
+
+def _model_fit(model: ShapeModel, template: Mesh, laid: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
+    faces = template.faces.cpu()
+    exposed = exposed_vertices(laid, faces, schedule.opening).nonzero()[:, 0]
+    landmarks = (start.pull.vertices, start.pull.points)
+    return fit_to_scan(model, faces, laid, exposed, start.surface, landmarks, schedule.largest_angle)
+
+
+def _model_notes(fit: ModelFit | None) -> list[str]:
+    if fit is None:
+        return []
+    far = float(fit.coefficients.abs().max())
+    return [f"the model comes to {fit.noise:.2f} mm (robust deviation) of the scan, {far:.1f} standard deviations off"]
 
 
 def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
