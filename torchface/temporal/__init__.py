@@ -1,5 +1,17 @@
 """What time does to signals: smoothing and filtering along frames."""
 
+from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
+from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
 from torchface.temporal.smoothing import savitzky_golay
 
-__all__ = ["savitzky_golay"]
+__all__ = [
+    "KalmanFilter",
+    "KalmanSettings",
+    "RotationFilter",
+    "estimate_settings",
+    "filter_rotations",
+    "kalman_filter",
+    "kalman_smoother",
+    "savitzky_golay",
+    "smooth_rotations",
+]

@@ -1,0 +1,154 @@
+"""Kalman filters: the optimum that linear algebra gives, less jitter, no lag, gaps bridged, valid rotations."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.temporal import (
+    KalmanFilter,
+    KalmanSettings,
+    estimate_settings,
+    filter_rotations,
+    kalman_filter,
+    kalman_smoother,
+    smooth_rotations,
+)
+
+
+def head_motion(frames: int = 400, channels: int = 20) -> Tensor:
+    """Pixels of points on a head that turns and nods, 30 frames a second."""
+    generator = torch.Generator().manual_seed(0)
+    time = torch.arange(frames, dtype=torch.float64)[:, None] / 30
+    swing = 40 * torch.rand(1, channels, generator=generator, dtype=torch.float64) + 10
+    phase = 6.3 * torch.rand(1, channels, generator=generator, dtype=torch.float64)
+    return 320 + swing * (2 * math.pi * 0.4 * time + phase).sin() + 0.1 * swing * (2 * math.pi * 0.9 * time).cos()
+
+
+def measured(truth: Tensor, noise: float = 1.5) -> Tensor:
+    return truth + noise * torch.randn(truth.shape, generator=torch.Generator().manual_seed(1), dtype=truth.dtype)
+
+
+def jitter(values: Tensor) -> Tensor:
+    return values[20:].diff(n=2, dim=0).square().mean().sqrt()
+
+
+def lag(values: Tensor, truth: Tensor) -> float:
+    """Frames by which values trail the truth: where their mean squared distance is least, between frames too."""
+    errors = [(values[30:-6] - truth[30 - d : len(truth) - 6 - d]).square().mean() for d in range(-5, 6)]
+    best = min(range(1, 10), key=lambda i: errors[i])
+    before, here, after = errors[best - 1], errors[best], errors[best + 1]
+    return best - 5 + 0.5 * float((before - after) / (before - 2 * here + after))
+
+
+def test_the_last_filtered_frame_is_the_least_squares_solution() -> None:
+    values = measured(head_motion(12, 2))
+    settings = KalmanSettings(1.5, 0.4)
+    transition, noise = KalmanFilter(1, settings)._transition, KalmanFilter(1, settings)._noise
+    frames = len(values)
+    # All frames' states at once: measurements, transitions and what is known of the first, each over its deviation.
+    first = torch.diag(torch.tensor([1.5, 45.0, 45.0], dtype=torch.float64)).inverse()
+    root = torch.linalg.cholesky(noise).inverse()
+    rows, sides = [torch.zeros(3, 3 * frames, dtype=torch.float64)], [torch.zeros(3, 2, dtype=torch.float64)]
+    rows[0][:, :3], sides[0][0] = first, values[0] / 1.5
+    for t in range(1, frames):
+        row = torch.zeros(3, 3 * frames, dtype=torch.float64)
+        row[:, 3 * t : 3 * t + 3], row[:, 3 * t - 3 : 3 * t] = root, -root @ transition
+        seen = torch.zeros(1, 3 * frames, dtype=torch.float64)
+        seen[0, 3 * t] = 1 / 1.5
+        rows += [row, seen]
+        sides += [torch.zeros(3, 2, dtype=torch.float64), values[t : t + 1] / 1.5]
+    states = torch.linalg.lstsq(torch.cat(rows), torch.cat(sides)).solution[::3]
+    torch.testing.assert_close(kalman_filter(values, settings)[-1], states[-1], rtol=0, atol=1e-8)
+    torch.testing.assert_close(kalman_smoother(values, settings), states, rtol=0, atol=1e-7)
+
+
+def test_jitter_falls_by_three_fifths_without_a_frame_of_lag() -> None:
+    truth = head_motion()
+    values = measured(truth)
+    settings = estimate_settings(values)
+    filtered, smoothed = kalman_filter(values, settings), kalman_smoother(values, settings)
+    assert settings.measurement == pytest.approx(1.5, rel=0.1)
+    assert jitter(filtered - truth) < 0.4 * jitter(values - truth)
+    assert abs(lag(filtered, truth)) < 1
+    assert jitter(smoothed - truth) < 0.1 * jitter(values - truth)
+    assert abs(lag(smoothed, truth)) < 0.1
+    error = [(kept - truth)[20:].square().mean() for kept in (values, filtered, smoothed)]
+    assert error[2] < error[1] < error[0]
+
+
+def test_gaps_are_bridged_and_long_ones_are_not_made_up() -> None:
+    truth = head_motion(120, 3)
+    values = measured(truth, 0.3)
+    values[:5, 0], values[50:56, 1], values[40:80, 2] = torch.nan, torch.nan, torch.nan
+    settings = KalmanSettings(0.3, 0.3, longest_gap=8)
+    filtered, smoothed = kalman_filter(values, settings), kalman_smoother(values, settings)
+    assert filtered[:5, 0].isnan().all()
+    assert float((filtered[50:56, 1] - truth[50:56, 1]).abs().max()) < 8
+    assert filtered[40:48, 2].isfinite().all()
+    assert filtered[48:80, 2].isnan().all()
+    assert filtered[80:, 2].isfinite().all()
+    assert float((smoothed[50:56, 1] - truth[50:56, 1]).abs().max()) < 1
+    assert smoothed[5:].isfinite().all()
+    assert smoothed[:5, 0].isnan().all()
+
+
+def test_one_frame_at_a_time_is_the_whole_take() -> None:
+    values, settings = measured(head_motion(30, 4)), KalmanSettings(1.5, 0.3)
+    running = KalmanFilter(4, settings)
+    assert torch.equal(torch.stack([running.step(frame).clone() for frame in values]), kalman_filter(values, settings))
+
+
+def turning(frames: int = 300) -> Tensor:
+    """A head that turns through more than half a circle, so that a quaternion's sign may flip."""
+    angle = 2.4 * (torch.arange(frames, dtype=torch.float64) / 50).sin() + 3.0
+    axis = torch.nn.functional.normalize(torch.tensor([0.2, 1.0, 0.1], dtype=torch.float64), dim=0)
+    return torch.cat([(angle / 2).cos()[:, None], (angle / 2).sin()[:, None] * axis], dim=1)
+
+
+def test_rotations_stay_valid_whatever_the_sign() -> None:
+    truth = turning()
+    generator = torch.Generator().manual_seed(2)
+    noisy = truth + 0.01 * torch.randn(truth.shape, generator=generator, dtype=truth.dtype)
+    signs = torch.where(torch.rand(len(truth), 1, generator=generator) < 0.5, -1.0, 1.0)
+    values = torch.nn.functional.normalize(noisy, dim=1) * signs
+    values[100:104] = torch.nan
+    settings = KalmanSettings(0.01, 0.0001)
+    for kept in (filter_rotations(values, settings), smooth_rotations(values, settings)):
+        assert torch.allclose(kept.norm(dim=1), torch.ones(len(kept), dtype=kept.dtype))
+        off = 2 * (kept * truth).sum(1).abs().clamp(max=1).acos()
+        seen = 2 * (values * truth).sum(1).abs().clamp(max=1).acos()
+        assert float(off[20:].mean()) < 0.7 * float(seen[20:].nanmean())
+
+
+@given(st.integers(1, 30), st.integers(1, 3), st.integers(0, 10**6))
+def test_any_pattern_of_gaps(frames: int, channels: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randn(frames, channels, generator=generator)
+    values[torch.rand(values.shape, generator=generator) < 0.4] = torch.nan
+    settings = KalmanSettings(0.5, 0.2, longest_gap=frames)
+    filtered, smoothed = kalman_filter(values, settings), kalman_smoother(values, settings)
+    unseen = values.isfinite().cumsum(0) == 0
+    assert torch.equal(filtered.isnan(), unseen)
+    assert torch.equal(smoothed.isnan(), unseen)
+
+
+def test_bad_input() -> None:
+    with pytest.raises(ValueRangeError, match="positive deviations"):
+        KalmanSettings(0.0, 1.0)
+    with pytest.raises(ShapeError, match="a frame at least"):
+        kalman_filter(torch.zeros(0, 2), KalmanSettings(1, 1))
+    with pytest.raises(ValueRangeError, match="infinite"):
+        kalman_filter(torch.full((3, 1), torch.inf), KalmanSettings(1, 1))
+    with pytest.raises(ValueRangeError, match="expected at least 8"):
+        estimate_settings(torch.zeros(3, 1))
+    with pytest.raises(ShapeError, match="expected \\(T,4\\)"):
+        filter_rotations(torch.zeros(3, 3), KalmanSettings(1, 1))
+    with pytest.raises(ValueRangeError, match="no or infinite length"):
+        smooth_rotations(torch.zeros(3, 4), KalmanSettings(1, 1))

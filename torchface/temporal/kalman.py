@@ -1,0 +1,219 @@
+"""Kalman filters and smoothers of constant acceleration, for signals that come frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+
+# Deviation of the first velocity and acceleration, in measurement deviations a frame: nothing is known of them.
+_FIRST_VELOCITY, _FIRST_ACCELERATION = 30.0, 30.0
+_RATIOS = torch.logspace(-3, 0.5, 22, dtype=torch.float64)
+_FEWEST_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class KalmanSettings:
+    r"""What a constant-acceleration filter assumes; time counts in frames.
+
+    Args:
+        measurement: deviation of the measurements, in their unit (pixels, millimetres).
+        jerk: deviation of what the acceleration changes by in a frame, in that unit a frame². Small makes the filter
+            smooth and slow, large quick and rough. See :func:`estimate_settings`.
+        longest_gap: frames without measurements that the causal filter bridges by prediction; then it waits for the
+            next one and starts anew.
+    """
+
+    measurement: float
+    jerk: float
+    longest_gap: int = 10
+
+    def __post_init__(self) -> None:
+        if not (0 < self.measurement < float("inf") and 0 < self.jerk < float("inf") and self.longest_gap >= 0):
+            raise ValueRangeError(
+                f"Kalman filter: found measurement {self.measurement}, jerk {self.jerk}, longest_gap "
+                f"{self.longest_gap}, expected positive deviations and a gap from 0"
+            )
+
+
+class KalmanFilter:
+    r"""A causal filter for C channels, one frame at a time.
+
+    .. math:: x_t = F x_{t-1} + q, \quad z_t = p_t + r, \qquad
+        F = \begin{pmatrix} 1 & 1 & \tfrac12 \\ & 1 & 1 \\ & & 1 \end{pmatrix}
+
+    with position, velocity and acceleration :math:`x = (p, v, a)` of each channel on its own, and white jerk.
+
+    Args:
+        channels: C.
+        settings: deviations and gaps.
+
+    Source: Kalman 1960; thesis 4.2.5.
+    """
+
+    def __init__(self, channels: int, settings: KalmanSettings) -> None:
+        self.settings = settings
+        self.state = torch.full((channels, 3), torch.nan, dtype=torch.float64)
+        self.covariance = torch.zeros(channels, 3, 3, dtype=torch.float64)
+        self._unseen = torch.zeros(channels, dtype=torch.int64)
+        self._transition, self._noise = _model(settings)
+
+    def predict(self) -> None:
+        """Goes one frame on."""
+        self.state = self.state @ self._transition.T
+        self.covariance = self._transition @ self.covariance @ self._transition.T + self._noise
+
+    def correct(self, measured: Tensor) -> None:
+        """Takes in a frame's measurements (C,); NaN means not seen."""
+        seen = ~measured.isnan()
+        fresh = seen & self.state[:, 0].isnan()
+        self._unseen = torch.where(seen, 0, self._unseen + 1)
+        variance = self.settings.measurement**2
+        innovation = torch.where(seen & ~fresh, measured.double() - self.state[:, 0], 0.0)
+        gain = self.covariance[:, :, 0] / (self.covariance[:, 0, 0] + variance)[:, None]
+        gain = torch.where((seen & ~fresh)[:, None], gain, 0.0)
+        self.state = self.state + gain * innovation[:, None]
+        # Joseph's form stays symmetric and positive, whatever is rounded.
+        keep = torch.eye(3, dtype=torch.float64) - gain[:, :, None] * torch.tensor([1.0, 0, 0], dtype=torch.float64)
+        self.covariance = keep @ self.covariance @ keep.transpose(1, 2) + variance * gain[:, :, None] * gain[:, None]
+        first, first_covariance = _first(measured.double(), self.settings)
+        lost = self._unseen > self.settings.longest_gap
+        self.state = torch.where(fresh[:, None], first, torch.where(lost[:, None], torch.nan, self.state))
+        self.covariance = torch.where(fresh[:, None, None], first_covariance, self.covariance)
+
+    def step(self, measured: Tensor) -> Tensor:
+        """Filtered positions (C,) float64 after a frame's measurements (C,); NaN before the first and in long gaps.
+
+        Raises:
+            ShapeError: another number of channels.
+            ValueRangeError: an infinite measurement.
+        """
+        if measured.shape != self.state.shape[:1]:
+            raise ShapeError(f"Kalman filter: found {tuple(measured.shape)}, expected ({len(self.state)},)")
+        if measured.isinf().any():
+            raise ValueRangeError("Kalman filter: found an infinite measurement, expected numbers, or NaN for not seen")
+        self.predict()
+        self.correct(measured)
+        return self.state[:, 0]
+
+
+def kalman_filter(values: Tensor, settings: KalmanSettings) -> Tensor:
+    """Each frame from itself and those before it.
+
+    Args:
+        values: measurements (T,...), NaN for not seen.
+        settings: see :class:`KalmanSettings`.
+
+    Returns:
+        Filtered values of the same shape and dtype. Gaps up to ``longest_gap`` are bridged; NaN before a channel was
+        first seen, and in longer gaps after that.
+    """
+    curves = _checked(values)
+    running = KalmanFilter(curves.shape[1], settings)
+    # A frame needs the one before: a loop over frames, all channels at once.
+    return torch.stack([running.step(frame).clone() for frame in curves]).to(values.dtype).reshape(values.shape)
+
+
+def kalman_smoother(values: Tensor, settings: KalmanSettings) -> Tensor:
+    """Each frame from all frames, those after it too; for work that need not be live.
+
+    Args:
+        values: measurements (T,...), NaN for not seen.
+        settings: see :class:`KalmanSettings`; all gaps are bridged, whatever ``longest_gap`` is.
+
+    Returns:
+        Smoothed values of the same shape and dtype; NaN for a channel that was never seen, and before its first
+        measurement.
+
+    Source: Rauch, Tung, Striebel 1965.
+    """
+    curves = _checked(values)
+    running = KalmanFilter(curves.shape[1], KalmanSettings(settings.measurement, settings.jerk, len(curves)))
+    transition = running._transition
+    predicted, filtered = [], []
+    for frame in curves:
+        running.predict()
+        predicted.append((running.state, running.covariance))
+        running.correct(frame)
+        filtered.append((running.state, running.covariance))
+    state = filtered[-1][0]
+    smoothed = [state[:, 0]]
+    for (ahead, ahead_covariance), (here, covariance) in zip(
+        reversed(predicted[1:]), reversed(filtered[:-1]), strict=True
+    ):
+        gain = torch.linalg.solve(_regular(ahead_covariance), transition @ covariance).transpose(1, 2)
+        moved = here + (gain @ (state - ahead)[..., None])[..., 0]
+        # Where nothing was predicted, the channel is first seen in the next frame.
+        state = torch.where(ahead[:, :1].isnan(), here, moved)
+        smoothed.append(state[:, 0])
+    return torch.stack(smoothed[::-1]).to(values.dtype).reshape(values.shape)
+
+
+def estimate_settings(values: Tensor, longest_gap: int = 10) -> KalmanSettings:
+    r"""The settings under which measurements are most likely.
+
+    For each ratio of jerk to measurement noise the scale of both follows from the innovations; the ratio with the
+    greatest likelihood wins.
+
+    Args:
+        values: measurements (T,...) of channels that share their noise, NaN for not seen.
+        longest_gap: kept in the settings.
+
+    Raises:
+        ValueRangeError: fewer than eight frames, or channels that do not move at all.
+
+    Source: maximum likelihood by prediction-error decomposition, Schweppe 1965.
+    """
+    curves = _checked(values)
+    if len(curves) < _FEWEST_FRAMES:
+        raise ValueRangeError(f"estimate_settings: found {len(curves)} frames, expected at least {_FEWEST_FRAMES}")
+    channels = curves.shape[1]
+    best, likelihood = KalmanSettings(1.0, 1.0), -float("inf")
+    for ratio in _RATIOS.tolist():
+        running = KalmanFilter(channels, KalmanSettings(1.0, ratio, len(curves)))
+        squares, logs, count = 0.0, 0.0, 0
+        for frame in curves:
+            running.predict()
+            known = ~(frame.isnan() | running.state[:, 0].isnan())
+            variance = running.covariance[:, 0, 0] + 1.0
+            squares += float((frame - running.state[:, 0])[known].square().div(variance[known]).sum())
+            logs += float(variance[known].log().sum())
+            count += int(known.sum())
+            running.correct(frame)
+        if count == 0 or squares == 0:
+            raise ValueRangeError("estimate_settings: found channels without noise or motion, expected measurements")
+        scale = squares / count
+        found = -0.5 * (count * torch.log(torch.tensor(scale)).item() + logs)
+        if found > likelihood:
+            best, likelihood = KalmanSettings(scale**0.5, ratio * scale**0.5, longest_gap), found
+    return best
+
+
+def _model(settings: KalmanSettings) -> tuple[Tensor, Tensor]:
+    transition = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], dtype=torch.float64)
+    noise = torch.tensor([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]], dtype=torch.float64)
+    return transition, settings.jerk**2 * noise
+
+
+def _first(measured: Tensor, settings: KalmanSettings) -> tuple[Tensor, Tensor]:
+    """State and covariance of channels (C,) at their first measurement."""
+    state = torch.nn.functional.pad(measured[:, None], (0, 2))
+    deviation = settings.measurement * torch.tensor([1.0, _FIRST_VELOCITY, _FIRST_ACCELERATION], dtype=torch.float64)
+    return state, deviation.square().diag().expand(len(measured), 3, 3)
+
+
+def _regular(covariance: Tensor) -> Tensor:
+    """Covariances (C,3,3) that can be inverted, also of channels not yet seen, which have none."""
+    empty = (covariance[:, 0, 0] <= 0)[:, None, None]
+    return torch.where(empty, torch.eye(3, dtype=covariance.dtype), covariance)
+
+
+def _checked(values: Tensor) -> Tensor:
+    if values.ndim == 0 or len(values) == 0:
+        raise ShapeError(f"Kalman filter: found values {tuple(values.shape)}, expected (T,...) with a frame at least")
+    if values.isinf().any():
+        raise ValueRangeError("Kalman filter: found infinite measurements, expected numbers, or NaN for not seen")
+    return values.detach().cpu().double().reshape(len(values), -1)
