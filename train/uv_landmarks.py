@@ -1,17 +1,20 @@
-"""``python -m train.uv_landmarks --scans DIR --annotations FILE --out models/uv_landmarks``: landmarks of raw scans."""
+"""``python -m train.uv_landmarks --scans DIR --annotations FILE --out models/NAME``: landmarks of raw scans.
+
+``--performers 30`` learns from scans of so many embedded performers instead, and needs no file.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import torch
 import tyro
 
-from torchface import Mesh, TorchfaceError, load_mesh
-from torchface.files import write_file
+from torchface import Mesh, TorchfaceError, load_mesh, zoo
 from torchface.landmarks import (
     TWELVE,
     CylinderLayout,
@@ -20,13 +23,18 @@ from torchface.landmarks import (
     ScanAnnotation,
     UVLandmarkDetector,
     appearance_image,
+    line_image,
     load_annotations,
-    save_detector,
     scan_landmarks,
     unwrap,
 )
 from torchface.landmarks.evaluation import ScanErrors, error_table, landmark_errors, picture
 from torchface.rendering.compositing import save_picture, sheet
+from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.scanner import ScannerSettings, eyes_closed, scan_head
+
+_TESTED_PERFORMERS = 20
+_VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
 
 
 @dataclass(frozen=True)
@@ -36,20 +44,36 @@ class Settings:
     Args:
         scans: Folder of scans (.obj, .ply, .stl, .glb), in any pose, in millimetres.
         annotations: JSON with the landmarks of each scan by file name.
+        performers: Learn from scans of so many embedded performers instead of a folder's.
         out: Folder for the model, its card and its pictures.
         appearance: What the detector looks at: the scans' colours, or their form.
-        held_out: How many scans, the last by name, are kept for the test.
+        held_out: How many scans, the last by name, are kept for the test; or how many more performers are drawn for it.
+            None if absent, and 20 performers.
+        seed: Draws performers, and what their scanner does to them.
         size: Pixels a side of the unwrapped pictures.
+        licence: Under which the model may be used.
         detector: How landmarks are matched.
     """
 
-    scans: Path
-    annotations: Path
+    scans: Path | None = None
+    annotations: Path | None = None
+    performers: int = 0
     out: Path = Path("models/uv_landmarks")
-    appearance: Literal["texture", "relief"] = "relief"
-    held_out: int = 0
+    appearance: Literal["texture", "relief"] = "texture"
+    held_out: int | None = None
+    seed: int = 7
     size: int = 1024
+    licence: str = "MIT"
     detector: DetectorSettings = field(default_factory=DetectorSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotatedScan:
+    """A scan, what is known of it, and what to call it."""
+
+    name: str
+    mesh: Mesh
+    truth: ScanAnnotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,77 +88,132 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
     """Loads, aligns, splits, fits, evaluates and saves.
 
     Raises:
-        TorchfaceError: no scan is annotated, or a scan or the annotations cannot be used.
+        TorchfaceError: neither scans nor performers are asked for, no scan is annotated, or one cannot be used.
     """
     say = say or (lambda line: None)
-    annotations = load_annotations(settings.annotations)
-    names = sorted(annotations)
-    if len(names) - settings.held_out < 2:
-        raise TorchfaceError(
-            f"{settings.annotations}: found {len(names)} annotated scans, expected at least two besides the "
-            f"{settings.held_out} held out"
-        )
-    split = len(names) - settings.held_out
-    scans = [load_mesh(settings.scans / name) for name in names]
-    say(f"{split} scans to learn from, {settings.held_out} to test on")
-    detector = fit(scans[:split], [annotations[name] for name in names[:split]], settings, say)
+    learn, test = _split(settings, say)
+    say(f"{len(learn)} scans to learn from, {len(test)} to test on")
+    detector = fit(learn, settings.appearance, settings.size, settings.detector, say)
     errors, pictures = [], []
-    for name, scan in zip(names[split:], scans[split:], strict=True):
-        found = scan_landmarks(detector, scan)
-        errors.append(landmark_errors(found, scan, annotations[name], name))
-        pictures.append(picture(found, annotations[name]))
-        say(f"{name}: {errors[-1].mean_pixels:.1f} px")
-    save(detector, settings, errors, names[:split])
+    for scan in test:
+        found = scan_landmarks(detector, scan.mesh)
+        errors.append(landmark_errors(found, scan.mesh, scan.truth, scan.name))
+        pictures.append(picture(found, scan.truth))
+        say(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
+    save(detector, settings, errors, len(learn))
     if pictures:
         save_picture(sheet(pictures[:9], 3), settings.out / "held_out.png")
     return Trained(detector, errors)
 
 
 def fit(
-    scans: list[Mesh], annotations: list[ScanAnnotation], settings: Settings, say: Callable[[str], None]
+    scans: list[AnnotatedScan],
+    appearance: Literal["texture", "relief"] = "texture",
+    size: int = 1024,
+    detector: DetectorSettings | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> UVLandmarkDetector:
-    """Learns the face frame, unwraps every scan as it will be found again, learns the filters."""
-    points = torch.stack([annotation.twelve() for annotation in annotations])
+    """Learns the face frame, unwraps every scan as it will be found again, learns the filters and the lines."""
+    say = say or (lambda line: None)
+    points = torch.stack([scan.truth.twelve() for scan in scans])
     say("learning the face frame")
-    frame = FaceFrame.fit(scans, points)
-    layout = CylinderLayout().resized(settings.size)
-    images, pixels, lines = [], [], []
-    for scan, truth, annotation in zip(scans, points, annotations, strict=True):
-        head = unwrap(scan, frame.locate(scan), layout)
-        images.append(appearance_image(head, settings.appearance))
+    frame = FaceFrame.fit([scan.mesh for scan in scans], points)
+    layout = CylinderLayout().resized(size)
+    images, traced, pixels, lines = [], [], [], []
+    for scan, truth in zip(scans, points, strict=True):
+        head = unwrap(scan.mesh, frame.locate(scan.mesh), layout)
+        images.append(appearance_image(head, appearance))
+        traced.append(line_image(head, appearance))
         pixels.append(layout.pixels(head.pose.apply(truth[None])[0]))
-        lines.append({name: layout.pixels(head.pose.apply(line[None])[0]) for name, line in annotation.lines.items()})
+        known = scan.truth.lines.items()
+        lines.append({name: layout.pixels(head.pose.apply(line[None].double())[0]) for name, line in known})
         say(f"unwrapped {len(images)} of {len(scans)}")
     return UVLandmarkDetector.fit(
         torch.stack(images),
         torch.stack(pixels).float(),
         TWELVE,
-        settings.appearance,
-        settings.detector,
+        appearance,
+        detector,
         frame,
         lines,
+        torch.stack(traced),
         lambda done, total: say(f"scored {done} of {total}"),
     )
 
 
-def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErrors], names: list[str]) -> None:
+def scanned_performers(
+    count: int, seed: int, say: Callable[[str], None] | None = None, voxel: float = _VOXEL
+) -> list[AnnotatedScan]:
+    """Raw textured scans of embedded performers with closed eyes, and the truth about them."""
+    settings, scans = ScannerSettings(voxel=voxel), []
+    for i, identity in enumerate(draw_identities(count, torch.Generator().manual_seed(seed))):
+        scan = scan_head(eyes_closed(performer(identity)), 1000 * seed + i, settings)
+        scans.append(AnnotatedScan(f"performer {i:03d}", scan.mesh, scan.annotation))
+        if say is not None:
+            say(f"scanned {i + 1} of {count}")
+    return scans
+
+
+def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErrors], count: int) -> None:
     """Writes the model with its effective settings, measured errors and card."""
-    table = error_table(errors)
-    effective = asdict(replace(settings, scans=Path(settings.scans.name), annotations=Path(settings.annotations.name)))
-    effective.update({key: str(value) for key, value in effective.items() if isinstance(value, Path)})
-    save_detector(detector, settings.out, {"settings": effective, "errors": table})
-    rows = "\n".join(f"| {key} | {value:.2f} |" for key, value in table.items())
-    card = (
-        f"# UV landmarks ({settings.appearance})\n\n"
-        f"Twelve face landmarks, lip and lid lines of raw scans. Learned from {len(names)} annotated scans, "
-        f"tested on {len(errors)} others.\n\n| measured | value |\n| --- | --- |\n{rows}\n"
+    folder, notes = settings.scans, settings.annotations
+    effective = {key: value for key, value in asdict(settings).items() if value is not None}
+    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
+    if settings.performers:
+        data = f"{count} scans of the embedded performer; no person's face."
+        flags = f"--performers {settings.performers} --seed {settings.seed}"
+    else:
+        data = f"{count} annotated scans of {'a folder' if folder is None else folder.name}."
+        flags = f"--scans {folder and folder.name} --annotations {notes and notes.name}"
+    flags += f" --appearance {settings.appearance}" + (f" --held-out {len(errors)}" if errors else "")
+    seen = "colours" if settings.appearance == "texture" else "form"
+    pitch = CylinderLayout().resized(settings.size).pitch
+    zoo.save_model(
+        detector,
+        settings.out,
+        licence=settings.licence,
+        data=data,
+        metrics=error_table(errors),
+        recipe=f"python -m train.uv_landmarks {flags} --out models/{settings.out.name}",
+        card=(
+            f"Twelve face landmarks, lip and lid lines of raw scans, found by their {seen}. Tested on {len(errors)} "
+            f"other scans; pixels are those of the unwrapped head, {settings.size} a side, {pitch:g} mm each. Lids are "
+            "traced where they meet in scans with closed eyes."
+        ),
+        settings=effective,
     )
-    write_file(settings.out / "CARD.md", card.encode())
+
+
+def _split(settings: Settings, say: Callable[[str], None]) -> tuple[list[AnnotatedScan], list[AnnotatedScan]]:
+    """Scans to learn from, and those to test on."""
+    given = settings.scans is not None and settings.annotations is not None
+    if given == (settings.performers > 0):
+        raise TorchfaceError(
+            f"found scans={settings.scans}, annotations={settings.annotations}, performers={settings.performers}; "
+            "expected scans with their annotations, or a number of performers"
+        )
+    if settings.scans is None or settings.annotations is None:
+        more = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out
+        scans = scanned_performers(settings.performers + more, settings.seed, say)
+        return scans[: settings.performers], scans[settings.performers :]
+    annotations = load_annotations(settings.annotations)
+    names, held_out = sorted(annotations), settings.held_out or 0
+    split = len(names) - held_out
+    if split < 2:
+        raise TorchfaceError(
+            f"{settings.annotations}: found {len(names)} annotated scans, expected at least two besides the "
+            f"{held_out} held out"
+        )
+    scans = [AnnotatedScan(name, load_mesh(settings.scans / name), annotations[name]) for name in names]
+    return scans[:split], scans[split:]
 
 
 def main() -> None:
     """Parses flags, trains, prints."""
-    trained = train(tyro.cli(Settings, description=__doc__), print)
+    try:
+        trained = train(tyro.cli(Settings, description=__doc__), print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
     for key, value in error_table(trained.errors).items():
         print(f"{key:40} {value:8.2f}")
 

@@ -10,71 +10,42 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface import Mesh, load_mesh
+from torchface import load_mesh
 from torchface.geometry.proximity import SurfaceIndex
 from torchface.io.landmarks import load_landmark_points
-from torchface.landmarks import (
-    TWELVE,
-    CylinderLayout,
-    FaceFrame,
-    ScanAnnotation,
-    UVLandmarkDetector,
-    appearance_image,
-    scan_landmarks,
-    twelve_from_ibug,
-    unwrap,
-)
+from torchface.landmarks import TWELVE, ScanAnnotation, UVLandmarkDetector, scan_landmarks, twelve_from_ibug
 from torchface.landmarks.evaluation import error_table, landmark_errors, picture
 from torchface.rendering.compositing import save_picture, sheet
-from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.scanner import ScannerSettings, eyes_closed, scan_head
+from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
 
 LEARN, TEST = 30, 20
 PICTURES = Path("out/landmarks")
 
 
 @pytest.fixture(scope="module")
-def scans() -> list[tuple[Mesh, ScanAnnotation]]:
-    identities = draw_identities(LEARN + TEST, torch.Generator().manual_seed(7))
-    settings = ScannerSettings(voxel=1.7)
-    made = (scan_head(eyes_closed(performer(who)), 1000 + i, settings) for i, who in enumerate(identities))
-    return [(scan.mesh, scan.annotation) for scan in made]
+def scans() -> list[AnnotatedScan]:
+    return scanned_performers(LEARN + TEST, seed=7)
 
 
 @pytest.fixture(scope="module")
-def detectors(scans: list[tuple[Mesh, ScanAnnotation]]) -> dict[str, UVLandmarkDetector]:
-    learn = scans[:LEARN]
-    points = torch.stack([truth.twelve() for _, truth in learn])
-    frame = FaceFrame.fit([scan for scan, _ in learn], points)
-    heads = [unwrap(scan, frame.locate(scan)) for scan, _ in learn]
-    layout = CylinderLayout()
-    lines = [
-        {name: layout.pixels(h.pose.apply(line[None])[0]) for name, line in truth.lines.items()}
-        for h, (_, truth) in zip(heads, learn, strict=True)
-    ]
-    pixels = torch.stack([layout.pixels(h.pose.apply(p[None])[0]) for h, p in zip(heads, points, strict=True)]).float()
-    return {
-        kind: UVLandmarkDetector.fit(
-            torch.stack([appearance_image(h, kind) for h in heads]), pixels, TWELVE, kind, frame=frame, lines=lines
-        )
-        for kind in ("texture", "relief")
-    }
+def detectors(scans: list[AnnotatedScan]) -> dict[str, UVLandmarkDetector]:
+    return {"texture": fit(scans[:LEARN], "texture"), "relief": fit(scans[:LEARN], "relief")}
 
 
 @pytest.mark.parametrize(("kind", "line_limit"), [("texture", 3.0), ("relief", None)])
 def test_landmarks_of_scanned_performers(
     kind: str,
     line_limit: float | None,
-    scans: list[tuple[Mesh, ScanAnnotation]],
+    scans: list[AnnotatedScan],
     detectors: dict[str, UVLandmarkDetector],
 ) -> None:
     errors, pictures, spent = [], [], 0.0
-    for scan, truth in scans[LEARN:]:
+    for scan in scans[LEARN:]:
         begin = time.perf_counter()
-        found = scan_landmarks(detectors[kind], scan)
+        found = scan_landmarks(detectors[kind], scan.mesh)
         spent += time.perf_counter() - begin
-        errors.append(landmark_errors(found, scan, truth))
-        pictures.append(picture(found, truth))
+        errors.append(landmark_errors(found, scan.mesh, scan.truth))
+        pictures.append(picture(found, scan.truth))
     print(f"\n{kind}: learned from {LEARN} scanned performers, tested on {TEST} others, {spent / TEST:.1f} s a scan")
     table = error_table(errors)
     for what, value in table.items():

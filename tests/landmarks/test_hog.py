@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.hog import HogLayout, cell_map, similarity, windows
+from torchface.landmarks.hog import HogLayout, cell_map, similarity, unit_windows, windows
 
 LAYOUT = HogLayout(window=32, cell=8, bins=9, stride=2)
 
@@ -36,7 +36,7 @@ def test_cells_ignore_brightness_and_contrast() -> None:
 def test_convolution_is_the_cosine_of_the_windows() -> None:
     cells = cell_map(noise(), LAYOUT) - 0.2
     filters = torch.randn(5, 9, 4, 4, generator=torch.Generator().manual_seed(1))
-    scores = similarity(cells, filters, LAYOUT)[0]
+    scores = similarity(unit_windows(cells, LAYOUT), filters)[0].view(5, *cells.shape[2:])
     places = torch.tensor([[20, 15], [24, 30], [33, 12]])
     described = windows(cells[0], LAYOUT, places).flatten(1)
     expected = torch.nn.functional.cosine_similarity(filters.flatten(1)[:, None], described[None], dim=-1)
@@ -48,7 +48,7 @@ def test_a_window_is_found_where_it_was_cut_out() -> None:
     cells = cell_map(image, LAYOUT)
     at = torch.tensor([[62.0, 50.0]])
     place = LAYOUT.rows(at)
-    scores = similarity(cells, windows(cells[0], LAYOUT, place), LAYOUT)[0, 0]
+    scores = similarity(unit_windows(cells, LAYOUT), windows(cells[0], LAYOUT, place)).view(cells.shape[2:])
     best = int(scores.argmax())
     found = LAYOUT.positions(torch.tensor([best % scores.shape[1], best // scores.shape[1]]))
     assert float(scores.max()) == pytest.approx(1.0, abs=1e-5)

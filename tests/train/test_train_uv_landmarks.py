@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchface import zoo
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.geometry.proximity import SurfaceIndex
@@ -50,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(folder: Path, out: Path) -> Settings:
-    return Settings(folder, folder / "annotations.json", out, "texture", held_out=1, size=SIZE, detector=QUICK)
+    return Settings(folder, folder / "annotations.json", 0, out, "texture", held_out=1, size=SIZE, detector=QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,11 @@ def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder:
     result, out = trained
     assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "held_out.png"}
     again = load_detector(out)
+    assert zoo.get_model(out).config == again.config
+    described = zoo.describe(out)
+    assert described.size < 2 * 2**20
+    assert described.metrics["mean error, pixels"] == pytest.approx(result.errors[0].mean_pixels)
+    assert described.recipe.startswith("python -m train.uv_landmarks --scans")
     scan = load_mesh(folder / "scan_005.obj")
     found = scan_landmarks(again, scan)
     truth = load_annotations(folder / "annotations.json")["scan_005.obj"]
@@ -128,6 +134,10 @@ def test_annotations_that_cannot_be_used_are_named(folder: Path, tmp_path: Path)
     (tmp_path / "one.json").write_text(json.dumps(one))
     with pytest.raises(TorchfaceError, match="at least two"):
         train(replace(settings(folder, tmp_path), annotations=tmp_path / "one.json"))
+    with pytest.raises(TorchfaceError, match="number of performers"):
+        train(replace(settings(folder, tmp_path), annotations=None))
+    with pytest.raises(TorchfaceError, match="number of performers"):
+        train(replace(settings(folder, tmp_path), performers=3))
     document["scans"]["scan_000.obj"]["points"]["nose"] = [1, "two", 3]
     (tmp_path / "text.json").write_text(json.dumps(document))
     with pytest.raises(FileFormatError, match=r"scan_000.obj: nose"):
@@ -143,3 +153,4 @@ def test_the_command_says_what_it_wants() -> None:
     )
     assert "--scans" in shown.stdout
     assert "--annotations" in shown.stdout
+    assert "--performers" in shown.stdout

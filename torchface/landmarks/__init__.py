@@ -7,7 +7,7 @@ from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.detector_files import load_detector, save_detector
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.relief import relief
-from torchface.landmarks.scan import ScanLandmarks, appearance_image, scan_landmarks
+from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
 from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
 from torchface.landmarks.uv import DetectorSettings, UVLandmarkDetector, UVLandmarks
 
@@ -27,6 +27,7 @@ __all__ = [
     "UnwrappedHead",
     "appearance_image",
     "contour_correspondences",
+    "line_image",
     "load_annotations",
     "load_detector",
     "relief",

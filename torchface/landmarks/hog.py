@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, one_hot, pad
+from torch.nn.functional import avg_pool2d, normalize, one_hot, pad, unfold
 
 from torchface.errors import ShapeError, ValueRangeError
 
@@ -108,21 +108,24 @@ def windows(cells: Tensor, layout: HogLayout, centres: Tensor) -> Tensor:
     return cells[:, rows, columns].permute(1, 0, 2, 3)
 
 
-def similarity(cells: Tensor, filters: Tensor, layout: HogLayout) -> Tensor:
-    r"""Cosine of the angle between filters and the windows at every place: a convolution, normalised.
-
-    Args:
-        cells: maps (B,bins,h,w).
-        filters: (K,bins,side,side).
-        layout: of the windows.
-
-    Returns:
-        (B,K,h,w) in [-1,1].
-    """
+def unit_windows(cells: Tensor, layout: HogLayout) -> Tensor:
+    """The window at every place of maps (B,bins,h,w) as a column of length 1: (B,bins·side²,h·w)."""
     step = layout.cell // layout.stride
     reach = (layout.side - 1) * step // 2
-    unit = filters / filters.flatten(1).norm(dim=1).clamp(min=1e-9)[:, None, None, None]
-    product = conv2d(pad(cells, (reach,) * 4, mode="replicate"), unit, dilation=step)
-    energy = pad(cells.square().sum(1, keepdim=True), (reach,) * 4, mode="replicate")
-    norm = conv2d(energy, torch.ones_like(filters[:1, :1]), dilation=step).sqrt()
-    return product / norm.clamp(min=1e-9)
+    columns = unfold(pad(cells, (reach,) * 4, mode="replicate"), layout.side, dilation=step)
+    return columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-9)
+
+
+def similarity(columns: Tensor, filters: Tensor) -> Tensor:
+    r"""Cosine of the angle between filters and the windows at every place: a convolution, normalised.
+
+    The windows of a map are laid side by side once and serve every landmark's filters.
+
+    Args:
+        columns: of ``unit_windows``, (B,bins·side²,P).
+        filters: (K,bins,side,side).
+
+    Returns:
+        (B,K,P) in [-1,1].
+    """
+    return normalize(filters.flatten(1), dim=1, eps=1e-9) @ columns

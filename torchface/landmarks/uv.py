@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.face_frame import FaceFrame
-from torchface.landmarks.hog import HogLayout, cell_map, similarity, windows
+from torchface.landmarks.hog import HogLayout, cell_map, similarity, unit_windows, windows
 from torchface.landmarks.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.mean_shift import mean_shift
 from torchface.landmarks.smoothing import unsharp
@@ -197,29 +197,29 @@ class UVLandmarkDetector(nn.Module):
         confidence = torch.zeros(pixels.shape[:2], dtype=pixels.dtype, device=pixels.device)
         for b, image in enumerate(images):  # one image's responses are 100 MB; a batch of them would be too much
             cells = self._cells(image[None])
+            columns, width = unit_windows(cells, self.settings.hog), cells.shape[-1]
             for k in range(len(self.names)):
-                pixels[b, k], confidence[b, k] = self._locate(k, cells)
+                pixels[b, k], confidence[b, k] = self._locate(k, columns, width)
         return UVLandmarks(pixels, confidence)
 
-    def matches(self, landmark: int, cells: Tensor, without: int | None = None) -> tuple[Tensor, Tensor]:
+    def matches(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:
         """Where a landmark's filters match: pixels (N,2), and how many filters say so (N,).
 
         Args:
             landmark: which one.
-            cells: centred map of one image (1,bins,h,w).
-            without: leave out the filter that comes from this training image.
+            columns: the windows of one image's centred map, see ``unit_windows``.
+            width: of that map.
         """
-        scores = similarity(cells, self.filters[landmark], self.settings.hog)[0]
-        return self._votes(landmark, *self._best_scores(scores), scores.shape[-1], without)
+        scores = similarity(columns, self.filters[landmark])[0]
+        return self._votes(landmark, *self._best_scores(scores), width)
 
     def _best_scores(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Of score maps (M,h,w): the best of each (M,R), and their places in a row of all."""
-        flat = scores.flatten(1)
-        best = flat.topk(min(self._kept_matches, flat.shape[1]), dim=1)
+        """Of scores (M,P): the best of each row (M,R), and their places."""
+        best = scores.topk(min(self._kept_matches, scores.shape[1]), dim=1)
         return best.values, best.indices
 
     def _votes(
-        self, landmark: int, best: Tensor, place: Tensor, width: int, without: int | None
+        self, landmark: int, best: Tensor, place: Tensor, width: int, without: int | None = None
     ) -> tuple[Tensor, Tensor]:
         good = (best >= self.settings.similarity_threshold) & self._more_likely_good(landmark, best)
         if without is not None:
@@ -232,8 +232,8 @@ class UVLandmarkDetector(nn.Module):
     def _kept_matches(self) -> int:
         return max(4, round(self.settings.responses / self.settings.hog.stride**2))
 
-    def _locate(self, landmark: int, cells: Tensor) -> tuple[Tensor, Tensor]:
-        best, share = self._best_cluster(landmark, *self.matches(landmark, cells))
+    def _locate(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:
+        best, share = self._best_cluster(landmark, *self.matches(landmark, columns, width))
         return self._weighed(landmark, best, share), share
 
     def _weighed(self, landmark: int, place: Tensor, share: Tensor) -> Tensor:
@@ -288,19 +288,19 @@ class UVLandmarkDetector(nn.Module):
         place = torch.zeros(best.shape, dtype=torch.int64)
         rows, columns = (settings.hog.positions(torch.arange(n)) for n in (height, width))
         for i, cells in enumerate(maps):
-            centred = (cells - self.mean_cell[:, None, None])[None]
+            centred = unit_windows((cells - self.mean_cell[:, None, None])[None], settings.hog)
             others = torch.arange(count) != i
             for k in range(len(self.names)):
                 if not bool(torch.isfinite(landmarks[i, k]).all()):
                     continue
-                scores = similarity(centred, self.filters[k, others], settings.hog)[0]
+                scores = similarity(centred, self.filters[k, others])[0]
                 best[i, k, others], place[i, k, others] = self._best_scores(scores)
                 away = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
-                near = away <= settings.good_radius**2
+                near = away.flatten() <= settings.good_radius**2
                 kept = scores >= settings.similarity_threshold
                 for which, region in enumerate((near, ~near)):
-                    chosen = torch.where(kept & region, scores, 0.0).flatten(1)
-                    moments = [(kept & region).flatten(1).sum(1), chosen.sum(1), chosen.square().sum(1)]
+                    chosen = torch.where(kept & region, scores, 0.0)
+                    moments = [(kept & region).sum(1), chosen.sum(1), chosen.square().sum(1)]
                     sums[which, k, others] += torch.stack([m.double() for m in moments], dim=-1)
             if progress is not None:
                 progress(i + 1, count)
