@@ -1,0 +1,309 @@
+"""A head from landmarks in photographs: identity, expression and cameras at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.camera import Camera
+from torchface.geometry.pnp import Pose, solve_pnp
+from torchface.geometry.silhouette import LevelCurves, level_curves
+from torchface.mesh import Mesh
+from torchface.modeling.head_model import HeadModel
+from torchface.modeling.image_solve import FitSettings, Problem, State, covariance, solve
+from torchface.modeling.landmark_view import JAW, LinearPoints, Views
+from torchface.modeling.transfer import transfer_with_report
+from torchface.rig import BlendshapeRig
+
+LANDMARKS = 68
+_FEWEST = 6
+_FOCAL, _FOCAL_SPREAD = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
+_TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks
+_UNLIKE = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
+_INSIDE = 0.5
+_SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFit:
+    """A person's head, found in I photographs with 68 landmarks each.
+
+    Args:
+        mesh: the head at rest, in the model's place, with the rig's topology and skin.
+        posed: the same with the expression of the photographs.
+        coefficients: of identity, (K,), standard deviations.
+        weights: of the rig's shapes, (N,).
+        cameras: one a photograph.
+        residuals: where the fit's landmarks are seen minus where they were found, (I,68,2), pixels, NaN for missing.
+        landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
+        noise: estimated deviation of an inner landmark, pixels.
+        covariance: of coefficients and weights, (K+N,K+N); rows of those that lie on their bound are zero.
+    """
+
+    mesh: Mesh
+    posed: Mesh
+    coefficients: Tensor
+    weights: Tensor
+    cameras: tuple[Camera, ...]
+    residuals: Tensor
+    landmarks: Tensor
+    noise: float
+    covariance: Tensor
+
+    @property
+    def errors(self) -> Tensor:
+        """Root mean square distance of the landmarks in each photograph, (I,), pixels."""
+        return self.residuals.square().sum(-1).nanmean(-1).sqrt()
+
+
+def fit_images(
+    model: HeadModel,
+    rig: BlendshapeRig,
+    landmarks: Tensor,
+    image_size: tuple[int, int] | Sequence[tuple[int, int]],
+    landmark_vertices: Tensor | None = None,
+    camera: float | Tensor | None = None,
+    settings: FitSettings | None = None,
+    transfers: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> ImageFit:
+    r"""The head whose landmarks are seen where photographs show them.
+
+    .. math:: \min_{a,w,P} \sum_{i,l} c_l \lVert P_i(\bar S + \sum_k a_k s_k + \sum_n w_n B_n)_{v_l} - q_{il} \rVert^2
+              / \sigma^2 + \lVert a \rVert^2 + \rho(w), \quad |a| \le 3, \; 0 \le w \le 1
+
+    for all photographs of one person with one expression together. Poses start by PnP; then identity, expression,
+    poses and focal length move at once, each step a quadratic program in a box. Landmarks of the face's contour slide
+    to where the silhouette is. At the end the shapes that show are transferred to the head found, and it is fitted
+    again.
+
+    Args:
+        model: heads at rest.
+        rig: template with the model's topology.
+        landmarks: in iBUG's order, (I,68,2), pixels, x right, y down; NaN for missing.
+        image_size: (width, height) of all photographs, or one for each.
+        landmark_vertices: of the 68, (68,); the rig's annotated ones, or the model's, if absent.
+        camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as known unless
+            ``settings.focal_spread`` says how far it may be off. Estimated if absent.
+        settings: how landmarks are trusted; see ``FitSettings``.
+        transfers: how often shapes are transferred to the head found; 0 keeps the template's.
+        progress: called with a line before each step.
+
+    Returns:
+        The head, what it took to find it, and how sure it is; see ``ImageFit``. Solved in float64 on the CPU.
+
+    Raises:
+        ShapeError: the landmarks are not (I,68,2), or sizes do not fit.
+        TopologyError: model and rig have other triangles.
+        ValueRangeError: too few landmarks in a view, or landmarks outside its picture.
+        AlignmentError: a face seen from behind, or landmarks that are not a face's in iBUG's order.
+
+    Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
+    """
+    say = progress or (lambda line: None)
+    vertices = _checked_topology(model, rig, landmark_vertices)
+    sizes = _checked_landmarks(landmarks, image_size)
+    intrinsics, settings = _lens(camera, sizes, settings or FitSettings())
+    found = landmarks.detach().cpu().double()
+    mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
+    deltas = _in_place(rig, mean)
+    curves = _contour_curves(mean, model.faces.cpu(), vertices)
+    points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
+    say("placing the cameras")
+    pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
+    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings)
+    start = State(
+        torch.zeros(len(points.basis), dtype=torch.float64),
+        Views(intrinsics, pose.rotation, pose.translation),
+        torch.arange(LANDMARKS).expand(len(found), -1),
+        float(pose.errors.mean()) if settings.noise is None else settings.noise,
+    )
+    say("fitting identity and expression")
+    state = solve(problem, start)
+    for turn in range(transfers):
+        say(f"transferring the shapes that show, {turn + 1} of {transfers}")
+        weights = state.coefficients[len(modes) :].float()
+        rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
+        deltas = _personal(rig, deltas, weights, vertices, rest)
+        points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
+        problem = replace(problem, points=points)
+        state = solve(problem, state)
+    return _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
+
+
+def _result(
+    problem: Problem, state: State, template: Mesh, mean: Tensor, modes: Tensor, deltas: Tensor, sizes: Tensor
+) -> ImageFit:
+    coefficients, weights = state.coefficients[: len(modes)].float(), state.coefficients[len(modes) :].float()
+    rest = mean + torch.tensordot(coefficients, modes, dims=1)
+    shown = rest + torch.tensordot(weights, deltas, dims=1)
+    views = state.views
+    cameras = tuple(
+        Camera(K, R, t, int(width), int(height))
+        for K, R, t, (width, height) in zip(
+            views.intrinsics, views.rotation, views.translation, sizes.tolist(), strict=True
+        )
+    )
+    seen = views.pixels(problem.points.at(state.coefficients)[state.rows])
+    mesh = template.to("cpu")
+    return ImageFit(
+        mesh.with_vertices(rest),
+        mesh.with_vertices(shown),
+        coefficients,
+        weights,
+        cameras,
+        seen - problem.found,
+        seen,
+        state.noise,
+        covariance(problem, state),
+    )
+
+
+def _checked_topology(model: HeadModel, rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
+    """The landmark vertices (68,)."""
+    faces = rig.neutral.faces
+    if len(model.shape.mean) != len(rig.vertices) or not torch.equal(model.faces.cpu(), faces.cpu()):
+        raise TopologyError(
+            f"fit_images: found a model of {len(model.shape.mean)} vertices and {len(model.faces)} triangles for a rig "
+            f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
+        )
+    if landmark_vertices is None:
+        known = rig.neutral.annotations
+        landmark_vertices = known.landmarks if known is not None and known.landmarks is not None else model.landmarks
+    if landmark_vertices is None:
+        raise ValueRangeError(
+            "landmark_vertices: found none, neither given nor annotated on rig or model; expected (68,) vertex ids"
+        )
+    if landmark_vertices.shape != (LANDMARKS,) or landmark_vertices.dtype != torch.int64:
+        raise ShapeError(
+            f"landmark_vertices: found {tuple(landmark_vertices.shape)} of {landmark_vertices.dtype}, expected "
+            f"({LANDMARKS},) of torch.int64"
+        )
+    if not 0 <= int(landmark_vertices.min()) <= int(landmark_vertices.max()) < len(rig.vertices):
+        raise TopologyError(
+            f"landmark_vertices: found {int(landmark_vertices.min())} to {int(landmark_vertices.max())}, expected 0 "
+            f"to {len(rig.vertices) - 1}"
+        )
+    return landmark_vertices.cpu()
+
+
+def _checked_landmarks(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:
+    """The photographs' sizes, (I,2): width and height."""
+    if landmarks.ndim != 3 or landmarks.shape[1:] != (LANDMARKS, 2) or len(landmarks) == 0:
+        raise ShapeError(
+            f"landmarks: found {tuple(landmarks.shape)}, expected (I,{LANDMARKS},2) with at least one view"
+        )
+    sizes = torch.as_tensor(image_size, dtype=torch.float64)
+    if sizes.shape not in ((2,), (len(landmarks), 2)) or not bool((sizes >= 2).all()):
+        raise ShapeError(
+            f"image_size: found {image_size}, expected (width, height) in pixels, once or for each of "
+            f"{len(landmarks)} views"
+        )
+    sizes = sizes.expand(len(landmarks), 2)
+    for i, (marks, size) in enumerate(zip(landmarks.double(), sizes, strict=True)):  # a view at a time, for its message
+        _check_view(i, marks.cpu(), size)
+    return sizes
+
+
+def _check_view(i: int, marks: Tensor, size: Tensor) -> None:
+    seen = torch.isfinite(marks).all(-1)
+    picture = f"a picture of {int(size[0])} x {int(size[1])}"
+    if int(seen.sum()) == 0:
+        raise ValueRangeError(f"landmarks: found none in view {i}, expected at least {_FEWEST}; leave that view out")
+    if int(seen[JAW:].sum()) < _FEWEST:
+        raise ValueRangeError(
+            f"landmarks: found {int(seen[JAW:].sum())} on brows, eyes, nose and mouth in view {i}, expected at least "
+            f"{_FEWEST}"
+        )
+    low, high = marks[seen].amin(0), marks[seen].amax(0)
+    found = f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
+    if float((high - low).max()) < 4:
+        raise ValueRangeError(f"landmarks: found view {i}'s from {found}, expected pixels in {picture}")
+    inside = ((marks[seen] > -0.1 * size) & (marks[seen] < 1.1 * size)).all(-1)
+    if float(inside.double().mean()) < _INSIDE:
+        raise ValueRangeError(
+            f"landmarks: found view {i}'s from {found}, most of them outside {picture}; expected pixels of that picture"
+        )
+
+
+def _lens(camera: float | Tensor | None, sizes: Tensor, settings: FitSettings) -> tuple[Tensor, FitSettings]:
+    """Intrinsics (I,3,3), and the settings with what is known of the focal length."""
+    count = len(sizes)
+    if isinstance(camera, Tensor) and camera.ndim > 0:
+        intrinsics = camera.detach().cpu().double()
+        if intrinsics.shape not in ((3, 3), (count, 3, 3)):
+            raise ShapeError(f"camera: found {tuple(camera.shape)}, expected (3,3) or ({count},3,3)")
+        if not torch.isfinite(intrinsics).all() or not bool((intrinsics[..., [0, 1], [0, 1]] > 0).all()):
+            raise ValueRangeError("camera: found a focal length that is not positive, expected K with positive ones")
+        return intrinsics.expand(count, 3, 3), settings
+    if camera is None:
+        focal = _FOCAL * sizes.amax(1)
+        if settings.focal_spread == 0:
+            settings = replace(settings, focal_spread=_FOCAL_SPREAD)
+        if not bool((sizes == sizes[0]).all()):  # other sizes, other cameras or crops
+            settings = replace(settings, shared_focal=False)
+    else:
+        focal = torch.full((count,), float(camera), dtype=torch.float64)
+        if not math.isfinite(float(camera)) or not float(camera) > 0:
+            raise ValueRangeError(f"camera: found a focal length of {float(camera):g}, expected positive pixels")
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
+    intrinsics[:, :2, 2] = (sizes - 1) / 2
+    return intrinsics, settings
+
+
+def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
+    """The rig's deltas (N,V,3) where the model's heads are, turned and scaled as they are."""
+    rest, deltas = rig.vertices.detach().cpu(), rig.deltas.detach().cpu()
+    if torch.allclose(rest, mean, atol=1e-3):
+        return deltas.float()
+    return similarity_transform(rest[None], mean[None]).apply_vectors(deltas).float()
+
+
+def _contour_curves(mean: Tensor, faces: Tensor, landmarks: Tensor) -> LevelCurves:
+    """Where contour landmarks slide: over the skin, but not over the nose."""
+    x, y = mean[:, 0].abs(), mean[:, 1]
+    wing, top, bottom = float(x[landmarks[[31, 35]]].max()), float(y[landmarks[27]]), float(y[landmarks[33]])
+    nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
+    return level_curves(mean, faces[~nose[faces].any(1)], landmarks[:JAW])
+
+
+def _checked_pose(mean: Tensor, found: Tensor, intrinsics: Tensor) -> Pose:
+    """By the inner landmarks, which mean the same points whatever the pose."""
+    inner = torch.ones(LANDMARKS, dtype=torch.float64)
+    inner[:JAW] = 0
+    pose = solve_pnp(mean, found, intrinsics, inner)
+    marks = found[:, JAW:]
+    size = (marks - marks.nanmean(1, keepdim=True)).square().sum(-1).nanmean(1).sqrt()
+    turned = torch.rad2deg(torch.arccos((-pose.rotation[:, 2, 2]).clamp(-1, 1)))
+    for i in range(len(found)):  # a view at a time, for its message
+        share = float(pose.errors[i] / size[i])
+        if share > _UNLIKE:
+            raise AlignmentError(
+                f"landmarks: found view {i}'s {share:.0%} of their extent away from a face's, expected less than "
+                f"{_UNLIKE:.0%}; are they in iBUG's order of 68, x before y?"
+            )
+        if float(turned[i]) > _TURNED:
+            raise AlignmentError(
+                f"landmarks: found a face turned by {float(turned[i]):.0f}° in view {i}, as if seen from behind, "
+                f"expected at most {_TURNED:.0f}°; are left and right swapped, or is y up?"
+            )
+    return pose
+
+
+def _personal(rig: BlendshapeRig, deltas: Tensor, weights: Tensor, landmarks: Tensor, rest: Tensor) -> Tensor:
+    """The deltas (N,V,3) with those shapes that show at a landmark transferred to a head at rest (V,3)."""
+    shows = weights * deltas[:, landmarks].norm(dim=-1).amax(1) > _SHOWS
+    names = [name for name, shown in zip(rig.names, shows.tolist(), strict=True) if shown]
+    if not names:
+        return deltas
+    transferred = transfer_with_report(rig.select(names), rig.neutral.with_vertices(rest.to(rig.vertices)))
+    deltas = deltas.clone()
+    deltas[shows] = transferred.rig.deltas.cpu().float()
+    return deltas
