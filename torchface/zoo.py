@@ -17,8 +17,10 @@ from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.model_files import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
 from torchface.modeling.head_model import HeadModel
 from torchface.modeling.morphable import MorphableModel
+from torchface.modeling.personalization import ExpressionRegression
 
 KINDS: dict[str, type[nn.Module]] = {
+    "expression_regression": ExpressionRegression,
     "head": HeadModel,
     "marker_solver": MarkerSolver,
     "morphable": MorphableModel,

@@ -1,16 +1,19 @@
 """Faces as models: learned ones, personal rigs, and the detail that meshes are too coarse to hold."""
 
+from torchface.modeling.color_casts import color_casts, texture_areas, without_cast
 from torchface.modeling.detail import BakeStatistics, NormalMap, bake_normal_map, detail_maps
 from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.modeling.head_model import HeadModel, Heads
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.open_eyes import open_eyes
+from torchface.modeling.personalization import ExpressionRegression, rig_from_neutral
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
 
 __all__ = [
     "BakeStatistics",
     "ExampleRig",
+    "ExpressionRegression",
     "HeadModel",
     "Heads",
     "MorphableModel",
@@ -21,9 +24,13 @@ __all__ = [
     "TransferredRig",
     "align_scan",
     "bake_normal_map",
+    "color_casts",
     "detail_maps",
     "open_eyes",
     "rig_from_examples",
+    "rig_from_neutral",
+    "texture_areas",
     "transfer_deformation",
     "transfer_with_report",
+    "without_cast",
 ]
