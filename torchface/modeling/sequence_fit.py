@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -14,27 +13,18 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files import read_file, write_file
+from torchface.geometry.samples import Samples, blocks
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.principal_components import check_count, check_rank, gram_spectrum, signs
 
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
-
-
-class Samples(Protocol):
-    """Samples (M,V,C) that are read a few at a time, such as a :class:`torchface.io.mesh_sequence.MeshSequence`."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
-
-    def read(self, begin: int, end: int) -> Tensor:
-        """Samples ``begin`` to ``end``, without the last, (N,V,C)."""
-        ...
+_MANY = 200
 
 
 def fit_sequence(
     samples: Samples,
-    components: int,
+    components: int | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> MorphableModel:
@@ -46,7 +36,7 @@ def fit_sequence(
 
     Args:
         samples: in correspondence, aligned.
-        components: how many.
+        components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
         checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
             samples and folder, the fit continues; in the end the files are removed.
         progress: called with (blocks done, blocks).
@@ -60,25 +50,27 @@ def fit_sequence(
     """
     count, vertices, channels = samples.shape
     check_count(count, components)
-    blocks = list(_blocks(count, vertices * channels))
-    work = 2 * len(blocks) + len(blocks) * (len(blocks) + 1) // 2
+    if components is None and count > _WHOLE_SPECTRUM:
+        components = _MANY
+    parts = list(blocks(samples, _BLOCK_BYTES))
+    work = 2 * len(parts) + len(parts) * (len(parts) + 1) // 2
     steps = iter(range(1, work + 1))
 
     def step() -> None:
         if progress is not None:
             progress(next(steps), work)
 
-    mean, floor = _mean(samples, blocks, step)
+    mean, floor = _mean(samples, parts, step)
     gram = torch.zeros(count, count, dtype=torch.float64)
     rows = _Rows(None if checkpoint is None else Path(checkpoint), mean, count)
-    for number, (begin, end) in enumerate(blocks):
+    for number, (begin, end) in enumerate(parts):
         if (known := rows.read(number, end - begin, end)) is not None:
             gram[begin:end, :end] = known
             for _ in range(number + 1):
                 step()
             continue
         own = _centred(samples, begin, end, mean)
-        for first, last in blocks[: number + 1]:
+        for first, last in parts[: number + 1]:
             other = own if first == begin else _centred(samples, first, last, mean)
             gram[begin:end, first:last] = own @ other.T
             step()
@@ -86,32 +78,26 @@ def fit_sequence(
     values, vectors, trace = _leading(gram, floor, components)
     toward = (vectors / values.sqrt()).T.contiguous()
     del gram, vectors
-    learned = torch.zeros(components, vertices * channels, dtype=torch.float64)
-    for begin, end in blocks:
+    learned = torch.zeros(len(values), vertices * channels, dtype=torch.float64)
+    for begin, end in parts:
         learned.addmm_(toward[:, begin:end], _centred(samples, begin, end, mean))
         step()
     learned.mul_(signs(learned)[:, None])
     rows.remove()
     return MorphableModel(
         mean.reshape(vertices, channels),
-        learned.reshape(components, vertices, channels),
+        learned.reshape(len(values), vertices, channels),
         (values / (count - 1)).sqrt(),
         trace / (count - 1),
         count,
     )
 
 
-def _blocks(count: int, size: int) -> Iterator[tuple[int, int]]:
-    rows = max(1, min(count, _BLOCK_BYTES // (8 * size)))
-    for begin in range(0, count, rows):
-        yield begin, min(begin + rows, count)
-
-
-def _mean(samples: Samples, blocks: list[tuple[int, int]], step: Callable[[], None]) -> tuple[Tensor, float]:
+def _mean(samples: Samples, parts: list[tuple[int, int]], step: Callable[[], None]) -> tuple[Tensor, float]:
     """The mean (D,) float64, and the eigenvalue that rounding alone makes."""
     total: Tensor | None = None
     largest = eps = 0.0
-    for begin, end in blocks:
+    for begin, end in parts:
         part = samples.read(begin, end).flatten(1)
         summed = part.sum(0, dtype=torch.float64)
         if not bool(torch.isfinite(summed).all()):
@@ -128,10 +114,10 @@ def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
     return samples.read(begin, end).flatten(1).double().sub_(mean)
 
 
-def _leading(gram: Tensor, floor: float, count: int) -> tuple[Tensor, Tensor, float]:
+def _leading(gram: Tensor, floor: float, count: int | None) -> tuple[Tensor, Tensor, float]:
     """The leading eigenpairs of a matrix whose lower triangle is filled, and its trace."""
     size = len(gram)
-    if size <= _WHOLE_SPECTRUM or count > size // 4:
+    if count is None or size <= _WHOLE_SPECTRUM or count > size // 4:
         spectrum = gram_spectrum(gram, floor, count)
         return spectrum.values, spectrum.vectors, spectrum.trace
     trace = float(gram.diagonal().sum())
