@@ -1,0 +1,161 @@
+"""What is in a head-camera video: where to look, and which action units were performed when, as TOML."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files import read_file, write_file
+
+_FORMAT = "torchface.action_labels/1"
+_LARGEST_TEXT = 2**22
+_MOST = 10_000_000
+
+Box = tuple[float, float, float, float]
+Pixel = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Performed:
+    """Action units done together, from rest and back to rest.
+
+    Args:
+        units: their names, such as ``("1+2", "4")``.
+        first: frame in which the motion begins.
+        last: the frame before which it is over.
+    """
+
+    units: tuple[str, ...]
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class ActionLabels:
+    """A head-camera video described.
+
+    Args:
+        frames: how many frames the video has.
+        neutral: a frame in which the face is at rest; pixels below are its.
+        helmet: a point of the helmet that the camera sees, (x,y).
+        markers: two markers on the sides of the face, (x,y) each.
+        regions: boxes (left, top, right, bottom) by name.
+        performed: what was done when, in any order; empty for a video that is only to be classified.
+
+    Raises:
+        ValueRangeError: a frame outside the video, an empty stretch or box, or a number that is not finite.
+        NameMismatchError: a stretch without a unit, or no region.
+    """
+
+    frames: int
+    neutral: int
+    helmet: Pixel
+    markers: tuple[Pixel, Pixel]
+    regions: dict[str, Box]
+    performed: tuple[Performed, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= _MOST:
+            raise ValueRangeError(f"labels: found {self.frames} frames, expected 1 to {_MOST}")
+        if not 0 <= self.neutral < self.frames:
+            raise ValueRangeError(f"labels: found neutral frame {self.neutral}, expected 0 to {self.frames - 1}")
+        if not all(math.isfinite(v) for point in (self.helmet, *self.markers) for v in point):
+            raise ValueRangeError(f"labels: found helmet {self.helmet} and markers {self.markers}, expected pixels")
+        if not self.regions:
+            raise NameMismatchError("labels: found no region, expected at least one")
+        for name, (left, top, right, bottom) in self.regions.items():
+            if not (math.isfinite(left + top + right + bottom) and left + 1 < right and top + 1 < bottom):
+                raise ValueRangeError(
+                    f"labels: region {name!r} is {(left, top, right, bottom)}, expected left < right, top < bottom"
+                )
+        for stretch in self.performed:
+            if not 0 <= stretch.first < stretch.last <= self.frames:
+                raise ValueRangeError(
+                    f"labels: {' '.join(stretch.units)} is performed from frame {stretch.first} to before "
+                    f"{stretch.last}, expected a stretch within the video's {self.frames} frames"
+                )
+            if not stretch.units or len(set(stretch.units)) < len(stretch.units):
+                raise NameMismatchError(f"labels: found the units {stretch.units!r}, expected distinct names")
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Every action unit that is performed, in order of first appearance."""
+        return tuple(dict.fromkeys(unit for stretch in self.performed for unit in stretch.units))
+
+
+def load_action_labels(path: str | Path) -> ActionLabels:
+    """Reads what :func:`save_action_labels` wrote, or a person with a text editor.
+
+    Raises:
+        FileFormatError: the file is missing, too large, no TOML, or lacks a field.
+        ValueRangeError, NameMismatchError: what it says cannot be; see :class:`ActionLabels`.
+    """
+    path = Path(path)
+    try:
+        document = tomllib.loads(read_file(path, _LARGEST_TEXT).decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise FileFormatError(f"{path}: not TOML ({error})") from error
+    if document.get("format") != _FORMAT:
+        raise FileFormatError(f'{path}: found format {document.get("format")!r:.60}, expected "{_FORMAT}"')
+    try:
+        markers = [_numbers(point, 2) for point in document["markers"]]
+        if len(markers) != 2:
+            raise ValueError(f"found {len(markers)} markers, expected two")
+        performed = tuple(
+            Performed(tuple(_text(unit) for unit in entry["units"]), _whole(entry["first"]), _whole(entry["last"]))
+            for entry in document.get("performed", [])
+        )
+        return ActionLabels(
+            _whole(document["frames"]),
+            _whole(document["neutral"]),
+            _numbers(document["helmet"], 2),
+            (markers[0], markers[1]),
+            {name: _numbers(box, 4) for name, box in document["regions"].items()},
+            performed,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileFormatError(f"{path}: no labels of a video ({type(error).__name__}: {error})") from error
+    except (ValueRangeError, NameMismatchError) as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
+    """Writes TOML; the file appears only when it is complete."""
+    document: dict[str, Any] = {
+        "format": _FORMAT,
+        "frames": labels.frames,
+        "neutral": labels.neutral,
+        "helmet": list(labels.helmet),
+        "markers": [list(point) for point in labels.markers],
+        "regions": {name: list(box) for name, box in labels.regions.items()},
+        "performed": [
+            {"units": list(stretch.units), "first": stretch.first, "last": stretch.last} for stretch in labels.performed
+        ],
+    }
+    write_file(path, tomli_w.dumps(document).encode())
+
+
+def _whole(value: object) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not -_MOST <= value <= _MOST:
+        raise ValueError(f"found {value!r:.40}, expected a whole number")
+    return value
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"found {value!r:.40}, expected a name")
+    return value
+
+
+def _numbers(values: object, count: int) -> Any:
+    if not isinstance(values, list) or len(values) != count:
+        raise ValueError(f"found {values!r:.60}, expected {count} numbers")
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e9 for v in values):
+        raise ValueError(f"found {values!r:.60}, expected {count} numbers")
+    return tuple(float(v) for v in values)
