@@ -17,11 +17,10 @@ from torchface.geometry.silhouette import LevelCurves, level_curves
 from torchface.mesh import Mesh
 from torchface.modeling.head_model import HeadModel
 from torchface.modeling.image_solve import FitSettings, Problem, State, covariance, solve
-from torchface.modeling.landmark_view import JAW, LinearPoints, Views
+from torchface.modeling.landmark_view import JAW, LANDMARKS, LinearPoints, Views
 from torchface.modeling.transfer import transfer_with_report
 from torchface.rig import BlendshapeRig
 
-LANDMARKS = 68
 _FEWEST = 6
 _FOCAL, _FOCAL_SPREAD = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
 _TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks

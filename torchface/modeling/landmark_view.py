@@ -11,6 +11,7 @@ from torchface.geometry.pnp import pixel_jacobian
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
 from torchface.geometry.silhouette import LevelCurves, outermost
 
+LANDMARKS = 68
 JAW = 17
 """How many of the 68 landmarks trace the face's contour; they come first."""
 

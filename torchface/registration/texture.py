@@ -12,14 +12,14 @@ from torch import Tensor
 from torchface.errors import TopologyError
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.proximity import SurfacePoints
-from torchface.geometry.uv_raster import TexelMap, interpolate, rasterise_uvs
+from torchface.geometry.uv_margin import laid_out
+from torchface.geometry.uv_raster import interpolate, rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import sample_texture
 
 _REACH = 5.0
 _LARGEST_ANGLE = 75.0
-_SEAM = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def resampled_texture(mesh: Mesh, colors: Tensor, source: ScanColors, size: int)
     values = texels.interpolate(colors.double(), faces).float()
     triangle, barycentric, found = _along_normals(source, points, normals)
     values[found] = source.at(triangle[found], barycentric[found])
-    return _widened(values.clamp(0, 1), texels)
+    return laid_out(values.clamp(0, 1), texels)
 
 
 def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,18 +116,3 @@ def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple
         triangle = torch.where(better, hits.triangle, triangle)
         barycentric = torch.where(better[:, None], hits.barycentric.double(), barycentric)
     return triangle, barycentric, triangle >= 0
-
-
-def _widened(values: Tensor, texels: TexelMap) -> Tensor:
-    """The texels laid out (3,H,W); around the charts the mean of the neighbours that have a colour, ring by ring."""
-    image = torch.zeros(3, texels.height * texels.width)
-    image[:, texels.texels] = values.T
-    image = image.reshape(1, 3, texels.height, texels.width)
-    known = texels.mask()[None, None].float()
-    background = values.mean(0).reshape(1, 3, 1, 1) if len(values) else torch.zeros(1, 3, 1, 1)
-    for _ in range(_SEAM):  # a ring of texels a turn
-        count = torch.nn.functional.avg_pool2d(known, 3, 1, 1, count_include_pad=True)
-        mean = torch.nn.functional.avg_pool2d(image * known, 3, 1, 1) / count.clamp(min=1e-6)
-        image = torch.where(known > 0, image, torch.where(count > 0, mean, image))
-        known = (count > 1e-6).float()
-    return torch.where(known > 0, image, background)[0].contiguous()

@@ -1,0 +1,204 @@
+"""Photographs as a head's texture: blended by viewing angle, seams hidden, completed where none shows the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError
+from torchface.geometry.camera import Camera
+from torchface.geometry.operators import edges, vertex_normals
+from torchface.geometry.uv_margin import laid_out
+from torchface.geometry.uv_raster import rasterise_uvs
+from torchface.mesh import Mesh
+from torchface.modeling.visibility import Shown, shown_in
+from torchface.rendering.raycast import RayCaster
+
+_SQUARELY = 0.2
+_SHARP = 3.0
+_FEATHER, _BROAD, _FILL = 6, 60, 400
+_MOST_GAIN = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoTexture:
+    """A texture made of photographs.
+
+    Args:
+        image: (3,size,size), first row on top.
+        colors: of the vertices, (V,3).
+        seen: how much of each vertex's colour comes from photographs, (V,) in [0,1].
+    """
+
+    image: Tensor
+    colors: Tensor
+    seen: Tensor
+
+
+def photo_texture(
+    mesh: Mesh,
+    images: Sequence[Tensor],
+    cameras: Sequence[Camera],
+    size: int = 1024,
+    base: Tensor | None = None,
+) -> PhotoTexture:
+    """Lays photographs on a head.
+
+    Each texel takes the photographs that see it, the squarest most. Weights are made on the vertices and fade out over
+    the mesh before a photograph ends, so that no edge of one shows, also not where the layout is cut. What photographs
+    differ in broadly (exposure, white balance, shading) is brought to their mean, detail is kept from the squarest.
+    Where none shows the skin, the mirror image of the other side is taken, then the base; both are toned to what is
+    next to them.
+
+    Args:
+        mesh: the head as the photographs show it, with texture coordinates.
+        images: photographs, (3,H,W) each.
+        cameras: one each.
+        size: texels a side.
+        base: colours for what no photograph shows, (V,3), such as ``fit_colors`` gives; those nearby if absent.
+
+    Raises:
+        ShapeError: not one camera an image, a picture of another size than its camera's, or a base of another shape.
+        TopologyError: the mesh has no texture coordinates.
+        AlignmentError: no photograph shows the head.
+
+    Source: thesis 3.2.5, algorithm 3; Burt and Adelson 1983 (bands blended apart).
+    """
+    if len(images) != len(cameras) or not images:
+        raise ShapeError(f"photo_texture: found {len(images)} images and {len(cameras)} cameras, expected one each")
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("photo_texture: found a mesh without texture coordinates, expected some to lay it out in")
+    if base is not None and base.shape != mesh.vertices.shape:
+        raise ShapeError(f"base: found {tuple(base.shape)}, expected {tuple(mesh.vertices.shape)}")
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    normals, caster, graph = vertex_normals(vertices, faces), RayCaster(vertices, faces), _Graph(faces, len(vertices))
+    at_vertices = [
+        shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
+    ]
+    weights = torch.stack([_faded(shown, graph) for shown in at_vertices])
+    seen = weights.sum(0)
+    if float(seen.max()) <= 0:
+        raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
+    gains = _gains(at_vertices, weights)
+    toned = [shown.colors.double() * gain for shown, gain in zip(at_vertices, gains, strict=True)]
+    blended, offsets = _blended(toned, weights, graph)
+    alpha = (seen / 0.05).clamp(max=1)
+    filled = _filled(mesh, blended, alpha, base, graph)
+    colors = torch.lerp(filled, blended, alpha[:, None])
+    texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
+    points = texels.interpolate(vertices, faces)
+    outward = torch.nn.functional.normalize(texels.interpolate(normals, faces), dim=-1)
+    total = torch.zeros(len(points), 1, dtype=torch.float64)
+    values = torch.zeros(len(points), 3, dtype=torch.float64)
+    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):  # photographs: a ray a texel each
+        shown = shown_in(image.cpu(), camera, caster, points, outward)
+        weight = texels.interpolate(weights[i, :, None], faces) * (shown.cosine[:, None] > 0)
+        tone = texels.interpolate(offsets[i], faces)
+        values += weight * (shown.colors.double() * gains[i] + tone)
+        total += weight
+    under = texels.interpolate(filled, faces)
+    share = (total / 0.05).clamp(max=1)
+    values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
+    return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
+
+
+class _Graph:
+    """Which vertices are neighbours, for fading and filling over the mesh rather than over its layout."""
+
+    def __init__(self, faces: Tensor, count: int) -> None:
+        self.first, self.second = edges(faces).T
+        degree = torch.zeros(count, dtype=torch.float64)
+        one = torch.ones(len(self.first), dtype=torch.float64)
+        self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Of each vertex's neighbours, (V,C)."""
+        total = torch.zeros_like(values).index_add_(0, self.first, values[self.second])
+        return total.index_add_(0, self.second, values[self.first])
+
+    def smoothed(self, values: Tensor, weights: Tensor, rounds: int) -> Tensor:
+        """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""
+        top, bottom = values * weights[:, None], weights[:, None]
+        for _ in range(rounds):
+            both = torch.cat([top, bottom], dim=1)
+            both = 0.5 * (both + self.sum(both) / self.degree[:, None])
+            top, bottom = both[:, :-1], both[:, -1:]
+        return top / bottom.clamp(min=1e-12)
+
+    def least(self, values: Tensor) -> Tensor:
+        """Of each vertex and its neighbours, (V,)."""
+        least = values.clone()
+        least.scatter_reduce_(0, self.first, values[self.second], "amin")
+        return least.scatter_reduce_(0, self.second, values[self.first], "amin")
+
+
+def _faded(shown: Shown, graph: _Graph) -> Tensor:
+    """A photograph's weight at each vertex, (V,): how squarely it is seen, fading to 0 before it ends."""
+    weight = ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
+    inner = (weight > 0).double()
+    for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is off
+        inner = graph.least(inner)
+    soft = inner
+    for _ in range(_FEATHER):
+        soft = torch.minimum(inner, 0.5 * (soft + graph.sum(soft[:, None])[:, 0] / graph.degree))
+    return weight * soft
+
+
+def _gains(shown: Sequence[Shown], weights: Tensor) -> Tensor:
+    """What each photograph's channels are multiplied by so that they agree where they overlap, (I,3)."""
+    count = len(shown)
+    logs = torch.stack([one.colors.double().clamp(0.02, 0.98).log() for one in shown])
+    H = torch.full((count, count), 1e-6, dtype=torch.float64) + 1e-6 * torch.eye(count, dtype=torch.float64)
+    g = torch.zeros(count, 3, dtype=torch.float64)
+    for i in range(count):  # pairs of photographs
+        for j in range(i):
+            both = (weights[i] * weights[j]).sqrt()
+            if float(both.sum()) < 1e-6:
+                continue
+            ratio = logs[i] - logs[j]
+            middle = ratio[both > 0].median(0).values
+            trust = both * (1 / (1 + ((ratio - middle) / 0.2).square().sum(-1)))
+            step = (trust[:, None] * ratio).sum(0) / trust.sum()
+            strength = trust.sum()
+            H[i, i] += strength
+            H[j, j] += strength
+            H[i, j] -= strength
+            H[j, i] -= strength
+            g[i] -= strength * step
+            g[j] += strength * step
+    return torch.linalg.solve(H, g).exp().clamp(1 / _MOST_GAIN, _MOST_GAIN)
+
+
+def _blended(toned: Sequence[Tensor], weights: Tensor, graph: _Graph) -> tuple[Tensor, Tensor]:
+    """The vertices' colours (V,3), and what brings each photograph's broad tone to the mean, (I,V,3)."""
+    colors = torch.stack(list(toned))
+    mean = (weights[..., None] * colors).sum(0) / weights.sum(0).clamp(min=1e-12)[:, None]
+    offsets = torch.stack([
+        graph.smoothed(mean - color, weight, _BROAD) for color, weight in zip(colors, weights, strict=True)
+    ])  # fmt: skip
+    corrected = (weights[..., None] * (colors + offsets)).sum(0) / weights.sum(0).clamp(min=1e-12)[:, None]
+    return corrected, offsets
+
+
+def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: _Graph) -> Tensor:
+    """Colours (V,3) where no photograph shows the skin: the mirror image, the base, else what is nearest, toned."""
+    known, guess = alpha.clone(), colors * alpha[:, None]
+    mirror = None if mesh.annotations is None else mesh.annotations.mirror
+    if mirror is not None:
+        other = alpha[mirror.cpu()] * (1 - known)
+        guess, known = guess + other[:, None] * colors[mirror.cpu()], known + other
+    if base is not None:
+        under = base.detach().cpu().double()
+        tone = graph.smoothed(colors - under, alpha, _FILL)
+        guess = guess + (1 - known)[:, None] * (under + tone)
+        known = torch.ones_like(known)
+    rest = (known[:, None] > 0.5) & torch.isfinite(guess)
+    mean = (guess * alpha[:, None]).sum(0) / alpha.sum()
+    guess = torch.where(rest, guess / known.clamp(min=0.5)[:, None], mean)
+    fixed = rest[:, 0]
+    for _ in range(_FILL if not bool(fixed.all()) else 0):  # heat that flows from what is known
+        guess = torch.where(fixed[:, None], guess, graph.sum(guess) / graph.degree[:, None])
+    return guess
