@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 
 from torchface.mesh import Mesh
-from torchface.registration.linear_step import Data, LinearStep
+from torchface.registration.linear_step import Contacts, Data, LinearStep
 from torchface.registration.stiffness import identity_maps, linked_edges, stiffness_rows
 from torchface.registration.subspace import Subspace, all_maps, graph, translations
 
@@ -114,3 +114,21 @@ def test_the_kept_factorisation_serves_other_weights(patch: Mesh, data: Data) ->
     again = kept.minimise(start, other, tolerance=1e-9)
     fresh = step(space, patch, 0.1).minimise(start, other, tolerance=1e-9)
     assert torch.allclose(torch.from_numpy(again), torch.from_numpy(fresh), atol=1e-6)
+
+
+def test_contacts_keep_their_offset_and_the_optimum_agrees_with_scipy(patch: Mesh, data: Data) -> None:
+    generator = np.random.default_rng(3)
+    pairs = np.array([[3, 40], [10, 55], [20, 21]])
+    contacts = Contacts(pairs, generator.normal(size=(3, 3)), np.array([1.0, 30.0, 0.0]))
+    matrix, target = stacked(patch, data, 0.3)
+    place = sparse.eye_array(4 * len(patch.vertices), format="csr")[3::4]
+    rows = sparse.diags_array(np.sqrt(contacts.weights)) @ (place[pairs[:, 1]] - place[pairs[:, 0]])
+    matrix = sparse.vstack([matrix, sparse.block_diag([rows] * 3)])
+    target = np.concatenate([target, (np.sqrt(contacts.weights)[:, None] * contacts.offsets).T.ravel()])
+    expected = np.linalg.lstsq(matrix.toarray(), target, rcond=None)[0].reshape(3, -1).T
+    space = all_maps(stiffness_rows(patch.vertices, patch.faces, LENGTH))
+    solver = LinearStep(space, np.arange(40), patch.landmarks.numpy(), ALPHA, BETA, 0.3, contacts)
+    found = solver.minimise(identity_maps(patch.vertices), data, tolerance=1e-9)
+    assert np.allclose(found, expected, atol=1e-5)
+    residual = matrix @ found.T.ravel() - target
+    assert solver.energy(found, data) == pytest.approx(float(residual @ residual), rel=1e-8)

@@ -13,12 +13,14 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.geometry.operators import triangle_cross
 from torchface.geometry.proximity import SurfaceIndex
+from torchface.registration.contact import ContactPull
 from torchface.registration.correspondence import Correspondences, correspondences, evenly_spread, exposed_vertices
-from torchface.registration.linear_step import Data, LinearStep
+from torchface.registration.linear_step import Contacts, Data, LinearStep
 from torchface.registration.record import StageRecord
 from torchface.registration.schedule import Level, Schedule, Stage
 from torchface.registration.stiffness import identity_maps, linked_edges, positions, stiffness_rows
 from torchface.registration.subspace import Subspace, all_maps, graph, translations
+from torchface.rendering.raycast import RayCaster
 
 _AREA_OF_ONE = 10.0
 _MOST_ATTEMPTS = 8
@@ -40,14 +42,21 @@ class Deformer:
         faces: its triangles.
         scan: the surface.
         landmarks: what is known of where vertices belong; none of them is needed.
+        contacts: what touches at rest.
         schedule: of its constants; the stages are given one by one to ``run``.
     """
 
     def __init__(
-        self, vertices: Tensor, faces: Tensor, scan: SurfaceIndex, landmarks: LandmarkPull, schedule: Schedule
+        self,
+        vertices: Tensor,
+        faces: Tensor,
+        scan: SurfaceIndex,
+        landmarks: LandmarkPull,
+        contacts: ContactPull,
+        schedule: Schedule,
     ) -> None:
         self.rest, self.faces, self._scan, self._landmarks = vertices, faces, scan, landmarks
-        self._schedule = schedule
+        self._contacts, self._schedule = contacts, schedule
         self.maps = identity_maps(vertices)
         self.exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
         self._rest_cross = triangle_cross(vertices, faces)
@@ -111,6 +120,7 @@ class Deformer:
             stage.stiffness,
             stage.landmark_weight,
             self._schedule.sliding,
+            self._held_together(stage),
         )
         energies, moved, made = [], float("inf"), 0
         while made < stage.iterations and moved >= stage.tolerance:
@@ -150,6 +160,16 @@ class Deformer:
                 "expected the scan to show the template's face where the landmarks or its shape lay it"
             )
         return found
+
+    def _held_together(self, stage: Stage) -> Contacts | None:
+        if stage.contact_weight == 0 or not len(self._contacts.pairs):
+            return None
+        weights = stage.contact_weight**2 * self._contacts.weights(self.current, self._scan, self._caster)
+        return Contacts(self._contacts.pairs.numpy(), self._contacts.offsets.numpy(), weights.numpy())
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        return RayCaster(self._scan.vertices, self._scan.faces)
 
     def _data(self, found: Correspondences, pull: LandmarkPull) -> Data:
         share = self._area / _AREA_OF_ONE / max(len(found.vertices), 1)

@@ -36,11 +36,28 @@ class Data:
     landmarks: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Vertices that keep their place beside each other.
+
+    Args:
+        pairs: (K,2) int64.
+        offsets: o, from the first to the second, (K,3).
+        weights: c, (K,).
+    """
+
+    pairs: NDArray[np.int64]
+    offsets: Array
+    weights: Array
+
+
 class LinearStep:
     r"""Minimises cost function 7 over the affine maps of a subspace.
 
     .. math:: E(X) = \lVert \alpha (M \otimes G) X \rVert^2 + \lVert W (D X - U) \rVert^2
-        + \lVert \beta (D_L X - U_L) \rVert^2
+        + \lVert \beta (D_L X - U_L) \rVert^2 + \sum_{(i,j)} c_{ij} \lVert p_j - p_i - o_{ij} \rVert^2
+
+    The last sum, over vertices in contact, is not in the paper; p are the positions ``D X``.
 
     A vertex's block of :math:`W` is :math:`\sqrt w\,(n n^\top + \sqrt\rho\,(I - n n^\top))`: across the surface a
     correspondence counts in full, along it, where the nearest point says nothing, only a share :math:`\rho`. With
@@ -54,6 +71,7 @@ class LinearStep:
         stiffness: :math:`\alpha`.
         landmark_weight: :math:`\beta`.
         sliding: :math:`\rho`.
+        contacts: what is to keep together; nothing if absent.
 
     Source: Amberg, Romdhani, Vetter 2007, equation 12; thesis 3.2.3, equation 7.
     """
@@ -66,6 +84,7 @@ class LinearStep:
         stiffness: float,
         landmark_weight: float,
         sliding: float,
+        contacts: Contacts | None = None,
     ) -> None:
         self._space, self._vertices, self._landmarks = subspace, vertices, landmarks
         self._alpha2, self._beta2, self._rho = stiffness**2, landmark_weight**2, sliding
@@ -75,6 +94,11 @@ class LinearStep:
         fixed = self._alpha2 * subspace.stiffness_matrix + self._beta2 * (
             self._landmark_rows_t @ self._landmark_rows_t.T
         )
+        self._contacts = contacts
+        if contacts is not None:
+            apart = subspace.positions[contacts.pairs[:, 1]] - subspace.positions[contacts.pairs[:, 0]]
+            self._contact_rows_t = (apart.T @ sparse.diags_array(contacts.weights)).tocsr()
+            fixed = fixed + self._contact_rows_t @ apart
         # Nothing holds the whole where every correspondence is refused; the ridge holds it where it is.
         ridge = _RIDGE * fixed.diagonal().mean() + 1e-12
         self._fixed = (fixed + ridge * sparse.eye_array(fixed.shape[0])).tocsr()
@@ -88,7 +112,14 @@ class LinearStep:
         pull = (1 - self._rho) * across**2 + self._rho * (left**2).sum(1)
         landmarks = place[self._landmarks] - data.landmarks
         stiff = self._space.stiffness @ maps
-        return float(self._alpha2 * (stiff**2).sum() + (data.weights * pull).sum() + self._beta2 * (landmarks**2).sum())
+        energy = self._alpha2 * (stiff**2).sum() + (data.weights * pull).sum() + self._beta2 * (landmarks**2).sum()
+        if self._contacts is not None:
+            energy += (self._contacts.weights * (self._parted(self._contacts, place) ** 2).sum(1)).sum()
+        return float(energy)
+
+    @staticmethod
+    def _parted(contacts: Contacts, place: Array) -> Array:
+        return place[contacts.pairs[:, 1]] - place[contacts.pairs[:, 0]] - contacts.offsets
 
     def minimise(self, maps: Array, data: Data, tolerance: float = _TOLERANCE) -> Array:
         """The best maps (4V,3) among those that differ from ``maps`` by what the subspace spans.
@@ -113,6 +144,8 @@ class LinearStep:
         place = maps[3::4]
         downhill = self._rows_t @ blocks(data.targets - place[self._vertices])
         downhill += self._beta2 * (self._landmark_rows_t @ (data.landmarks - place[self._landmarks]))
+        if self._contacts is not None:
+            downhill -= self._contact_rows_t @ self._parted(self._contacts, place)
         downhill -= self._alpha2 * self._space.stiffness_gradient(maps)
         return maps + self._space.basis @ conjugate_gradients(apply, self._solver.solve, downhill, tolerance)
 

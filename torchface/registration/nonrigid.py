@@ -14,6 +14,7 @@ from torchface.geometry.alignment import Similarity
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
+from torchface.registration.contact import contact_pull
 from torchface.registration.correspondence import evenly_spread, exposed_vertices
 from torchface.registration.deformer import Deformer, LandmarkPull
 from torchface.registration.model_start import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
@@ -116,12 +117,13 @@ def register(
     say("laying the template on the scan")
     start = _start(template, scan, prepared, landmarks, detector, schedule)
     laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
+    contacts = contact_pull(laid, template)
     fit, stages_left = None, schedule.stages
     if shape is not None:
         say("fitting the model")
         fit = _model_fit(shape, template, laid, start, schedule)
         laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
-    deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, schedule)
+    deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
     for number, stage in enumerate(stages_left, 1):

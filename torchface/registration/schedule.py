@@ -31,6 +31,7 @@ class Stage:
         samples: how many vertices of the template look for a correspondence; all of them if absent.
         iterations: at most.
         tolerance: :math:`\\varepsilon`, millimetres; the stage ends when the vertices move less on average.
+        contact_weight: :math:`\\gamma`, of vertices that touch in the template and between which the scan shows no gap.
     """
 
     level: Level
@@ -40,9 +41,11 @@ class Stage:
     samples: int | None = None
     iterations: int = 3
     tolerance: float = 0.02
+    contact_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.stiffness > 0 and self.landmark_weight >= 0 and self.reach > 0 and self.iterations > 0):
+        weights = (self.landmark_weight, self.contact_weight)
+        if not (self.stiffness > 0 and min(weights) >= 0 and self.reach > 0 and self.iterations > 0):
             raise ValueRangeError(f"stage: found {self}, expected positive stiffness, reach and iterations")
 
 
@@ -77,9 +80,9 @@ DEFAULT_SCHEDULE = Schedule(
     (
         Stage(Level.GRAPH, 18.0, 10.0, 30.0, samples=2000, iterations=4),
         Stage(Level.GRAPH, 5.0, 10.0, 20.0, samples=2000, iterations=3),
-        Stage(Level.GRAPH, 1.2, 5.0, 12.0, samples=2000, iterations=2),
-        Stage(Level.GRAPH, 0.3, 2.0, 8.0, samples=2000, iterations=2),
-        Stage(Level.TRANSLATIONS, 0.3, 1.0, 5.0, iterations=2),
+        Stage(Level.GRAPH, 1.2, 5.0, 12.0, samples=2000, iterations=2, contact_weight=3.0),
+        Stage(Level.GRAPH, 0.3, 2.0, 8.0, samples=2000, iterations=2, contact_weight=3.0),
+        Stage(Level.TRANSLATIONS, 0.3, 1.0, 5.0, iterations=2, contact_weight=3.0),
     )
 )
 """For heads of any resolution."""
@@ -88,9 +91,9 @@ FULL_SCHEDULE = Schedule(
     (
         Stage(Level.VERTICES, 18.0, 10.0, 30.0, iterations=4),
         Stage(Level.VERTICES, 5.0, 10.0, 20.0),
-        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2),
-        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2),
-        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2),
+        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2, contact_weight=3.0),
+        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2, contact_weight=3.0),
+        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2, contact_weight=3.0),
     )
 )
 """An affine map a vertex from start to end, as in the paper: slower, and the measure for the default."""
