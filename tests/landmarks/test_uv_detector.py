@@ -10,8 +10,9 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.landmarks.detector_files import load_detector, save_detector
+from torchface.landmarks.detector_settings import DetectorSettings
 from torchface.landmarks.hog import HogLayout
-from torchface.landmarks.uv import DetectorSettings, UVLandmarkDetector
+from torchface.landmarks.uv import UVLandmarkDetector
 
 NAMES = ("cross", "ring", "corner")
 SETTINGS = DetectorSettings(hog=HogLayout(stride=4), responses=50)

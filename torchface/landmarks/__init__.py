@@ -5,11 +5,12 @@ from torchface.landmarks.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.correspondences import AutomaticLandmarks, LandmarkPairs, contour_correspondences
 from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.detector_files import load_detector, save_detector
+from torchface.landmarks.detector_settings import DetectorSettings
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.relief import relief
 from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
 from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
-from torchface.landmarks.uv import DetectorSettings, UVLandmarkDetector, UVLandmarks
+from torchface.landmarks.uv import UVLandmarkDetector, UVLandmarks
 
 __all__ = [
     "TWELVE",

@@ -23,8 +23,8 @@ class TraceSettings:
 
     Args:
         border: the line stays this near to the box round the two corners, above and below.
-        similar: weight of neighbours having the same intensity.
-        dark: weight of being dark.
+        similar: weight of neighbours having the same intensity, or being as like.
+        dark: weight of being dark, or like the learned look.
         smooth: weight of neighbours lying level, a squared pixel.
         near: weight of staying near the course that the line starts with, a squared standard deviation.
         line_width: intensity is measured against that so many pixels above and below.
@@ -59,7 +59,7 @@ class Contour:
 
     Args:
         points: one a pixel column from the left corner to the right one, (N,2), x right and y down.
-        kept: whether a point is as dark as the line, within one standard deviation, (N,) bool.
+        kept: whether a point is as dark as the line, or as like its look, within one standard deviation, (N,) bool.
         energy: what was minimised, a column.
     """
 
@@ -89,16 +89,20 @@ def trace_contour(
     settings: TraceSettings | None = None,
     shape: LineShape | None = None,
 ) -> Contour:
-    r"""Traces the dark line between two corners.
+    r"""Traces the line between two corners: a dark one, or one that looks as it was learned to.
 
-    A line has one row :math:`y_c` a column c; with I the intensity (how much brighter than the darker of what lies
-    above and below) over its standard deviation in the box,
+    A line has one row :math:`y_c` a column c; with I how little a pixel is like the line, over its standard deviation
+    in the box,
 
     .. math:: E = \sum_{c=1}^{N} a\,(I_c - I_{c+1})^2 + b\, I_c + s\,(y_c - y_{c+1})^2
         + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
 
-    with :math:`y^0` the course that it starts with. The thesis starts from the straight line and has no last term; here
-    the start is the mean of annotated lines where there were any, else the straight line and an arc.
+    with :math:`y^0` the course that it starts with. In the thesis I is the intensity; here it is how much brighter a
+    pixel is than the darker of what lies above and below, or, where the line's look was learned from annotated lines,
+    1 less the correlation of what lies round the pixel with that look: the line between two lids need not be the
+    darkest of the furrows there. The thesis starts from the straight line and has no last term; here the start is the
+    mean of annotated lines where there were any, else the straight line and an arc. Learned lines are tried with
+    their ends moved up and down as far as corners are usually off; the least energy wins.
 
     Iterated conditional modes goes from the left corner to the right one and gives every column the row that is best
     for its two neighbours as they are, again and again until nothing moves. Rows brighter than the present line's
@@ -108,7 +112,7 @@ def trace_contour(
         image: grey (1,S,S) or colours (3,S,S) in [0,1].
         left, right: corners, (2,) pixels; the left one further left by two pixels at least.
         settings: weights and limits.
-        shape: how the line usually runs.
+        shape: how the line usually runs and looks.
 
     Raises:
         ShapeError: not an image.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.alignment import Similarity
+from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.scan import ScanLandmarks, scan_landmarks
 from torchface.landmarks.twelve import LINES, TWELVE, twelve_from_ibug
 from torchface.landmarks.uv import UVLandmarkDetector
@@ -97,7 +98,8 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
 def scan_pairs(features: TemplateFeatures, found: ScanLandmarks, scan: Mesh) -> LandmarkPairs:
     """Pairs a template's features with those found on a scan.
 
-    The points of a line go to the same share of the line's length in 3D: lips and lids stretch evenly.
+    The points of a line go to the same share of the line's length in 3D: lips and lids stretch evenly. A line is as
+    sure as the less sure of its corners.
     """
     vertices, points, confidence, names = [], [], [], []
     for i, name in enumerate(found.names):
@@ -114,7 +116,7 @@ def scan_pairs(features: TemplateFeatures, found: ScanLandmarks, scan: Mesh) -> 
         ends = [found.names.index(end) for end in LINES[name]]
         vertices.append(ids[trusted])
         points.append(places[trusted])
-        confidence.append(found.confidence[ends].mean().expand(int(trusted.sum())))
+        confidence.append(found.confidence[ends].min().expand(int(trusted.sum())))
         names += [name] * int(trusted.sum())
     if not vertices:
         raise ValueRangeError("scan_pairs: found no landmark that template and scan share, expected some")
@@ -191,30 +193,51 @@ class AutomaticLandmarks:
     """Finds pairs for ``register``: called with the template laid on a scan, the scan, and the similarity from the
     template's own space to the scan's; gives template vertex ids (K,) and scan points (K,3).
 
+    Only sure pairs are given. Where the picture is unlike those learned from (open eyes, another skin), filters agree
+    on little, confidence is low, and registration goes by shape alone instead of by guesses.
+
     Args:
         detector: fitted with a frame.
         template: as it will be registered, in its own space.
         confidence: pairs below it are left out.
+        without_colors: asked about scans that have no colours, where ``detector`` needs them; no landmarks are found
+            on those if absent.
 
     Raises:
         TopologyError: when called with another template.
+        ValueRangeError: a detector without a frame, or no face in the template.
     """
 
-    def __init__(self, detector: UVLandmarkDetector, template: Mesh, confidence: float = 0.01) -> None:
-        if detector.frame is None:
-            raise ValueRangeError("detector: found one without a FaceFrame, expected one fitted with frame=")
-        self.detector, self.confidence = detector, confidence
-        self.features = template_features(template, detector)
-        self._pose = detector.frame.locate(template)
+    def __init__(
+        self,
+        detector: UVLandmarkDetector,
+        template: Mesh,
+        confidence: float = 0.01,
+        without_colors: UVLandmarkDetector | None = None,
+    ) -> None:
+        self.detectors = tuple(one for one in (detector, without_colors) if one is not None)
+        self.confidence = confidence
+        self._poses = [_framed(one).locate(template) for one in self.detectors]
+        seeing = [one for one in self.detectors if one.sees(template)]
+        self.features = template_features(template, seeing[0] if seeing else detector)
         self._count = len(template.vertices)
 
     def __call__(self, laid: Mesh, scan: Mesh, pose: Similarity) -> tuple[Tensor, Tensor] | None:
         """Pairs, or nothing where too few are sure."""
         if len(laid.vertices) != self._count:
             raise TopologyError(f"template: found {len(laid.vertices)} vertices, expected {self._count}")
-        rough = _after(self._pose, pose.inverse())
-        pairs = scan_pairs(self.features, scan_landmarks(self.detector, scan, rough), scan).above(self.confidence)
-        return None if len(pairs.vertices) < 3 else (pairs.vertices, pairs.points)
+        for detector, own in zip(self.detectors, self._poses, strict=True):
+            if detector.sees(scan):
+                found = scan_landmarks(detector, scan, _after(own, pose.inverse()))
+                pairs = scan_pairs(self.features, found, scan).above(self.confidence)
+                return None if len(pairs.vertices) < 3 else (pairs.vertices, pairs.points)
+        return None
+
+
+def _framed(detector: UVLandmarkDetector) -> FaceFrame:
+    if detector.frame is None:
+        raise ValueRangeError("detector: found one without a FaceFrame, expected one fitted with frame=")
+    return detector.frame
 
 
 def _after(second: Similarity, first: Similarity) -> Similarity:

@@ -4,45 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.detector_settings import DetectorSettings
 from torchface.landmarks.face_frame import FaceFrame
-from torchface.landmarks.hog import HogLayout, cell_map, similarity, unit_windows, windows
+from torchface.landmarks.hog import cell_map, similarity, unit_windows, windows
 from torchface.landmarks.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.mean_shift import mean_shift
+from torchface.landmarks.score_statistics import best_scores, score_statistics
 from torchface.landmarks.smoothing import unsharp
 from torchface.landmarks.twelve import LINES, TWELVE
+from torchface.mesh import Mesh
 
 _FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
 _PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that
-
-
-@dataclass(frozen=True)
-class DetectorSettings:
-    """How landmarks are matched; lengths in pixels of the image.
-
-    Args:
-        hog: the descriptor.
-        unsharp_sigma, unsharp_amount: of the pre-filter.
-        good_radius: a match this near to the landmark is a good one.
-        similarity_threshold: matches below it are not looked at.
-        responses: the best so many matches of each filter are kept, counted in pixels: a match at every fourth pixel of
-            a row and a column stands for sixteen.
-        bandwidth: of the mean shift.
-    """
-
-    hog: HogLayout = field(default_factory=HogLayout)
-    unsharp_sigma: float = 3.0
-    unsharp_amount: float = 1.0
-    good_radius: float = 20.0
-    similarity_threshold: float = 0.3
-    responses: int = 200
-    bandwidth: float = 10.0
 
 
 class UVLandmarks(NamedTuple):
@@ -107,7 +87,7 @@ class UVLandmarkDetector(nn.Module):
         if appearance not in ("texture", "relief"):
             raise ValueRangeError(f"appearance: found {appearance!r}, expected 'texture' or 'relief'")
         self.names, self.size, self.appearance = tuple(names), size, appearance
-        self.settings = _settings(settings)
+        self.settings = DetectorSettings.of(settings)
         self.frame = None if frame is None else FaceFrame(**frame)
         hog, count = self.settings.hog, len(self.names)
         self.register_buffer("filters", torch.zeros(count, images, hog.bins, hog.side, hog.side))
@@ -132,6 +112,11 @@ class UVLandmarkDetector(nn.Module):
             "settings": asdict(self.settings),
             "frame": None if self.frame is None else self.frame.config,
         }
+
+    def sees(self, mesh: Mesh) -> bool:
+        """Whether a scan has what this detector looks at: colours, if it learned from those."""
+        textured = mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None
+        return self.appearance == "relief" or textured or mesh.colors is not None
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> UVLandmarkDetector:
@@ -181,7 +166,11 @@ class UVLandmarkDetector(nn.Module):
         for i, cells in enumerate(maps):
             self.filters[:, i] = windows(cells - self.mean_cell[:, None, None], hog, places[i])
         self.filters[~torch.isfinite(landmarks).all(-1).T] = 0.0
-        self._fit_noise(*self._fit_scores(maps, landmarks, progress), maps[0].shape[-1], landmarks)
+        centred = [cells - self.mean_cell[:, None, None] for cells in maps]
+        scores = score_statistics(centred, self.filters, landmarks, self.settings, progress)
+        self.good.copy_(scores.good)
+        self.bad.copy_(scores.bad)
+        self._fit_noise(scores.best, scores.places, maps[0].shape[-1], landmarks)
         self._fit_lines(lines or [], images if line_images is None else line_images)
         return self
 
@@ -211,12 +200,7 @@ class UVLandmarkDetector(nn.Module):
             width: of that map.
         """
         scores = similarity(columns, self.filters[landmark])[0]
-        return self._votes(landmark, *self._best_scores(scores), width)
-
-    def _best_scores(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Of scores (M,P): the best of each row (M,R), and their places."""
-        best = scores.topk(min(self._kept_matches, scores.shape[1]), dim=1)
-        return best.values, best.indices
+        return self._votes(landmark, *best_scores(scores, self.settings.matches), width)
 
     def _votes(
         self, landmark: int, best: Tensor, place: Tensor, width: int, without: int | None = None
@@ -227,10 +211,6 @@ class UVLandmarkDetector(nn.Module):
         found, votes = place[good].unique(return_counts=True)
         columns, rows = found % width, torch.div(found, width, rounding_mode="floor")
         return self.settings.hog.positions(torch.stack([columns, rows], dim=-1)), votes
-
-    @property
-    def _kept_matches(self) -> int:
-        return max(4, round(self.settings.responses / self.settings.hog.stride**2))
 
     def _locate(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:
         best, share = self._best_cluster(landmark, *self.matches(landmark, columns, width))
@@ -258,7 +238,7 @@ class UVLandmarkDetector(nn.Module):
         best = int(value.argmax())
         if float(value[best]) <= 0:
             return mean, mean.new_zeros(())
-        return clusters.centres[best], clusters.sizes[best] / (self.filters.shape[1] * self._kept_matches)
+        return clusters.centres[best], clusters.sizes[best] / (self.filters.shape[1] * self.settings.matches)
 
     def _more_likely_good(self, landmark: int, scores: Tensor) -> Tensor:
         """Whether scores (M,R) of a landmark's filters are likelier among the good than among the bad."""
@@ -277,41 +257,6 @@ class UVLandmarkDetector(nn.Module):
         covariance = torch.einsum("mli,mlj->lij", offset, offset) / (count - 1)[:, None, None]
         self.prior_mean.copy_(mean)
         self.prior_covariance.copy_(covariance + _PRIOR_FLOOR**2 * torch.eye(2, dtype=covariance.dtype))
-
-    def _fit_scores(self, maps: list[Tensor], landmarks: Tensor, progress: Any) -> tuple[Tensor, Tensor]:
-        """Mean and spread of good and bad scores a filter, over the images it does not come from; gives every filter's
-        best scores (M,L,M,R) in every image, and their places."""
-        settings, count = self.settings, len(maps)
-        sums = torch.zeros(2, len(self.names), count, 3, dtype=torch.float64)
-        height, width = maps[0].shape[1:]
-        best = torch.zeros(count, len(self.names), count, min(self._kept_matches, height * width))
-        place = torch.zeros(best.shape, dtype=torch.int64)
-        rows, columns = (settings.hog.positions(torch.arange(n)) for n in (height, width))
-        for i, cells in enumerate(maps):
-            centred = unit_windows((cells - self.mean_cell[:, None, None])[None], settings.hog)
-            others = torch.arange(count) != i
-            for k in range(len(self.names)):
-                if not bool(torch.isfinite(landmarks[i, k]).all()):
-                    continue
-                scores = similarity(centred, self.filters[k, others])[0]
-                best[i, k, others], place[i, k, others] = self._best_scores(scores)
-                away = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
-                near = away.flatten() <= settings.good_radius**2
-                kept = scores >= settings.similarity_threshold
-                for which, region in enumerate((near, ~near)):
-                    chosen = torch.where(kept & region, scores, 0.0)
-                    moments = [(kept & region).sum(1), chosen.sum(1), chosen.square().sum(1)]
-                    sums[which, k, others] += torch.stack([m.double() for m in moments], dim=-1)
-            if progress is not None:
-                progress(i + 1, count)
-        for table, part in zip((self.good, self.bad), sums.unbind(0), strict=True):
-            number, total, squares = part.unbind(-1)
-            mean = total / number.clamp(min=1)
-            spread = (squares / number.clamp(min=1) - mean**2).clamp(min=1e-4).sqrt()
-            table.copy_(torch.stack([mean, spread], dim=-1))
-        # A filter that never matched where it should have: nothing it finds counts as good.
-        self.good[..., 0][sums[0, ..., 0] == 0] = 2.0
-        return best, place
 
     def _fit_noise(self, best: Tensor, place: Tensor, width: int, landmarks: Tensor) -> None:
         """How far off landmarks are, from images that are searched with the filters of the others: the squared error a
@@ -358,15 +303,6 @@ class UVLandmarkDetector(nn.Module):
 
     def _cells(self, images: Tensor) -> Tensor:
         return self._raw_cells(images) - self.mean_cell[None, :, None, None]
-
-
-def _settings(given: DetectorSettings | dict[str, Any] | None) -> DetectorSettings:
-    if given is None:
-        return DetectorSettings()
-    if isinstance(given, DetectorSettings):
-        return given
-    rest = {**given, "hog": HogLayout(**given["hog"])} if isinstance(given.get("hog"), dict) else given
-    return DetectorSettings(**rest)
 
 
 def _check_training(images: Tensor, landmarks: Tensor, names: tuple[str, ...]) -> None:

@@ -1,0 +1,104 @@
+"""Claim: the twelve landmarks found by themselves bring registration nearer to the truth than no landmarks, and the
+traced lines of lips and lids nearer still (the thesis's figures 12 and 14).
+
+The embedded head, its eyes open, is registered to raw scans of performers with closed eyes, of whom every vertex's true
+place is known. ``$TORCHFACE_BENCH_HEADS`` sets how many scans (6 if absent).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import Mesh, zoo
+from torchface.errors import NameMismatchError
+from torchface.landmarks import TWELVE, AutomaticLandmarks, LandmarkPairs, UVLandmarkDetector, contour_correspondences
+from torchface.registration import register
+from torchface.registration.preparation import Landmarks
+from torchface.rendering.compositing import headed, save_picture, sheet
+from torchface.synthetic import draw_identities, head, performer
+from torchface.synthetic.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.subdivision import finely_coloured
+from torchface.viz.faces import heat_map
+from train.uv_landmarks import fit, scanned_performers
+
+SCANS = int(os.environ.get("TORCHFACE_BENCH_HEADS", "6"))
+PICTURE = Path("out/landmarks/ablation.png")
+SCANNER = ScannerSettings(voxel=1.7)
+SURE = 0.01
+
+
+@dataclass(frozen=True)
+class Case:
+    scan: RawScan
+    truth: Tensor
+
+
+def case(seed: int) -> Case:
+    """A scan, and where each vertex of the head is on it."""
+    closed = eyes_closed(performer(draw_identities(1, torch.Generator().manual_seed(seed))[0]))
+    scan = scan_head(closed, seed, SCANNER)
+    smooth = finely_coloured(closed, SCANNER.detail).vertices[: len(closed.vertices)]
+    return Case(scan, smooth.double() @ scan.rotation.T + scan.translation)
+
+
+@pytest.fixture(scope="module")
+def detector() -> UVLandmarkDetector:
+    try:
+        return zoo.get_model("uv_landmarks")
+    except NameMismatchError:
+        return fit(scanned_performers(30, seed=7))
+
+
+def some(pairs: LandmarkPairs, names: tuple[str, ...]) -> Landmarks:
+    rows = torch.tensor([i for i, name in enumerate(pairs.names) if name in names])
+    return pairs.vertices[rows], pairs.points[rows]
+
+
+def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
+    template = head(texture=False)
+    finder = AutomaticLandmarks(detector, template)
+    regions, contacts = template.annotations.regions, template.annotations.contacts.flatten()
+    lids, lips = regions["lids_left"] | regions["lids_right"], regions["upper_lip"] | regions["lower_lip"]
+    edge = torch.zeros_like(lids)
+    edge[contacts] = True
+    parts = {
+        "face": regions["face"],
+        "lids": lids,
+        "lips": lips,
+        "lid edges": edge & (template.vertices[:, 1] > template.vertices[template.landmarks[33], 1]),
+        "lip edges": edge & (template.vertices[:, 1] < template.vertices[template.landmarks[33], 1]),
+    }
+    errors: dict[str, list[Tensor]] = {}
+    for seed in range(300, 300 + SCANS):
+        made = case(seed)
+        pairs = contour_correspondences(detector, template, made.scan.mesh).above(SURE)
+        ways: dict[str, Landmarks | None] = {"none": None, "twelve": some(pairs, TWELVE)}
+        ways["twelve, lines"] = (pairs.vertices, pairs.points)
+        for name, landmarks in ways.items():
+            found = register(template, made.scan.mesh, landmarks, texture_size=0).mesh.vertices.double()
+            errors.setdefault(name, []).append((found - made.truth).norm(dim=1))
+        found = register(template, made.scan.mesh, detector=finder, texture_size=0).mesh.vertices.double()
+        errors.setdefault("by itself", []).append((found - made.truth).norm(dim=1))
+    mean = {way: torch.stack(each).mean(0) for way, each in errors.items()}
+    print(f"\nmean distance to the true place over {SCANS} scans, millimetres")
+    print(f"{'landmarks':16}" + "".join(f"{part:>12}" for part in parts))
+    table = {way: {part: float(error[rows].mean()) for part, rows in parts.items()} for way, error in mean.items()}
+    for way, row in table.items():
+        print(f"{way:16}" + "".join(f"{value:12.2f}" for value in row.values()))
+    save_picture(sheet([heated(template, error, way) for way, error in mean.items()], 1), PICTURE)
+    for part in ("face", "lids", "lips"):
+        assert table["twelve, lines"][part] <= table["twelve"][part] + 0.02
+        assert table["twelve, lines"][part] <= table["none"][part] + 0.02
+        assert table["by itself"][part] <= table["none"][part] + 0.02
+    for part in ("lid edges", "lip edges"):
+        assert table["twelve, lines"][part] < table["none"][part]
+
+
+def heated(template: Mesh, error: Tensor, title: str) -> Tensor:
+    return headed(heat_map(template, error, 4.0, "mm to the true place"), title)
