@@ -6,6 +6,10 @@ import pytest
 import torch
 
 from torchface import Attachment, BlendshapeRig, Mesh
+from torchface.geometry.alignment import Similarity
+from torchface.synthetic import performer
+from torchface.synthetic.marker_stage import place_markers
+from torchface.synthetic.performance import perform
 
 
 @pytest.fixture(scope="session")
@@ -30,3 +34,20 @@ def small_attachment(small_rig: BlendshapeRig) -> Attachment:
     triangles = torch.randperm(len(small_rig.neutral.faces), generator=generator)[:40]
     corners = torch.rand(40, 3, generator=generator)
     return Attachment(triangles, corners / corners.sum(1, keepdim=True))
+
+
+@pytest.fixture(scope="session")
+def performance() -> tuple[BlendshapeRig, Attachment, list[torch.Tensor]]:
+    """The embedded performer, 100 markers on it, and two takes of half a minute as its weights, (T,51) each."""
+    rig = performer(texture=False)
+    generator = torch.Generator().manual_seed(0)
+    tracks = [perform(1850, generator).weights for _ in range(2)]
+    return rig, place_markers(rig, 100), [rig.weights_from(track) for track in tracks if track is not None]
+
+
+@pytest.fixture(scope="session")
+def stage_space() -> Similarity:
+    """Rig space as a stage might see it: turned, elsewhere, a little larger."""
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(5)))[0]
+    turn = turn * torch.linalg.det(turn).sign()
+    return Similarity(torch.tensor([1.07]), turn[None], torch.tensor([[100.0, -900.0, 40.0]]))

@@ -1,17 +1,23 @@
 """Capture from 3D markers."""
 
+from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachment
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
+from torchface.capture.markers.take_alignment import align_take, rest_residual
 
 __all__ = [
+    "AttachmentFit",
     "HybridSolver",
     "MarkerSolver",
     "Observability",
     "SparsityTrial",
+    "align_take",
+    "fit_attachment",
     "gamma_curves",
     "observability",
+    "rest_residual",
     "sparsity_by_rule",
     "sparsity_experiment",
 ]

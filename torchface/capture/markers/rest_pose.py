@@ -1,0 +1,97 @@
+"""The two steps that find how a take lies in the rig's space: weights of all frames, then one similarity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.capture.energy import marker_term, ridge_term
+from torchface.errors import AlignmentError
+from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.optim import BoxQP
+
+_ON_A_LINE = 1e-2
+_TOLERANCE = 3e-6
+_FILLS = 12
+
+
+def solve_weights(affine: Tensor, moved: Tensor, ridge: float, start: Tensor | None = None) -> Tensor:
+    r"""Weights for markers whose sites follow affine maps, as a step of an alternation.
+
+    A marker that is not seen is put where the weights before had it, which keeps one H for all frames; the weights then
+    come to their optimum over the steps of the alternation.
+
+    Args:
+        affine: of the sites, (M,3,N+1), millimetres of rig space.
+        moved: markers in rig space, (T,M,3), NaN for not seen.
+        ridge: mm² a marker for a squared weight of 1.
+        start: weights of the step before, (T,N).
+
+    Returns:
+        Weights in [0,1], (T,N), float64.
+    """
+    basis, rest = affine[..., 1:], affine[..., 0]
+    gaps = torch.isnan(moved)
+    passes = 1 if not bool(gaps.any()) else _FILLS if start is None else 2
+    shapes = basis.shape[-1]
+    weights = moved.new_zeros(len(moved), shapes) if start is None else start
+    solve = None
+    for _ in range(passes):
+        filled = moved
+        if passes > 1:
+            filled = torch.where(gaps, rest + torch.einsum("mcn,tn->tmc", basis, weights), moved)
+        energy = marker_term(basis, rest, filled) + ridge_term(shapes, ridge, affine)
+        solve = solve or BoxQP(energy.H, 0.0, 1.0, _TOLERANCE)
+        weights = solve(energy.f, weights)
+    return weights
+
+
+def pose_step(
+    paths: Tensor, pose: Similarity, on_rig: Tensor, outward: Tensor | None = None
+) -> tuple[Similarity, float]:
+    r"""The similarity that lays a take's markers on points of the moving rig, least squares over all frames.
+
+    .. math:: \min_{s,R,t,h} \sum_{t,m} \lVert s R y_{tm} + t - p_{tm} - h\, n_{tm} \rVert^2
+
+    Args:
+        paths: :math:`y`, (T,M,3), NaN for not seen.
+        pose: where it was.
+        on_rig: :math:`p`, (T,M,3).
+        outward: :math:`n`, (T,M,3), where h is asked for.
+
+    Returns:
+        The similarity and h; without ``outward`` the exact one and 0, with it one Gauss-Newton step from ``pose``.
+    """
+    if outward is None:
+        return similarity_transform(paths.reshape(1, -1, 3), on_rig.reshape(1, -1, 3)), 0.0
+    moved = pose.apply(paths)
+    seen = ~torch.isnan(moved[..., 0])
+    y, left, n = moved[seen], (on_rig - moved)[seen], outward[seen]
+    centre = y.mean(0)
+    arm = y - centre
+    zero = torch.zeros_like(arm[:, 0])
+    x0, x1, x2 = arm.unbind(1)
+    turns = [torch.stack(row, 1) for row in ((zero, -x2, x1), (x2, zero, -x0), (-x1, x0, zero))]
+    axes = torch.eye(3, dtype=y.dtype)
+    rows = torch.stack([*turns, *(axis.expand_as(y) for axis in axes), arm, -n], dim=1)
+    matrix = torch.einsum("pic,pjc->ij", rows, rows)
+    step = torch.linalg.solve(matrix, torch.einsum("pic,pc->i", rows, left))
+    skew = y.new_zeros(3, 3)
+    skew[0, 1], skew[0, 2], skew[1, 2] = -step[2], step[1], -step[0]
+    turn = torch.linalg.matrix_exp(skew - skew.T)
+    grow = 1 + step[6]
+    translation = centre + grow * (turn @ (pose.translation[0] - centre)) + step[3:6]
+    moved_pose = Similarity(pose.scale * grow, turn @ pose.rotation, translation[None])
+    return moved_pose, float(step[7])
+
+
+def check_spread(points: Tensor) -> None:
+    """Raises ``AlignmentError`` where points (M,3) lie on a line or in one spot: no rotation can be told."""
+    if len(points) < 3:
+        raise AlignmentError(f"markers: found {len(points)}, expected at least three")
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if not float(spread[1]) > _ON_A_LINE * float(spread[0]):
+        raise AlignmentError(
+            f"markers: found {len(points)} on a line (extent {float(spread[1]):.3g} across {float(spread[0]):.3g} "
+            "along it), expected markers spread over the face"
+        )

@@ -1,0 +1,140 @@
+"""How a take lies in the rig's space, and what is left at rest between its markers and their sites."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture.markers.rest_pose import check_spread, pose_step, solve_weights
+from torchface.capture.markers.solve import MarkerSolver, check_labels
+from torchface.capture.markers.surface_motion import with_one
+from torchface.errors import ValueRangeError
+from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+
+_FIRST_RIDGE, _LAST_RIDGE, _FALLING_ROUNDS = 3.0, 0.01, 20
+_ROUNDS, _SETTLED = 80, 1e-3
+_FRAMES = 240
+
+
+def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_frame: int | None = None) -> Similarity:
+    r"""The similarity that moves a take's markers into the rig's space; every take has its own.
+
+    With a neutral frame, that frame is laid on the rig at rest. Without one (a take may hold none) the similarity and
+    the weights of frames spread over the take are found together, in turns:
+
+    .. math:: \min_{s,R,t,\,w} \sum_{t,m} \lVert s R y_{tm} + t - b_m - B_m w_t \rVert^2, \quad 0 \le w \le 1
+
+    Args:
+        rig: the performer's.
+        attachment: where the markers sit; markers match by label, and a ``residual`` is added to the sites.
+        take: markers (T,M,3), millimetres of any space.
+        neutral_frame: a frame with the face at rest.
+
+    Returns:
+        One similarity, marker space to rig space, scale included, float64.
+
+    Raises:
+        NameMismatchError: the take has no markers, or one that the attachment does not know.
+        ValueRangeError: no such frame, or a coordinate is infinite.
+        ShapeError: fewer than three markers are seen in the neutral frame.
+        AlignmentError: the markers lie on a line.
+        TopologyError: the attachment belongs to another mesh.
+
+    Source: thesis 4.1.2.
+    """
+    attachment.check(rig.neutral)
+    affine, paths = _seen_sites(rig, attachment, take)
+    rest = affine[..., 0]
+    if neutral_frame is not None:
+        if not 0 <= neutral_frame < len(paths):
+            raise ValueRangeError(
+                f"neutral frame: found a take of {len(paths)} frames, expected frame {neutral_frame} among them"
+            )
+        frame = paths[neutral_frame]
+        pose = similarity_transform(frame[None], rest[None])
+        check_spread(frame[~torch.isnan(frame).any(-1)])
+        return pose
+    check_spread(paths.nanmean(0))
+    few = paths[:: max(1, len(paths) // _FRAMES)]
+    few = few[~torch.isnan(few).any(-1).all(1)]
+    pose = similarity_transform(paths.nanmean(0)[None], rest[None])
+    weights, before = None, rest
+    for number in range(_ROUNDS):
+        falling = min(number / (_FALLING_ROUNDS - 1), 1.0)
+        ridge = _FIRST_RIDGE * (_LAST_RIDGE / _FIRST_RIDGE) ** falling
+        weights = solve_weights(affine, pose.apply(few), ridge, weights)
+        pose, _ = pose_step(few, pose, torch.einsum("mcn,tn->tmc", affine, with_one(weights)))
+        # How far the sites at rest went since the last round says whether the pose still moves.
+        here = pose.inverse().apply(rest)[0]
+        settled = float(((here - before).norm(dim=1) * pose.scale).max()) < _SETTLED
+        before = here
+        if settled and falling == 1.0:
+            break
+    return pose
+
+
+def rest_residual(
+    rig: BlendshapeRig, attachment: Attachment, take: Take, alignment: Similarity | None = None, rounds: int = 1
+) -> Attachment:
+    r"""The attachment with the mean distance between markers and solved sites over a take as its ``residual``.
+
+    .. math:: r_m = \frac{1}{|T_m|} \sum_{t \in T_m} (s R y_{tm} + t - p_m(w_t))
+
+    What a marker's site is wrong by, or stands off the skin, then no longer pulls at the weights of any frame. The mean
+    is over the whole solved take, since a take may hold no neutral frame.
+
+    Args:
+        rig: the performer's.
+        attachment: where the markers sit; a residual that it has is where the solve starts.
+        take: the one to be solved.
+        alignment: marker space to rig space; none if absent.
+        rounds: how often to solve and to take the mean.
+
+    Returns:
+        The attachment with a residual (M,3), millimetres in rig space; a marker that the take never shows keeps what it
+        had.
+
+    Source: thesis 4.1.2, after algorithm 4.
+    """
+    for _ in range(rounds):
+        solver = MarkerSolver(rig, attachment, alignment)
+        assert take.markers is not None
+        markers = solver.arrange(take.markers)
+        shown = ~torch.isnan(markers).any(-1).all(1)
+        markers = markers[shown].double()
+        on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), solver(markers))
+        moved = markers if alignment is None else alignment.apply(markers)
+        left = (moved - on_rig).nanmean(0)
+        had = torch.zeros_like(left) if attachment.residual is None else attachment.residual.double()
+        attachment = replace(attachment, residual=(had + left.nan_to_num(0.0)).float())
+    return attachment
+
+
+def _seen_sites(rig: BlendshapeRig, attachment: Attachment, take: Take) -> tuple[Tensor, Tensor]:
+    """Affine maps (M,3,N+1) of the sites whose markers the take shows, and their paths (T,M,3), float64."""
+    labels = tuple(attachment.labels or ())
+    track = take.markers
+    check_labels(() if track is None else track.names, labels)
+    assert track is not None
+    shown = [
+        label
+        for label in labels
+        if label in track.names and not torch.isnan(track.select([label]).values).any(-1).all()
+    ]
+    if not shown:
+        raise ValueRangeError("markers: found none that is seen in any frame, expected at least three")
+    paths = track.select(shown).values.double()
+    if torch.isinf(paths).any():
+        raise ValueRangeError("markers: found infinite coordinates, expected millimetres, or NaN for not seen")
+    sites = attachment.select(shown)
+    faces = rig.neutral.faces
+    rest = sites.on(faces, rig.vertices.double())
+    if sites.residual is not None:
+        rest = rest + sites.residual.double()
+    basis = sites.on(faces, rig.deltas.double()).permute(1, 2, 0)
+    return torch.cat([rest[..., None], basis], dim=2), paths
