@@ -1,6 +1,7 @@
 """Capture from 3D markers."""
 
 from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachment
+from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
@@ -9,6 +10,8 @@ from torchface.capture.markers.take_alignment import align_take, rest_residual
 
 __all__ = [
     "AttachmentFit",
+    "HelmetMotion",
+    "HelmetSolver",
     "HybridSolver",
     "MarkerSolver",
     "Observability",
