@@ -1,0 +1,170 @@
+"""The recipe end to end: performers, registered meshes in any place and light, a killed run, bad input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from torchface import Mesh, save_mesh, zoo
+from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
+from torchface.modeling import HeadModel, MorphableModel
+from torchface.modeling.color_casts import to_linear, to_srgb
+from torchface.synthetic import draw_identities, head
+from torchface.synthetic.complexion import complexion_colors, draw_complexions
+from torchface.viz import model_pictures
+from train import morphable as recipe
+from train.head_samples import registered, upright
+from train.morphable import Settings, Trained, train
+
+
+def people(count: int) -> list[Mesh]:
+    generator = torch.Generator().manual_seed(5)
+    identities = draw_identities(count, generator)
+    colors = complexion_colors(draw_complexions(count, generator))
+    return [replace(head(i, texture=False), colors=c) for i, c in zip(identities, colors, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def heads() -> list[Mesh]:
+    return people(9)
+
+
+@pytest.fixture(scope="module")
+def folder(heads: list[Mesh], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The heads as registration leaves them: each in its scan's place, under its scan's light."""
+    path = tmp_path_factory.mktemp("registered")
+    turns = torch.from_numpy(Rotation.random(len(heads), rng=1).as_matrix()).float()
+    generator = torch.Generator().manual_seed(2)
+    for number, mesh in enumerate(heads):
+        vertices = mesh.vertices @ turns[number].T + 80 * torch.randn(3, generator=generator)
+        light = torch.exp(0.15 * torch.randn(3, generator=generator))
+        assert mesh.colors is not None
+        colors = to_srgb(to_linear(mesh.colors) * light).clamp(0, 1)
+        save_mesh(replace(mesh, vertices=vertices, colors=colors), path / f"scan_{number}.glb")
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Path]:
+    out = tmp_path_factory.mktemp("models") / "people"
+    with pytest.MonkeyPatch.context() as patch:  # small pictures are drawn sooner
+        patch.setattr(model_pictures, "_WIDTH", 44)
+        patch.setattr(model_pictures, "_HEIGHT", 55)
+        return train(Settings(scans=folder, out=out, held_out=2)), out
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recipe, "draw", lambda *parts: None)
+
+
+def test_places_and_lights_of_the_scans_are_gone(trained: tuple[Trained, Path], heads: list[Mesh]) -> None:
+    model = trained[0].model
+    plain = MorphableModel.fit(torch.stack([mesh.vertices for mesh in heads[:7]]))
+    # Performers stand where they stand; laid on each other they differ by less, and in form alone.
+    assert 0.5 * plain.total_variance < model.shape.total_variance < plain.total_variance
+    assert model.shape.count == 6
+    for mesh in heads[:7]:
+        again = model.shape(model.shape.project(upright(mesh).vertices[None]))[0]
+        sizes = torch.pdist(again[::200]), torch.pdist(mesh.vertices[::200])
+        assert (sizes[0] - sizes[1]).abs().mean() < 1.5
+    assert model.color is not None
+    assert model.color.explained[2] > 0.6
+
+
+def test_the_model_stands_upright_and_knows_its_landmarks(trained: tuple[Trained, Path], heads: list[Mesh]) -> None:
+    mean = trained[0].model.template()
+    marks = mean.vertices[mean.landmarks]
+    assert marks[45, 0] - marks[36, 0] > 60  # x to the viewer's right
+    assert marks[27, 1] - marks[8, 1] > 80  # y up
+    assert marks[30, 2] - marks[[0, 16], 2].mean() > 60  # z toward the viewer
+    assert mean.fingerprint() == heads[0].fingerprint()
+    assert mean.polygons is not None
+
+
+def test_the_folder_holds_model_card_and_pictures(trained: tuple[Trained, Path]) -> None:
+    result, out = trained
+    assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "pictures"}
+    assert not [p for p in out.parent.iterdir() if p != out]
+    names = {"modes", "color_modes", "random", "morph", "far", "components", "quality"}
+    assert {p.stem for p in (out / "pictures").iterdir()} == names
+    again = zoo.get_model(out)
+    assert isinstance(again, HeadModel)
+    a = torch.randn(1, 6, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(again(a).vertices, result.model(a).vertices)
+    assert zoo.describe(out).metrics == pytest.approx(result.metrics)
+    assert result.metrics["held out, of the mean head's error"] < 1
+    card = (out / "CARD.md").read_text()
+    assert "python -m train.morphable --scans" in card
+    assert "Tested on 2 heads" in card
+
+
+def test_performers_in_half_precision_are_learned_the_same_each_time(tmp_path: Path, without_pictures: None) -> None:
+    settings = Settings(performers=6, held_out=2, components=4, half=True, out=tmp_path / "one")
+    train(settings)
+    again = train(replace(settings, out=tmp_path / "two"))
+    assert zoo.describe(tmp_path / "one").sha256 == zoo.describe(tmp_path / "two").sha256
+    loaded, a = zoo.get_model(tmp_path / "two"), torch.full((1, 4), 2.0)
+    assert (loaded(a).vertices - again.model(a).vertices).abs().max() < 0.05
+
+
+def test_a_killed_run_goes_on_where_it_was(
+    folder: Path, tmp_path: Path, without_pictures: None, monkeypatch: pytest.MonkeyPatch, trained: tuple[Trained, Path]
+) -> None:
+    settings, read = Settings(scans=folder, out=tmp_path / "people", held_out=2), []
+
+    def counted(path: Path) -> Callable[[int], Mesh]:
+        source = registered(path)
+
+        def one(number: int) -> Mesh:
+            read.append(number)
+            if len(read) == 6:
+                raise KeyboardInterrupt
+            return source.read(number)
+
+        return replace(source, read=one)
+
+    monkeypatch.setattr(recipe, "registered", counted)
+    with pytest.raises(KeyboardInterrupt):
+        train(settings)
+    assert read == [0, 1, 2, 3, 4, 5]
+    again = train(settings)
+    assert read[6:] == [0, 5, 6, 7, 8]  # the first is the template
+    assert torch.equal(again.model.shape.components, trained[0].model.shape.components)
+
+
+def test_meshes_that_teach_nothing_are_named(heads: list[Mesh], tmp_path: Path, without_pictures: None) -> None:
+    scans, settings = tmp_path / "scans", Settings(scans=tmp_path / "scans", out=tmp_path / "model", held_out=0)
+    scans.mkdir()
+    with pytest.raises(TorchfaceError, match="found no scan"):
+        train(settings)
+    save_mesh(heads[0], scans / "a.glb")
+    with pytest.raises(TorchfaceError, match="found 1, expected at least two"):
+        train(settings)
+    save_mesh(heads[0], scans / "b.glb")
+    save_mesh(heads[0], scans / "c.glb")
+    with pytest.raises(ValueRangeError, match="found 3 that are all the same"):
+        train(settings)
+    with pytest.raises(TorchfaceError, match="components: found 3, expected 1 to 2 with 3 heads"):
+        train(replace(settings, components=3))
+    save_mesh(Mesh(heads[0].vertices, heads[0].faces[:-5]), scans / "d.glb")
+    with pytest.raises(TopologyError, match=r"d\.glb: found 6419 vertices and 12755 triangles, expected.*12760"):
+        train(settings)
+    with pytest.raises(TorchfaceError, match="or a number of performers"):
+        train(replace(settings, performers=5))
+
+
+def test_meshes_without_colours_make_a_model_of_shape(
+    heads: list[Mesh], tmp_path: Path, without_pictures: None
+) -> None:
+    for number, mesh in enumerate(heads[:4]):
+        save_mesh(replace(mesh, colors=mesh.colors if number < 2 else None), tmp_path / f"{number}.glb")
+    said: list[str] = []
+    result = train(Settings(scans=tmp_path, out=tmp_path / "model", held_out=0), said.append)
+    assert result.model.color is None
+    assert "2.glb has no colours: the model will have none" in said

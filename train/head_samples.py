@@ -1,0 +1,180 @@
+"""What the recipe for head models learns from: meshes gathered on disk, laid on each other, freed from colour casts."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface import Mesh, load_mesh
+from torchface.errors import TopologyError
+from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.procrustes import aligned, generalised_procrustes
+from torchface.geometry.samples import MovedSamples, SampleRange, Samples, blocks
+from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.modeling import color_casts, texture_areas, without_cast
+from torchface.registration import find_scans
+from torchface.rendering.shading import sample_texture
+from torchface.synthetic import draw_identities, head
+from torchface.synthetic.complexion import complexion_colors, draw_complexions
+
+_CAST_VERTICES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Meshes that are read one by one.
+
+    Args:
+        names: of all of them.
+        read: gives the mesh of a number.
+        key: changes when anything about them does.
+    """
+
+    names: list[str]
+    read: Callable[[int], Mesh]
+    key: str
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Meshes of one topology on disk: positions, colours where all have some, and what they share."""
+
+    template: Mesh
+    shapes: MeshSequence
+    colors: MeshSequence | None
+    held_out: int
+
+
+def performers(count: int, seed: int) -> Source:
+    """Embedded performers, heads and complexions drawn by seed."""
+    generator = torch.Generator().manual_seed(seed)
+    identities, complexions = draw_identities(count, generator), draw_complexions(count, generator)
+
+    def read(number: int) -> Mesh:
+        mesh = head(identities[number], texture=False)
+        return replace(mesh, colors=complexion_colors(complexions[number : number + 1])[0])
+
+    return Source([f"performer {i}" for i in range(count)], read, f"performers {count} {seed}")
+
+
+def registered(folder: Path) -> Source:
+    """The meshes of a folder, by name."""
+    paths = find_scans([folder])
+    stamps = [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
+    key = hashlib.sha256("\n".join(stamps).encode()).hexdigest()
+    return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number])), key)
+
+
+def gather(source: Source, held_out: int, work: Path, template: Mesh | None, say: Callable[[str], None]) -> Gathered:
+    """Writes all meshes into two files; where an earlier run has stopped, it goes on.
+
+    Args:
+        source: of the meshes.
+        held_out: how many of them, the last, are kept for the test.
+        work: the folder of the files.
+        template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
+        say: told of progress.
+
+    Raises:
+        TopologyError: a mesh has another topology than the template.
+    """
+    first = source.read(0)
+    template = upright(first) if template is None else template
+    colored, size = first.colors is not None, len(template.vertices)
+    files = (work / "shapes.safetensors", work / "colors.safetensors")
+    count = len(source.names)
+    shapes, colors = (MeshSequenceWriter(path, count, size, template.faces, key=source.key) for path in files)
+    with shapes, colors:
+        for number in range(min(shapes.done, colors.done) if colored else shapes.done, count):
+            mesh = first if number == 0 else source.read(number)
+            if mesh.fingerprint() != template.fingerprint():
+                raise TopologyError(
+                    f"{source.names[number]}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, "
+                    f"expected the template's topology, {size} vertices and {len(template.faces)} triangles"
+                )
+            if colored and mesh.colors is None:
+                say(f"{source.names[number]} has no colours: the model will have none")
+                colored = False
+            if shapes.done == number:
+                shapes.append(mesh.vertices)
+            if colored and mesh.colors is not None and colors.done == number:
+                colors.append(mesh.colors)
+            if (number + 1) % max(1, count // 20) == 0:
+                say(f"read {number + 1} of {count}")
+    return Gathered(template, MeshSequence(files[0]), MeshSequence(files[1]) if colored else None, held_out)
+
+
+def upright(mesh: Mesh) -> Mesh:
+    """The mesh as its 68 landmarks stand upright and face the viewer, about its own middle; as it is without them."""
+    marked = mesh.annotations is not None and mesh.annotations.landmarks is not None
+    if not marked or len(mesh.landmarks) != 68:
+        return mesh
+    marks = mesh.vertices[mesh.landmarks].double()
+    across = torch.nn.functional.normalize(marks[45] - marks[36], dim=0)
+    up = marks[27] - marks[8]
+    up = torch.nn.functional.normalize(up - (up @ across) * across, dim=0)
+    turn = torch.stack([across, up, torch.linalg.cross(across, up)])
+    vertices = mesh.vertices.double()
+    return mesh.with_vertices(((vertices - vertices.mean(0)) @ turn.T).to(mesh.vertices))
+
+
+def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
+    """The heads to learn from on their common mean, and those to test on laid on it."""
+    total, count = len(gathered.shapes), len(gathered.shapes) - gathered.held_out
+    learn = SampleRange(gathered.shapes, 0, count)
+    found = generalised_procrustes(learn, scale, start=gathered.template.vertices)
+    rest = SampleRange(gathered.shapes, count, total)
+    poses = [
+        similarity_transform(part.double(), found.mean.expand(part.shape), scale=scale)
+        for part in (rest.read(*block) for block in blocks(rest))
+    ]
+    return aligned(learn, found), MovedSamples(rest, _joined(poses)) if poses else rest
+
+
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """Colours with each scan's cast taken off as they are read."""
+
+    colors: Samples
+    casts: Tensor
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """M, V, 3."""
+        return self.colors.shape
+
+    def read(self, begin: int, end: int) -> Tensor:
+        """See ``Samples``."""
+        return without_cast(self.colors.read(begin, end), self.casts[begin:end])
+
+
+def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, say: Callable[[str], None]) -> Samples:
+    """The colours, freed from casts that are told from some thousands of vertices, weighted by their texels."""
+    if not white_balance:
+        return colors
+    weights = texture_areas(template) if template.uvs is not None else torch.ones(len(template.vertices))
+    chosen = torch.arange(0, len(weights), max(1, len(weights) // _CAST_VERTICES))
+    some = torch.cat([colors.read(*block)[:, chosen] for block in blocks(colors)])
+    casts = color_casts(some, weights[chosen])
+    brightest = float(casts.mean(1).abs().max().exp())
+    say(f"casts taken off; the strongest exposure is {brightest:.2f} times the mean")
+    return Balanced(colors, casts)
+
+
+def vertex_colored(mesh: Mesh) -> Mesh:
+    """The mesh with colours a vertex: its own, or its texture's."""
+    if mesh.colors is not None or mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
+        return mesh
+    corner = torch.zeros(len(mesh.vertices), dtype=torch.int64)
+    corner[mesh.faces.flatten()] = mesh.uv_faces.flatten()
+    return replace(mesh, colors=sample_texture(mesh.texture, mesh.uvs[corner].double()).float())
+
+
+def _joined(poses: list[Similarity]) -> Similarity:
+
+    return Similarity(*(torch.cat([getattr(p, name) for p in poses]) for name in ("scale", "rotation", "translation")))
