@@ -1,0 +1,137 @@
+"""Densities against scikit-learn and scipy, their quadratics against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+from sklearn.cluster import estimate_bandwidth
+from sklearn.mixture import GaussianMixture as TheirMixture
+from torch import Tensor
+
+from torchface.capture.priors import (
+    GaussianMixture,
+    ParzenDensity,
+    ReciprocalPrior,
+    ShapePrior,
+    automatic_bandwidth,
+    face_halves,
+)
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+
+NAMES = ("browInnerUp", "eyeBlinkLeft", "jawOpen", "mouthPucker", "mouthClose")
+
+
+def clusters(frames: int = 600, seed: int = 0) -> Tensor:
+    """Weights around three poses, each with a covariance of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = torch.tensor([[0.1, 0.1, 0.1, 0.1, 0.1], [0.8, 0.2, 0.6, 0.1, 0.5], [0.2, 0.9, 0.2, 0.7, 0.1]]).double()
+    spread = torch.randn(3, 5, 5, generator=torch.Generator().manual_seed(9), dtype=torch.float64) * 0.04
+    member = torch.randint(3, (frames,), generator=generator)
+    noise = torch.randn(frames, 5, generator=generator, dtype=torch.float64)
+    return centers[member] + torch.einsum("tde,te->td", spread[member], noise)
+
+
+def test_a_single_gaussian_is_scipys() -> None:
+    x = clusters()
+    mixture = GaussianMixture.fit(x, 1, shrinkage=0.0, floor=1e-6).double()
+    covariance = np.cov(x.numpy().T, bias=True) + 1e-6 * np.eye(5)
+    theirs = multivariate_normal(x.mean(0).numpy(), covariance).logpdf(x.numpy())
+    np.testing.assert_allclose(mixture.log_density(x).numpy(), theirs, atol=1e-3)
+
+
+def test_a_mixture_is_as_likely_as_scikit_learns() -> None:
+    x, held_out = clusters(), clusters(seed=1)
+    mixture = GaussianMixture.fit(x, 3, shrinkage=0.0, floor=1e-6)
+    theirs = TheirMixture(3, n_init=5, random_state=0).fit(x.numpy())
+    ours = float(mixture.log_density(held_out.float()).mean())
+    assert ours == pytest.approx(theirs.score(held_out.numpy()), abs=0.02)
+
+
+def test_the_bandwidth_is_scikit_learns() -> None:
+    x = clusters(300)
+    assert automatic_bandwidth(x) == pytest.approx(estimate_bandwidth(x.numpy()), rel=0.02)
+
+
+@pytest.fixture(params=["parzen", "mixture"])
+def density(request: pytest.FixtureRequest) -> ParzenDensity | GaussianMixture:
+    x = clusters()
+    return ParzenDensity.fit(x) if request.param == "parzen" else GaussianMixture.fit(x, 3)
+
+
+def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture) -> None:
+    density = density.double()
+    at = clusters(5, seed=3).requires_grad_()
+    (slope,) = torch.autograd.grad(-density.log_density(at).sum(), at)
+    H, f = density.bound(at.detach())
+    torch.testing.assert_close((H @ at.detach()[..., None])[..., 0] + f, slope, rtol=1e-6, atol=1e-6)
+    other = clusters(5, seed=4)
+
+    def value(x: Tensor) -> Tensor:
+        return 0.5 * (x[:, None] @ H @ x[..., None])[:, 0, 0] + (f * x).sum(1)
+
+    rise = value(other) - value(at.detach())
+    assert bool((rise >= (density.log_density(at) - density.log_density(other)).detach() - 1e-9).all())
+
+
+def test_halves_are_independent() -> None:
+    takes = [clusters(200, seed=i) for i in range(3)]
+    prior = ShapePrior.fit(takes, NAMES).double()
+    assert prior.groups == face_halves(NAMES) == ((0, 1), (2, 3, 4))
+    here = takes[0][:4]
+    there = here.clone()
+    there[:, 2:] = takes[1][:4, 2:]
+    energy, other = prior.energy(here), prior.energy(there)
+    torch.testing.assert_close(energy.H[:, :2, :2], other.H[:, :2, :2])
+    assert not energy.H[:, :2, 2:].any()
+
+
+def test_a_solve_with_the_prior_never_gets_worse() -> None:
+    prior = ShapePrior.fit([clusters(200, seed=i) for i in range(3)], NAMES).double()
+    w = torch.rand(20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    before = prior.log_density(w)
+    for _ in range(10):
+        energy = prior.energy(w)
+        w = torch.linalg.solve(energy.H, -energy.f)
+        after = prior.log_density(w)
+        assert bool((after >= before - 1e-9).all())
+        before = after
+
+
+def test_the_papers_form_is_flat_near_the_data_and_guarded_far_from_it() -> None:
+    prior = ReciprocalPrior.fit([clusters()], NAMES).double()
+    at = clusters(3, seed=5).requires_grad_()
+    density = torch.stack([d.log_density(part) for d, part in prior._parts(at)]).exp()
+    (slope,) = torch.autograd.grad((1 / (density + prior.guard)).sum(), at)
+    energy = prior.energy(at.detach())
+    torch.testing.assert_close((energy.H @ at.detach()[..., None])[..., 0] + energy.f, slope, rtol=1e-6, atol=1e-6)
+    assert bool(torch.isfinite(prior.energy(torch.full((1, 5), 30.0, dtype=torch.float64)).H).all())
+
+
+@pytest.mark.parametrize("kind", [ShapePrior, ReciprocalPrior])
+def test_config_and_state_rebuild_it(kind: type[ShapePrior]) -> None:
+    prior = kind.fit([clusters(100), clusters(100, seed=1)], NAMES)
+    other = kind.from_config(prior.config)
+    other.load_state_dict(prior.state_dict())
+    w = clusters(4, seed=2).float()
+    assert torch.equal(other.log_density(w), prior.log_density(w))
+    assert torch.equal(other.energy(w).H, prior.energy(w).H)
+
+
+def test_bad_input() -> None:
+    with pytest.raises(ShapeError, match="no takes"):
+        ShapePrior.fit([], NAMES)
+    with pytest.raises(ShapeError, match="takes of \\(3, 2\\)"):
+        ShapePrior.fit([torch.zeros(3, 2)], NAMES)
+    with pytest.raises(ValueRangeError, match="no two frames"):
+        ShapePrior.fit([torch.full((5, 5), torch.nan)], NAMES)
+    with pytest.raises(ValueRangeError, match="all samples the same"):
+        ParzenDensity.fit(torch.ones(9, 2))
+    with pytest.raises(FileFormatError, match="expected one of parzen, mixture"):
+        ShapePrior.from_config({"names": ["a"], "groups": [[0]], "densities": [{"kind": "os.system"}], "strength": 1.0})
+    with pytest.raises(FileFormatError, match="at most"):
+        GaussianMixture.from_config({"components": 10**6, "dimensions": 10**5})
+    prior = ShapePrior.fit([clusters(100)], NAMES)
+    with pytest.raises(NameMismatchError, match="learned for other shapes"):
+        prior.require(["jawOpen"])

@@ -1,0 +1,14 @@
+"""What faces do, learned from takes: which weights, and how they go on."""
+
+from torchface.capture.priors.gaussian_mixture import GaussianMixture
+from torchface.capture.priors.parzen import ParzenDensity, automatic_bandwidth
+from torchface.capture.priors.shape_prior import ReciprocalPrior, ShapePrior, face_halves
+
+__all__ = [
+    "GaussianMixture",
+    "ParzenDensity",
+    "ReciprocalPrior",
+    "ShapePrior",
+    "automatic_bandwidth",
+    "face_halves",
+]

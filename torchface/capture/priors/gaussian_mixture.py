@@ -1,0 +1,176 @@
+"""A mixture of Gaussians with full covariances, fitted by expectation maximisation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.priors.parzen import checked_sizes
+from torchface.errors import ShapeError, ValueRangeError
+
+_ROUNDS, _DONE = 200, 1e-5
+_SEED_ROUNDS = 20
+
+
+class GaussianMixture(nn.Module):
+    r"""Gaussians with covariances of their own.
+
+    .. math:: p(x) = \sum_{k=1}^{K} \pi_k \, N(x \mid \mu_k, \Sigma_k)
+
+    Args:
+        means: (K,D).
+        factors: L with :math:`\Sigma_k^{-1} = L_k L_k^\top`, lower triangular, (K,D,D).
+        log_shares: :math:`\log \pi_k`, (K,).
+    """
+
+    means: Tensor
+    factors: Tensor
+    log_shares: Tensor
+
+    def __init__(self, means: Tensor, factors: Tensor, log_shares: Tensor) -> None:
+        super().__init__()
+        count, dimensions = means.shape
+        if factors.shape != (count, dimensions, dimensions) or log_shares.shape != (count,):
+            raise ShapeError(
+                f"Gaussian mixture: found means {tuple(means.shape)}, factors {tuple(factors.shape)}, log_shares "
+                f"{tuple(log_shares.shape)}, expected (K,D), (K,D,D), (K,)"
+            )
+        for name, value in (("means", means), ("factors", factors), ("log_shares", log_shares)):
+            self.register_buffer(name, value.detach().float())
+
+    @classmethod
+    def fit(
+        cls,
+        samples: Tensor,
+        components: int = 1,
+        shrinkage: float = 0.02,
+        floor: float = 1e-4,
+        seed: int = 0,
+    ) -> GaussianMixture:
+        """Fits by expectation maximisation from k-means, in float64.
+
+        Args:
+            samples: weights, (T,D).
+            components: K; those that lose all samples are dropped.
+            shrinkage: how far each covariance is drawn toward that of all samples, as a share: a component with few
+                samples keeps directions in which it saw nothing.
+            floor: added to each variance.
+            seed: of the k-means.
+
+        Raises:
+            ShapeError: fewer samples than components, or fewer than two.
+            ValueRangeError: NaN, or settings out of range.
+        """
+        if samples.ndim != 2 or len(samples) < max(components, 2):
+            raise ShapeError(
+                f"samples: found {tuple(samples.shape)}, expected (T,D) with at least {max(components, 2)}"
+            )
+        if not torch.isfinite(samples).all():
+            raise ValueRangeError("samples: found NaN or infinity, expected weights")
+        if components < 1 or not 0 <= shrinkage <= 1 or not floor > 0:
+            raise ValueRangeError(
+                f"Gaussian mixture: found {components} components, shrinkage {shrinkage}, floor {floor}, expected "
+                "at least one, a share, and a positive variance"
+            )
+        x = samples.detach().double()
+        whole = torch.cov(x.T, correction=0).reshape(x.shape[1], -1)
+        share = torch.nn.functional.one_hot(_nearest(x, _seeds(x, components, seed)), components).double()
+        before = -math.inf
+        # Each round needs the shares of the one before.
+        for _ in range(_ROUNDS):
+            share = share[:, share.sum(0) > 1e-6]
+            mixture = _maximised(x, share, whole, shrinkage, floor)
+            joint = mixture._log_joint(x)
+            likelihood = float(joint.logsumexp(1).mean())
+            if likelihood - before < _DONE:
+                break
+            before, share = likelihood, joint.softmax(1)
+        return mixture.float()
+
+    def log_density(self, samples: Tensor) -> Tensor:
+        """:math:`\\log p` of samples (B,D), (B,)."""
+        return self._log_joint(samples).logsumexp(1)
+
+    def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
+
+        By the share :math:`r_k` that each Gaussian has in the density there:
+        :math:`\sum_k r_k \tfrac12 (x - \mu_k)^\top \Sigma_k^{-1} (x - \mu_k)` and a constant.
+
+        Returns:
+            H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
+        """
+        share = self._log_joint(samples).softmax(1)
+        factors = self.factors.to(samples)
+        precision = factors @ factors.transpose(1, 2)
+        pulled = (precision @ self.means.to(samples)[..., None])[..., 0]
+        return (share @ precision.flatten(1)).unflatten(1, precision.shape[1:]), -share @ pulled
+
+    def _log_joint(self, samples: Tensor) -> Tensor:
+        """:math:`\\log \\pi_k N(x \\mid \\mu_k, \\Sigma_k)`, (B,K)."""
+        factors, means = self.factors.to(samples), self.means.to(samples)
+        whitened = torch.einsum("bkd,kde->bke", samples[:, None] - means, factors)
+        volume = factors.diagonal(dim1=1, dim2=2).log().sum(1)
+        constant = 0.5 * samples.shape[1] * math.log(2 * math.pi)
+        return self.log_shares.to(samples) + volume - constant - 0.5 * whitened.square().sum(-1)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Sizes from which :meth:`from_config` makes a density for the state to be loaded into."""
+        return {"kind": "mixture", "components": len(self.means), "dimensions": self.means.shape[1]}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> GaussianMixture:
+        """A density with the sizes of a ``config``.
+
+        Raises:
+            FileFormatError: a size is missing or too large.
+        """
+        count, dimensions = checked_sizes(config, "components", "dimensions")
+        checked_sizes({**config, "square": dimensions}, "components", "dimensions", "square")
+        return cls(torch.zeros(count, dimensions), torch.zeros(count, dimensions, dimensions), torch.zeros(count))
+
+
+def _maximised(x: Tensor, share: Tensor, whole: Tensor, shrinkage: float, floor: float) -> GaussianMixture:
+    """The mixture that is likeliest for samples x (T,D) whose shares (T,K) are known, in float64."""
+    count = share.sum(0)
+    means = (share.T @ x) / count[:, None]
+    moments = _moments(share, x)
+    own = moments / count[:, None, None] - means[:, :, None] * means[:, None]
+    covariance = (1 - shrinkage) * own + shrinkage * whole
+    covariance = 0.5 * (covariance + covariance.transpose(1, 2))
+    covariance.diagonal(dim1=1, dim2=2).add_(floor)
+    factors = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance)))
+    mixture = GaussianMixture(means, factors, (count / count.sum()).log())
+    # The buffers are float32 in a finished module; the rounds need the digits.
+    mixture.means, mixture.factors, mixture.log_shares = means, factors, (count / count.sum()).log()
+    return mixture
+
+
+def _moments(share: Tensor, x: Tensor) -> Tensor:
+    """Second moments (K,D,D); a loop over components keeps (T,K,D) out of the memory."""
+    return torch.stack([(column[:, None] * x).T @ x for column in share.T])
+
+
+def _seeds(x: Tensor, count: int, seed: int) -> Tensor:
+    """Centres (K,D) by k-means from far-apart samples (k-means++)."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = x[torch.randint(len(x), (1,), generator=generator)]
+    for _ in range(count - 1):  # each seed is drawn by its distance to those before
+        squared = torch.cdist(x, centers).square().amin(1)
+        if float(squared.sum()) == 0:
+            break
+        centers = torch.cat([centers, x[torch.multinomial(squared, 1, generator=generator)]])
+    for _ in range(_SEED_ROUNDS):
+        member = torch.nn.functional.one_hot(_nearest(x, centers), len(centers)).double()
+        total = member.sum(0)
+        centers = torch.where(total[:, None] > 0, member.T @ x / total.clamp(min=1)[:, None], centers)
+    return centers
+
+
+def _nearest(x: Tensor, centers: Tensor) -> Tensor:
+    return torch.cdist(x, centers).argmin(1)

@@ -1,0 +1,138 @@
+"""The Parzen window: how likely weights are, by their distance to those that were seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.landmarks.mean_shift import mean_shift
+
+_LARGEST = 2**28
+_SAMPLE = 1000
+
+
+class ParzenDensity(nn.Module):
+    r"""A density of equal bells around centres.
+
+    .. math:: p(x) = \frac{1}{K} \sum_{k=1}^{K} \exp\Big(-\frac{\lVert x - c_k \rVert^2}{2\sigma^2}\Big)
+
+    The bells are not scaled to an area of one: with the scale, a prior's strength would depend on the dimension.
+
+    Args:
+        centers: :math:`c_k`, (K,D).
+        bandwidth: :math:`\sigma`, a positive number, in the unit of the centres.
+
+    Source: thesis 4.2.7, equation 42, without its normaliser; 4.2.8.
+    """
+
+    centers: Tensor
+    bandwidth: Tensor
+
+    def __init__(self, centers: Tensor, bandwidth: float | Tensor) -> None:
+        super().__init__()
+        if centers.ndim != 2 or not len(centers):
+            raise ShapeError(f"Parzen window: found centers {tuple(centers.shape)}, expected (K,D) with at least one")
+        self.register_buffer("centers", centers.detach().float())
+        self.register_buffer("bandwidth", torch.as_tensor(bandwidth).detach().float().reshape(()))
+
+    @classmethod
+    def fit(cls, samples: Tensor, bandwidth: float | None = None, seed: int = 0) -> ParzenDensity:
+        """Bins samples (T,D) by mean shift, so that what was seen often counts as much as what was seen once.
+
+        Args:
+            samples: weights, (T,D).
+            bandwidth: of the mean shift and of the bells; :func:`automatic_bandwidth` if absent.
+            seed: for the samples that the automatic bandwidth looks at.
+
+        Raises:
+            ShapeError: fewer than two samples.
+            ValueRangeError: NaN, or samples that are all the same.
+        """
+        _check_samples(samples)
+        width = automatic_bandwidth(samples, seed=seed) if bandwidth is None else bandwidth
+        if not 0 < width < math.inf:
+            raise ValueRangeError(f"bandwidth: found {width}, expected a positive number; are all samples the same?")
+        return cls(mean_shift(samples.double(), width).centres, width)
+
+    def log_density(self, samples: Tensor) -> Tensor:
+        """:math:`\\log p` of samples (B,D), (B,), at most 0."""
+        return torch.logsumexp(self._log_bells(samples), dim=1) - math.log(len(self.centers))
+
+    def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
+
+        By the share :math:`r_k` that each bell has in the density there:
+        :math:`\sum_k r_k \lVert x - c_k \rVert^2 / 2\sigma^2` and a constant.
+
+        Returns:
+            H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
+        """
+        share = torch.softmax(self._log_bells(samples), dim=1)
+        precision = 1 / self.bandwidth.to(samples).square()
+        H = (precision * torch.eye(samples.shape[1], dtype=samples.dtype, device=samples.device)).expand(
+            len(samples), -1, -1
+        )
+        return H, -precision * (share @ self.centers.to(samples))
+
+    def _log_bells(self, samples: Tensor) -> Tensor:
+        squared = torch.cdist(samples, self.centers.to(samples)).square()
+        return -0.5 * squared / self.bandwidth.to(samples).square()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Sizes from which :meth:`from_config` makes a density for the state to be loaded into."""
+        return {"kind": "parzen", "centers": len(self.centers), "dimensions": self.centers.shape[1]}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> ParzenDensity:
+        """A density of zeros with the sizes of a ``config``.
+
+        Raises:
+            FileFormatError: a size is missing or too large.
+        """
+        return cls(torch.zeros(*checked_sizes(config, "centers", "dimensions")), 1.0)
+
+
+def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -> float:
+    """The mean distance from a sample to the farthest of its nearest share of the others.
+
+    Args:
+        samples: (T,D); of many a thousand are looked at.
+        quantile: that share.
+        seed: which ones.
+
+    Source: thesis 4.2.8; the rule of scikit-learn's ``estimate_bandwidth``.
+    """
+    _check_samples(samples)
+    generator = torch.Generator().manual_seed(seed)
+    some = samples.double()[torch.randperm(len(samples), generator=generator)[:_SAMPLE]]
+    nearest = max(int(quantile * len(some)), 1)
+    return float(torch.cdist(some, some).kthvalue(nearest, dim=1).values.mean())
+
+
+def checked_sizes(config: Mapping[str, Any], *names: str) -> tuple[int, ...]:
+    """Whole numbers of a config whose product fits the memory.
+
+    Raises:
+        FileFormatError: one is missing, no whole number from 1, or all together are too large.
+    """
+    sizes = tuple(config.get(name) for name in names)
+    found = dict(zip(names, sizes, strict=True))
+    if not all(isinstance(size, int) and not isinstance(size, bool) and size >= 1 for size in sizes):
+        raise FileFormatError(f"density: found sizes {found}, expected whole numbers from 1")
+    whole = tuple(int(size) for size in sizes if size is not None)
+    if math.prod(whole) > _LARGEST:
+        raise FileFormatError(f"density: found sizes {found}, expected at most {_LARGEST} numbers")
+    return whole
+
+
+def _check_samples(samples: Tensor) -> None:
+    if samples.ndim != 2 or len(samples) < 2:
+        raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (T,D) with at least two")
+    if not torch.isfinite(samples).all():
+        raise ValueRangeError("samples: found NaN or infinity, expected weights")

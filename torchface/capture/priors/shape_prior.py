@@ -1,0 +1,291 @@
+"""Which weights faces have: a density of each half of the face, as an energy for the solvers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.energy import Quadratic
+from torchface.capture.priors.gaussian_mixture import GaussianMixture
+from torchface.capture.priors.parzen import ParzenDensity
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+
+_UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
+_KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture]] = {"parzen": ParzenDensity, "mixture": GaussianMixture}
+_MOST_COMPONENTS = 8
+_FLOORS = (1e-4, 3e-4, 1e-3, 3e-3)
+_SHRINKAGES = (0.3, 0.5)
+
+
+class Density(Protocol):
+    """What a prior asks of a density; see ``ParzenDensity`` and ``GaussianMixture``."""
+
+    def log_density(self, samples: Tensor) -> Tensor:
+        """(B,D) to (B,)."""
+
+    def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        """A quadratic (B,D,D), (B,D) that touches the negative log density at samples (B,D) from above."""
+
+
+def face_halves(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """The shapes of eyes and brows, and all others: two groups of rows, or one where a half has none.
+
+    What the brows do says nothing of what the jaw does, and no take holds all combinations of both.
+
+    Example:
+        >>> face_halves(["jawOpen", "browInnerUp", "eyeBlink_L", "mouthPucker"])
+        ((1, 2), (0, 3))
+
+    Source: thesis 4.2.9.
+    """
+    upper = tuple(i for i, name in enumerate(names) if _UPPER.match(name))
+    lower = tuple(i for i in range(len(names)) if i not in upper)
+    return tuple(group for group in (upper, lower) if group)
+
+
+class ShapePrior(nn.Module):
+    r"""How unlikely weights are, as an energy.
+
+    .. math:: E(w) = -\lambda \sum_g \log p_g(w_g)
+
+    over groups of shapes that are independent of each other. The energy that a solver gets is quadratic, touches this
+    one at the weights where it is asked for and lies above it elsewhere, so that minimising it never makes things
+    worse: no pops, no step control.
+
+    Args:
+        names: N shapes; solvers refuse others.
+        groups: rows of ``names`` that belong together, (G) tuples; every shape in one group.
+        densities: one a group.
+        strength: :math:`\lambda`; 1 is Bayes' rule where the other terms are negative log likelihoods.
+
+    Raises:
+        ShapeError: not one density a group, or groups that do not divide the shapes.
+
+    Source: thesis 4.2.7 and 4.2.9; expectation maximisation's bound for the quadratic.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]],
+        densities: Sequence[ParzenDensity | GaussianMixture],
+        strength: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if sorted(i for group in groups for i in group) != list(range(len(names))) or len(groups) != len(densities):
+            raise ShapeError(
+                f"shape prior: found {len(densities)} densities of {len(groups)} groups, expected one each, and every "
+                f"one of {len(names)} shapes in one group"
+            )
+        self.names, self.groups = tuple(names), tuple(tuple(group) for group in groups)
+        self.strength = _checked_strength(strength)
+        self.densities = nn.ModuleList(densities)
+
+    @classmethod
+    def fit(
+        cls,
+        takes: Sequence[Tensor],
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]] | None = None,
+        seed: int = 0,
+    ) -> ShapePrior:
+        """Learns a mixture of Gaussians a group; how many and how smooth is chosen on takes left out in turn.
+
+        Args:
+            takes: weights of each take, (T,N); frames with a NaN are left out.
+            names: of the N shapes.
+            groups: :func:`face_halves` if absent.
+            seed: of the fit.
+
+        Raises:
+            ShapeError: no takes, or of another number of shapes.
+            ValueRangeError: fewer than two frames with all weights.
+        """
+        seen = _seen_frames(takes, names)
+        groups = face_halves(names) if groups is None else groups
+        chosen = [_chosen_mixture([take[:, list(group)] for take in seen], seed) for group in groups]
+        return cls(names, groups, chosen)
+
+    def log_density(self, weights: Tensor) -> Tensor:
+        """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
+        self._check(weights)
+        return torch.stack([density.log_density(part) for density, part in self._parts(weights)]).sum(0)
+
+    def energy(self, weights: Tensor) -> Quadratic:
+        """The quadratic that touches the energy at weights (B,N) from above."""
+        self._check(weights)
+        return self._assembled(weights, weights.new_full((len(self.groups), len(weights)), self.strength))
+
+    def _assembled(self, weights: Tensor, factors: Tensor) -> Quadratic:
+        """The groups' bounds at weights (B,N), each times its factor (G,B)."""
+        H = weights.new_zeros(len(weights), len(self.names), len(self.names))
+        f = weights.new_zeros(len(weights), len(self.names))
+        for (density, part), group, factor in zip(self._parts(weights), self.groups, factors, strict=True):
+            own, pull = density.bound(part)
+            rows = torch.tensor(group, device=weights.device)
+            H[:, rows[:, None], rows] = factor[:, None, None] * own
+            f[:, rows] = factor[:, None] * pull
+        return Quadratic(H, f)
+
+    def _parts(self, weights: Tensor) -> list[tuple[Density, Tensor]]:
+        densities: list[Any] = list(self.densities)
+        return [(density, weights[:, list(group)]) for density, group in zip(densities, self.groups, strict=True)]
+
+    def _check(self, weights: Tensor) -> None:
+        if weights.ndim != 2 or weights.shape[1] != len(self.names):
+            raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
+
+    def require(self, names: Sequence[str]) -> None:
+        """Checks that a rig's shapes are the prior's.
+
+        Raises:
+            NameMismatchError: they are others, or in another order.
+        """
+        if tuple(names) != self.names:
+            odd = sorted(set(names) ^ set(self.names))
+            shown = ", ".join(odd[:5]) or "another order"
+            raise NameMismatchError(f"prior: learned for other shapes than the rig has ({shown}); expected the same")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """From which :meth:`from_config` makes a prior for the state to be loaded into."""
+        return {
+            "names": list(self.names),
+            "groups": [list(group) for group in self.groups],
+            "densities": [density.config for density in self.densities],
+            "strength": self.strength,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> ShapePrior:
+        """A prior with the sizes of a ``config``.
+
+        Raises:
+            FileFormatError: a part of it is not what it should be.
+        """
+        densities = []
+        for entry in config.get("densities", []):
+            kind = _KINDS.get(entry.get("kind", "")) if isinstance(entry, Mapping) else None
+            if kind is None:
+                raise FileFormatError(
+                    f"shape prior: found the density {entry!r:.80}, expected one of {', '.join(_KINDS)}"
+                )
+            densities.append(kind.from_config(entry))
+        try:
+            return cls(config["names"], config["groups"], densities, config["strength"])
+        except (KeyError, TypeError) as error:
+            raise FileFormatError(f"shape prior: found a config without {error}, expected one") from error
+
+
+class ReciprocalPrior(ShapePrior):
+    r"""The paper's own form of the prior.
+
+    .. math:: E(w) = \lambda \sum_g \frac{1}{p_g(w_g) + p_0}
+
+    It is flat where weights are likely and rises steeply where they are not; :math:`p_0` guards it far from the data,
+    where 1/p has no bound and no direction. Its quadratic is the density's bound times the slope of
+    :math:`1/(p+p_0)` in :math:`-\log p`, which touches the energy at the weights but need not lie above it.
+
+    Args:
+        names, groups, densities, strength: as ``ShapePrior``.
+        guard: :math:`p_0`, against a density whose bells have height 1.
+
+    Source: thesis 4.2.9, equation 44.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]],
+        densities: Sequence[ParzenDensity | GaussianMixture],
+        strength: float = 1.0,
+        guard: float = 1e-2,
+    ) -> None:
+        super().__init__(names, groups, densities, strength)
+        if not 0 < guard < float("inf"):
+            raise ValueRangeError(f"guard: found {guard}, expected a positive density")
+        self.guard = guard
+
+    @classmethod
+    def fit(
+        cls,
+        takes: Sequence[Tensor],
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]] | None = None,
+        seed: int = 0,
+    ) -> ReciprocalPrior:
+        """Learns a Parzen window a group, over centres binned by mean shift with its automatic bandwidth.
+
+        Args, Raises: as ``ShapePrior.fit``.
+
+        Source: thesis 4.2.8.
+        """
+        together = torch.cat(_seen_frames(takes, names))
+        groups = face_halves(names) if groups is None else groups
+        return cls(names, groups, [ParzenDensity.fit(together[:, list(group)], seed=seed) for group in groups])
+
+    def energy(self, weights: Tensor) -> Quadratic:
+        """The quadratic with the energy's value and slope at weights (B,N)."""
+        self._check(weights)
+        density = torch.stack([density.log_density(part) for density, part in self._parts(weights)]).exp()
+        # d/dL of 1/(exp(-L) + p0) for L = -log p.
+        return self._assembled(weights, self.strength * density / (density + self.guard).square())
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """From which :meth:`from_config` makes a prior for the state to be loaded into."""
+        return {**super().config, "guard": self.guard}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> ReciprocalPrior:
+        """A prior with the sizes of a ``config``."""
+        made = ShapePrior.from_config(config)
+        densities: list[Any] = list(made.densities)
+        return cls(made.names, made.groups, densities, made.strength, float(config.get("guard", 1e-2)))
+
+
+def _chosen_mixture(takes: list[Tensor], seed: int) -> GaussianMixture:
+    """The mixture whose settings make takes left out likeliest; a single take is halved for that."""
+    parts = takes if len(takes) > 1 else list(takes[0].chunk(2))
+    best, likelihood = (1, _SHRINKAGES[0], _FLOORS[-1]), -float("inf")
+    count = 1
+    while count <= _MOST_COMPONENTS:
+        for shrinkage in _SHRINKAGES if count > 1 else _SHRINKAGES[:1]:
+            for floor in _FLOORS:
+                found = sum(_left_out(parts, i, count, shrinkage, floor, seed) for i in range(len(parts)))
+                if found > likelihood:
+                    best, likelihood = (count, shrinkage, floor), found
+        count *= 2
+    return GaussianMixture.fit(torch.cat(takes), *best, seed=seed)
+
+
+def _left_out(parts: list[Tensor], left: int, count: int, shrinkage: float, floor: float, seed: int) -> float:
+    """Mean log density of one part under a mixture of the others."""
+    others = torch.cat([part for i, part in enumerate(parts) if i != left])
+    if len(others) < max(count, 2):
+        return -float("inf")
+    mixture = GaussianMixture.fit(others, count, shrinkage, floor, seed)
+    return float(mixture.log_density(parts[left].double()).mean())
+
+
+def _seen_frames(takes: Sequence[Tensor], names: Sequence[str]) -> list[Tensor]:
+    """Each take's frames in which every weight is known, float64."""
+    wrong = [tuple(take.shape) for take in takes if take.ndim != 2 or take.shape[1] != len(names)]
+    if not takes or wrong:
+        found = f"takes of {wrong[0]}" if wrong else "no takes"
+        raise ShapeError(f"prior: found {found}, expected (T,{len(names)}) each")
+    seen = [take.detach().double()[torch.isfinite(take).all(1)] for take in takes]
+    seen = [take for take in seen if len(take) > 1]
+    if not seen:
+        raise ValueRangeError("prior: found no two frames with all weights, expected takes to learn from")
+    return seen
+
+
+def _checked_strength(strength: float) -> float:
+    if not isinstance(strength, int | float) or not 0 <= strength < float("inf"):
+        raise ValueRangeError(f"strength: found {strength!r}, expected a number that is not negative")
+    return float(strength)
