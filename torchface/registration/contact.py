@@ -15,7 +15,7 @@ from torchface.rendering.raycast import RayCaster
 
 _REACH = 1.5
 _BEHIND = 0.2
-_RELEASE = 1.5
+_RELEASE = 0.7
 _OUT = 20.0
 _SHALLOW, _DEEPER = 1.0, 0.8
 _CLOSED = 1.0
@@ -37,7 +37,7 @@ class ContactPull:
         r"""How firmly each pair is to keep together, (K,) in [0,1].
 
         :math:`(1 + g^2/c^2)^{-2}` (Geman and McClure) with g by how much further apart the two are than at rest and
-        c = 1.5 mm: what the scan's surface and landmarks have parted stays apart. And 0 where the scan is open
+        c = 0.7 mm: what the scan's surface and landmarks have parted stays apart. And 0 where the scan is open
         between the places that the two are nearest to: where these are more than 1 mm apart and a ray from before
         their middle into the head finds no surface, or one deeper than a crease between closed lips would be.
 

@@ -20,10 +20,12 @@ from torchface.registration.record import StageRecord
 from torchface.registration.schedule import Level, Schedule, Stage
 from torchface.registration.stiffness import identity_maps, linked_edges, positions, stiffness_rows
 from torchface.registration.subspace import Subspace, all_maps, graph, translations
+from torchface.registration.unfolding import unfolded
 from torchface.rendering.raycast import RayCaster
 
 _AREA_OF_ONE = 10.0
 _MOST_ATTEMPTS = 8
+_SLIVER = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,8 @@ class Deformer:
         self.maps = identity_maps(vertices)
         self.exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
         self._rest_cross = triangle_cross(vertices, faces)
+        area = self._rest_cross.norm(dim=-1)
+        self._sliver = area < _SLIVER * area.mean()
         # A correspondence stands for its share of the surface, so that the stiffness means the same at any resolution.
         self._area = float(self._rest_cross.norm(dim=-1).sum()) / 2
         self._folded = torch.zeros(len(vertices), dtype=torch.bool)
@@ -86,7 +90,8 @@ class Deformer:
         """One stage: correspondences and linear steps in turn, until ‖ΔX‖ < ε.
 
         Where triangles turn over, as in an ear that hair covers, the correspondences and landmarks around them are
-        dropped from here on and the stage starts again.
+        dropped from here on and the stage starts again. Slivers, which turn at the least motion, are left to
+        ``unfold``.
 
         Raises:
             ValueRangeError: no correspondence stands the tests.
@@ -98,7 +103,7 @@ class Deformer:
             vertices = evenly_spread(self.rest, vertices, stage.samples)
         record = self._attempt(stage, number, space, vertices)
         for circle in range(1, _MOST_ATTEMPTS):  # in widening circles, until nothing turns over
-            folded = self.folded_triangles()
+            folded = self.folded_triangles() & ~self._sliver
             if not folded.any():
                 break
             around = torch.zeros(len(self.rest), dtype=torch.bool)
@@ -148,6 +153,12 @@ class Deformer:
     def folded_triangles(self) -> Tensor:
         """Mask (F,) of the triangles that have turned by more than 90° since the template was laid on the scan."""
         return (triangle_cross(self.current, self.faces) * self._rest_cross).sum(-1) < 0
+
+    def unfold(self) -> None:
+        """Turns back what triangles are still turned over."""
+        maps = self.maps.copy()
+        maps[3::4] = unfolded(self.rest, self.current, self.faces).numpy()
+        self.maps = maps
 
     def _correspondences(self, vertices: Tensor, stage: Stage) -> Correspondences:
         found = correspondences(

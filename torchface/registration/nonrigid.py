@@ -129,6 +129,7 @@ def register(
     for number, stage in enumerate(stages_left, 1):
         say(f"bending, stage {number} of {len(stages_left)}")
         stages.append(deformer.run(stage, number))
+    deformer.unfold()
     say("measuring")
     nearest = _nearest(start.surface, deformer.current)
     matched = _matched(deformer, start.surface, nearest, schedule)

@@ -80,9 +80,9 @@ DEFAULT_SCHEDULE = Schedule(
     (
         Stage(Level.GRAPH, 18.0, 10.0, 30.0, samples=2000, iterations=4),
         Stage(Level.GRAPH, 5.0, 10.0, 20.0, samples=2000, iterations=3),
-        Stage(Level.GRAPH, 1.2, 5.0, 12.0, samples=2000, iterations=2, contact_weight=3.0),
-        Stage(Level.GRAPH, 0.3, 2.0, 8.0, samples=2000, iterations=2, contact_weight=3.0),
-        Stage(Level.TRANSLATIONS, 0.3, 1.0, 5.0, iterations=2, contact_weight=3.0),
+        Stage(Level.GRAPH, 1.2, 5.0, 12.0, samples=2000, iterations=2, contact_weight=2.0),
+        Stage(Level.GRAPH, 0.3, 2.0, 8.0, samples=2000, iterations=2, contact_weight=2.0),
+        Stage(Level.TRANSLATIONS, 0.3, 1.0, 5.0, iterations=2, contact_weight=2.0),
     )
 )
 """For heads of any resolution."""
@@ -91,9 +91,9 @@ FULL_SCHEDULE = Schedule(
     (
         Stage(Level.VERTICES, 18.0, 10.0, 30.0, iterations=4),
         Stage(Level.VERTICES, 5.0, 10.0, 20.0),
-        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2, contact_weight=3.0),
-        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2, contact_weight=3.0),
-        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2, contact_weight=3.0),
+        Stage(Level.VERTICES, 1.2, 5.0, 12.0, iterations=2, contact_weight=2.0),
+        Stage(Level.VERTICES, 0.3, 2.0, 8.0, iterations=2, contact_weight=2.0),
+        Stage(Level.VERTICES, 0.2, 1.0, 5.0, iterations=2, contact_weight=2.0),
     )
 )
 """An affine map a vertex from start to end, as in the paper: slower, and the measure for the default."""
