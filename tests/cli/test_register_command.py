@@ -8,10 +8,12 @@ import pytest
 import torch
 from PIL import Image
 
+from torchface import zoo
 from torchface.cli import main
 from torchface.io import load_mesh, save_mesh, save_rig
 from torchface.io.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
+from torchface.modeling import MorphableModel
 from torchface.rig import BlendshapeRig
 
 PICKS = torch.arange(26, 600, 41)
@@ -85,3 +87,25 @@ def test_mistakes_end_with_a_message_and_status_2(brought: Path, capsys: pytest.
         assert ended.value.code == 2
         told = capsys.readouterr().err.replace("\n", " ")
         assert message in told, (words, told)
+
+
+def test_a_model_by_folder_holds_the_registration(
+    brought: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heads = dome_rig.vertices * torch.tensor([[1, 1, 1], [1.05, 1, 1], [1, 0.95, 1.1], [1, 1, 1.1]])[:, None]
+    model = MorphableModel.fit(heads)
+    zoo.save_model(model, brought / "domes", licence="MIT", data="domes", metrics={}, recipe="this test")
+    scans, template = str(brought / "scans"), str(brought / "template.glb")
+    words = ["register", template, scans, "--out", str(brought / "out"), "--landmarks", scans, "--model"]
+    main([*words, str(brought / "domes")])
+    assert "the model comes to" in " ".join(capsys.readouterr().err.split())
+    true = load_mesh(brought / "scans" / "ben.obj")
+    assert float((load_mesh(brought / "out" / "ben.glb").vertices - true.vertices).norm(dim=-1).median()) < 0.3
+    with pytest.raises(SystemExit):
+        main([*words, "domes"])
+    assert "found no 'domes'" in capsys.readouterr().err
+    small = MorphableModel.fit(heads[:, :50])
+    zoo.save_model(small, brought / "half", licence="MIT", data="domes", metrics={}, recipe="this test")
+    with pytest.raises(SystemExit):
+        main([*words, str(brought / "half")])
+    assert "found a model of (50, 3), expected the template's topology" in " ".join(capsys.readouterr().err.split())

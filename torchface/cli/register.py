@@ -25,6 +25,7 @@ def register(
     unit: str | None = None,
     detector: Path | None = None,
     texture_size: int = 1024,
+    model: str | None = None,
     quiet: bool = False,
 ) -> None:
     """Bend a template onto raw scans: each scan's face in the template's topology, with the scan's colours.
@@ -46,6 +47,8 @@ def register(
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
         detector: Folder of a landmark detector for scans without landmarks.
         texture_size: Texels a side of each result's texture; 0 makes none.
+        model: Name or folder of a head model in the template's topology: each registration starts from it, and what it
+            knows of heads does not slide along the scan.
         quiet: Show no progress.
     """
     from torchface.registration.corpus_record import CorpusEntry
@@ -80,7 +83,7 @@ def register(
             progress.update(sheet, completed=done, total=total, visible=True)
 
         done = register_scans(
-            template, scans, out, landmarks, jobs, cluster, part, unit, detector, texture_size, registered, drawn
+            template, scans, out, landmarks, jobs, cluster, part, unit, detector, texture_size, model, registered, drawn
         )
     entries = done.report.entries
     reused = sum(entry.reused for entry in entries)

@@ -20,6 +20,7 @@ from torchface.registration.corpus_job import CorpusJob
 from torchface.registration.corpus_processes import in_processes
 from torchface.registration.corpus_record import CorpusEntry, CorpusTask, finished_entry, write_summary
 from torchface.registration.landmark_files import landmark_file
+from torchface.registration.model_start import HasShape, LinearShape, ShapeModel, shape_model
 from torchface.registration.preparation import check_template
 from torchface.registration.schedule import DEFAULT_SCHEDULE, Schedule
 
@@ -70,6 +71,7 @@ def register_corpus(
     schedule: Schedule = DEFAULT_SCHEDULE,
     texture_size: int = 1024,
     detector: str | Path | None = None,
+    model: ShapeModel | HasShape | None = None,
 ) -> CorpusReport:
     """Registers scans one by one into a folder: ``NAME.glb`` and a record ``NAME.json`` for each, and ``summary.csv``.
 
@@ -93,6 +95,7 @@ def register_corpus(
         unit: of the scans' files; if absent metres for glTF, millimetres for the others.
         schedule, texture_size: see ``register``.
         detector: the folder of a landmark detector for the scans without landmarks; see ``load_detector``.
+        model: of faces in the template's topology, which each registration starts from; see ``register``.
 
     Returns:
         ``CorpusReport(entries, out, summary)``.
@@ -118,7 +121,13 @@ def register_corpus(
     _check_apart(folder, files, marks)
     _make(folder)
     job = CorpusJob(
-        template, folder, schedule, texture_size, unit, None if detector is None else _folder("detector", detector)
+        template,
+        folder,
+        schedule,
+        texture_size,
+        unit,
+        None if detector is None else _folder("detector", detector),
+        None if model is None else LinearShape.of(shape_model(model, template)),
     )
     tasks = _tasks(job, files, marks)
     with _only_run(folder):
@@ -230,6 +239,8 @@ def _digest(job: CorpusJob) -> str:
         digest.update(template.annotations.landmarks.cpu().contiguous().numpy().tobytes())
     detector = None if job.detector is None else [_state(path) for path in sorted(job.detector.iterdir())]
     digest.update(repr((job.schedule, job.texture_size, job.unit, detector)).encode())
+    for tensor in () if job.model is None else (job.model.mean, job.model.modes):
+        digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 

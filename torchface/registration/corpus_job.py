@@ -19,6 +19,7 @@ from torchface.landmarks.detector_files import load_detector
 from torchface.mesh import Annotations, Mesh
 from torchface.registration.corpus_record import CorpusEntry, CorpusTask, write_record
 from torchface.registration.landmark_files import load_scan_landmarks
+from torchface.registration.model_start import LinearShape
 from torchface.registration.nonrigid import Registration, register
 from torchface.registration.schedule import Schedule
 
@@ -33,6 +34,7 @@ class CorpusJob:
         schedule, texture_size: see ``register``.
         unit: of the scans' files; each format's own if absent.
         detector: the folder of a landmark detector for the scans without landmarks.
+        model: of faces, which each registration starts from.
     """
 
     template: Mesh
@@ -41,6 +43,7 @@ class CorpusJob:
     texture_size: int
     unit: str | None = None
     detector: Path | None = None
+    model: LinearShape | None = None
 
     def run(self, task: CorpusTask) -> CorpusEntry:
         """Registers a scan and writes result and record; whatever is wrong with the scan is told, not raised."""
@@ -86,6 +89,7 @@ class CorpusJob:
             scan,
             landmarks,
             detector=self._detector if landmarks is None else None,
+            model=self.model,
             schedule=self.schedule,
             texture_size=self.texture_size,
         )
@@ -98,7 +102,8 @@ class CorpusJob:
     def __reduce__(self) -> tuple[Any, ...]:
         # Tensors would travel through shared memory, which containers keep small; arrays are copied.
         settings = (self.out, self.schedule, self.texture_size, self.unit, self.detector)
-        return _arrived, (_packed(self.template), *settings)
+        model = None if self.model is None else (self.model.mean.numpy(), self.model.modes.numpy())
+        return _arrived, (_packed(self.template), model, *settings)
 
 
 def _packed(mesh: Mesh) -> dict[str, Any]:
@@ -118,7 +123,7 @@ def _packed(mesh: Mesh) -> dict[str, Any]:
     return arrays
 
 
-def _arrived(arrays: dict[str, Any], *settings: Any) -> CorpusJob:
+def _arrived(arrays: dict[str, Any], model: tuple[np.ndarray, np.ndarray] | None, *settings: Any) -> CorpusJob:
     def tensors(found: dict[str, Any]) -> dict[str, Any]:
         return {
             name: tensors(value) if isinstance(value, dict) else torch.from_numpy(np.array(value))
@@ -128,4 +133,5 @@ def _arrived(arrays: dict[str, Any], *settings: Any) -> CorpusJob:
     mesh = tensors(arrays)
     if "annotations" in mesh:
         mesh["annotations"] = Annotations(**mesh["annotations"])
-    return CorpusJob(Mesh(**mesh), *settings)
+    shape = None if model is None else LinearShape(*(torch.from_numpy(np.array(part)) for part in model))
+    return replace(CorpusJob(Mesh(**mesh), *settings), model=shape)

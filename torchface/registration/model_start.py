@@ -35,6 +35,19 @@ class ShapeModel(Protocol):
     def modes(self) -> Tensor: ...
 
 
+@dataclass(frozen=True, eq=False)
+class LinearShape:
+    """A mean (V,3) and modes (K,V,3) of a model, without the model: what other processes are sent."""
+
+    mean: Tensor
+    modes: Tensor
+
+    @staticmethod
+    def of(model: ShapeModel) -> LinearShape:
+        """On the CPU, float32."""
+        return LinearShape(model.mean.detach().cpu().float(), model.modes.detach().cpu().float())
+
+
 class HasShape(Protocol):
     """What pairs a model of shape with other things, such as colours."""
 

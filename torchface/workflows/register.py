@@ -9,11 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, FileFormatError
+from torchface import zoo
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError
 from torchface.geometry.alignment import similarity_transform
 from torchface.io import load_mesh, load_rig
 from torchface.io.ict_facekit import region
 from torchface.mesh import Mesh, submesh
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.registration.corpus import CorpusReport, register_corpus
 from torchface.registration.corpus_record import CorpusEntry
 from torchface.rendering.compositing import caption, save_picture, sheet
@@ -23,6 +25,7 @@ CONTACT_SHEET = "contact_sheet.png"
 _WIDTH, _HEIGHT = 144, 180
 _TEXT = 11
 _SKIPPED = 0.85
+_KINDS = "HeadModel or MorphableModel"
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ def register_scans(
     unit: str | None = None,
     detector: Path | None = None,
     texture_size: int = 1024,
+    model: str | Path | None = None,
     progress: Callable[[int, int, CorpusEntry], None] | None = None,
     drawing: Callable[[int, int], None] | None = None,
 ) -> RegisteredScans:
@@ -66,6 +70,7 @@ def register_scans(
         TorchfaceError: the template, ``out`` or a setting is of no use.
     """
     mesh = load_template(template, part)
+    learned = None if model is None else load_shape_model(model)
     report = register_corpus(
         mesh,
         scans,
@@ -76,6 +81,7 @@ def register_scans(
         landmarks=landmarks,
         unit=unit,
         detector=detector,
+        model=learned,
         texture_size=texture_size,
     )
     picture = contact_sheet(report, mesh, drawing)
@@ -86,6 +92,20 @@ def register_scans(
             f"{report.entries[0].scan.name}: {report.entries[0].error}"
         )
     return RegisteredScans(report, report.out / CONTACT_SHEET)
+
+
+def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
+    """A model of heads by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    model = zoo.get_model(name_or_path)
+    if not isinstance(model, MorphableModel | HeadModel):
+        raise NameMismatchError(
+            f"model: found {name_or_path}, a {type(model).__name__}, expected a model of heads ({_KINDS})"
+        )
+    return model
 
 
 def contact_sheet(report: CorpusReport, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Tensor:
