@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.camera import Camera
-from torchface.geometry.operators import edges, vertex_normals
+from torchface.geometry.operators import border_vertices, components, edges, vertex_normals
 from torchface.geometry.uv_margin import laid_out
 from torchface.geometry.uv_raster import rasterise_uvs
 from torchface.mesh import Mesh
@@ -78,7 +78,8 @@ def photo_texture(
     at_vertices = [
         shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
     ]
-    weights = torch.stack([_faded(shown, graph) for shown in at_vertices])
+    outside = _outer_border(vertices, faces)
+    weights = torch.stack([_faded(shown, graph, outside) for shown in at_vertices])
     seen = weights.sum(0)
     if float(seen.max()) <= 0:
         raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
@@ -135,10 +136,23 @@ class _Graph:
         return least.scatter_reduce_(0, self.second, values[self.first], "amin")
 
 
-def _faded(shown: Shown, graph: _Graph) -> Tensor:
+def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
+    """The vertices (V,) of the widest opening, where the mesh ends but the person does not."""
+    border = border_vertices(faces, len(vertices))
+    along = edges(faces)
+    label = components(along[border[along].all(1)][:, [0, 1, 1]], len(vertices))
+    result = torch.zeros(len(vertices), dtype=torch.bool)
+    names = label[border].unique()
+    if len(names):
+        widths = [float((vertices[label == k].amax(0) - vertices[label == k].amin(0)).norm()) for k in names]
+        result = (label == names[int(torch.tensor(widths).argmax())]) & border
+    return result
+
+
+def _faded(shown: Shown, graph: _Graph, outside: Tensor) -> Tensor:
     """A photograph's weight at each vertex, (V,): how squarely it is seen, fading to 0 before it ends."""
     weight = ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
-    inner = (weight > 0).double()
+    inner = ((weight > 0) & ~outside).double()
     for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is off
         inner = graph.least(inner)
     soft = inner
@@ -188,17 +202,20 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     known, guess = alpha.clone(), colors * alpha[:, None]
     mirror = None if mesh.annotations is None else mesh.annotations.mirror
     if mirror is not None:
-        other = alpha[mirror.cpu()] * (1 - known)
-        guess, known = guess + other[:, None] * colors[mirror.cpu()], known + other
+        there = alpha[mirror.cpu()]
+        other = colors[mirror.cpu()]
+        tone = graph.smoothed(colors - other, alpha * there, _BROAD)
+        guess = guess + ((1 - alpha) * there)[:, None] * (other + tone)
+        known = known + (1 - alpha) * there
     if base is not None:
         under = base.detach().cpu().double()
-        tone = graph.smoothed(colors - under, alpha, _FILL)
-        guess = guess + (1 - known)[:, None] * (under + tone)
-        known = torch.ones_like(known)
-    rest = (known[:, None] > 0.5) & torch.isfinite(guess)
+        # The tone at the edge of what is known counts, not that of the face as a whole.
+        edge = graph.smoothed(1 - known[:, None], torch.ones_like(known), _FEATHER)[:, 0]
+        tone = graph.smoothed(guess / known.clamp(min=1e-9)[:, None] - under, known * (edge + 1e-3), _FILL)
+        return guess + (1 - known)[:, None] * (under + tone)
     mean = (guess * alpha[:, None]).sum(0) / alpha.sum()
-    guess = torch.where(rest, guess / known.clamp(min=0.5)[:, None], mean)
-    fixed = rest[:, 0]
-    for _ in range(_FILL if not bool(fixed.all()) else 0):  # heat that flows from what is known
-        guess = torch.where(fixed[:, None], guess, graph.sum(guess) / graph.degree[:, None])
+    fixed = (known > 0.5)[:, None]
+    guess = torch.where(fixed, guess / known.clamp(min=0.5)[:, None], mean)
+    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known
+        guess = torch.where(fixed, guess, graph.sum(guess) / graph.degree[:, None])
     return guess

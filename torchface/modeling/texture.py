@@ -49,7 +49,7 @@ def fit_colors(
     cameras: Sequence[Camera],
     lighting: bool = True,
     bound: float = 3.0,
-    prior: float = 1.0,
+    prior: float = 0.1,
 ) -> ColorFit:
     r"""The coefficients of a colour model under which a head looks as its photographs do.
 
