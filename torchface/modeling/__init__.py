@@ -4,20 +4,28 @@ from torchface.modeling.color_casts import color_casts, texture_areas, without_c
 from torchface.modeling.detail import BakeStatistics, NormalMap, bake_normal_map, detail_maps
 from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.modeling.head_model import HeadModel, Heads
+from torchface.modeling.image_fit import ImageFit, fit_images
+from torchface.modeling.image_solve import FitSettings
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.open_eyes import open_eyes
 from torchface.modeling.personalization import ExpressionRegression, rig_from_neutral
+from torchface.modeling.photo_texture import PhotoTexture, photo_texture
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
+from torchface.modeling.texture import ColorFit, fit_colors
 from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
 
 __all__ = [
     "BakeStatistics",
+    "ColorFit",
     "ExampleRig",
     "ExpressionRegression",
+    "FitSettings",
     "HeadModel",
     "Heads",
+    "ImageFit",
     "MorphableModel",
     "NormalMap",
+    "PhotoTexture",
     "RiggingSchedule",
     "ScanAlignment",
     "TransferReport",
@@ -26,7 +34,10 @@ __all__ = [
     "bake_normal_map",
     "color_casts",
     "detail_maps",
+    "fit_colors",
+    "fit_images",
     "open_eyes",
+    "photo_texture",
     "rig_from_examples",
     "rig_from_neutral",
     "texture_areas",

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError
 from torchface.geometry.alignment import similarity_transform
 from torchface.geometry.camera import Camera
 from torchface.geometry.pnp import Pose, solve_pnp
 from torchface.geometry.silhouette import LevelCurves, level_curves
 from torchface.mesh import Mesh
 from torchface.modeling.head_model import HeadModel
+from torchface.modeling.image_input import check_images, checked_landmark_vertices, checked_sizes, lens
+from torchface.modeling.image_skin import photographed_skin
 from torchface.modeling.image_solve import FitSettings, Problem, State, covariance, solve
 from torchface.modeling.landmark_view import JAW, LANDMARKS, LinearPoints, Views
+from torchface.modeling.texture import ColorFit
 from torchface.modeling.transfer import transfer_with_report
 from torchface.rig import BlendshapeRig
 
-_FEWEST = 6
-_FOCAL, _FOCAL_SPREAD = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
 _TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks
 _UNLIKE = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
-_INSIDE = 0.5
 _SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
 
 
@@ -43,6 +42,7 @@ class ImageFit:
         landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
         noise: estimated deviation of an inner landmark, pixels.
         covariance: of coefficients and weights, (K+N,K+N); rows of those that lie on their bound are zero.
+        color: what the colour model tells of the photographs; None without one, or without photographs.
     """
 
     mesh: Mesh
@@ -54,6 +54,7 @@ class ImageFit:
     landmarks: Tensor
     noise: float
     covariance: Tensor
+    color: ColorFit | None = None
 
     @property
     def errors(self) -> Tensor:
@@ -66,10 +67,12 @@ def fit_images(
     rig: BlendshapeRig,
     landmarks: Tensor,
     image_size: tuple[int, int] | Sequence[tuple[int, int]],
+    images: Sequence[Tensor] | None = None,
     landmark_vertices: Tensor | None = None,
     camera: float | Tensor | None = None,
     settings: FitSettings | None = None,
     transfers: int = 1,
+    texture_size: int = 1024,
     progress: Callable[[str], None] | None = None,
 ) -> ImageFit:
     r"""The head whose landmarks are seen where photographs show them.
@@ -87,11 +90,13 @@ def fit_images(
         rig: template with the model's topology.
         landmarks: in iBUG's order, (I,68,2), pixels, x right, y down; NaN for missing.
         image_size: (width, height) of all photographs, or one for each.
+        images: the photographs, (3,H,W) each, for the head's skin; see ``photographed_skin``.
         landmark_vertices: of the 68, (68,); the rig's annotated ones, or the model's, if absent.
         camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as known unless
             ``settings.focal_spread`` says how far it may be off. Estimated if absent.
         settings: how landmarks are trusted; see ``FitSettings``.
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
+        texture_size: of the skin, texels a side; 0 makes no texture.
         progress: called with a line before each step.
 
     Returns:
@@ -106,9 +111,11 @@ def fit_images(
     Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
     """
     say = progress or (lambda line: None)
-    vertices = _checked_topology(model, rig, landmark_vertices)
-    sizes = _checked_landmarks(landmarks, image_size)
-    intrinsics, settings = _lens(camera, sizes, settings or FitSettings())
+    vertices = checked_landmark_vertices(model, rig, landmark_vertices)
+    sizes = checked_sizes(landmarks, image_size)
+    if images is not None:
+        check_images(images, sizes)
+    intrinsics, settings = lens(camera, sizes, settings or FitSettings())
     found = landmarks.detach().cpu().double()
     mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
     deltas = _in_place(rig, mean)
@@ -133,7 +140,12 @@ def fit_images(
         points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
         problem = replace(problem, points=points)
         state = solve(problem, state)
-    return _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
+    fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
+    if images is None:
+        return fit
+    say("laying the photographs on the head")
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size)
+    return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
 
 
 def _result(
@@ -162,99 +174,6 @@ def _result(
         state.noise,
         covariance(problem, state),
     )
-
-
-def _checked_topology(model: HeadModel, rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
-    """The landmark vertices (68,)."""
-    faces = rig.neutral.faces
-    if len(model.shape.mean) != len(rig.vertices) or not torch.equal(model.faces.cpu(), faces.cpu()):
-        raise TopologyError(
-            f"fit_images: found a model of {len(model.shape.mean)} vertices and {len(model.faces)} triangles for a rig "
-            f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
-        )
-    if landmark_vertices is None:
-        known = rig.neutral.annotations
-        landmark_vertices = known.landmarks if known is not None and known.landmarks is not None else model.landmarks
-    if landmark_vertices is None:
-        raise ValueRangeError(
-            "landmark_vertices: found none, neither given nor annotated on rig or model; expected (68,) vertex ids"
-        )
-    if landmark_vertices.shape != (LANDMARKS,) or landmark_vertices.dtype != torch.int64:
-        raise ShapeError(
-            f"landmark_vertices: found {tuple(landmark_vertices.shape)} of {landmark_vertices.dtype}, expected "
-            f"({LANDMARKS},) of torch.int64"
-        )
-    if not 0 <= int(landmark_vertices.min()) <= int(landmark_vertices.max()) < len(rig.vertices):
-        raise TopologyError(
-            f"landmark_vertices: found {int(landmark_vertices.min())} to {int(landmark_vertices.max())}, expected 0 "
-            f"to {len(rig.vertices) - 1}"
-        )
-    return landmark_vertices.cpu()
-
-
-def _checked_landmarks(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:
-    """The photographs' sizes, (I,2): width and height."""
-    if landmarks.ndim != 3 or landmarks.shape[1:] != (LANDMARKS, 2) or len(landmarks) == 0:
-        raise ShapeError(
-            f"landmarks: found {tuple(landmarks.shape)}, expected (I,{LANDMARKS},2) with at least one view"
-        )
-    sizes = torch.as_tensor(image_size, dtype=torch.float64)
-    if sizes.shape not in ((2,), (len(landmarks), 2)) or not bool((sizes >= 2).all()):
-        raise ShapeError(
-            f"image_size: found {image_size}, expected (width, height) in pixels, once or for each of "
-            f"{len(landmarks)} views"
-        )
-    sizes = sizes.expand(len(landmarks), 2)
-    for i, (marks, size) in enumerate(zip(landmarks.double(), sizes, strict=True)):  # a view at a time, for its message
-        _check_view(i, marks.cpu(), size)
-    return sizes
-
-
-def _check_view(i: int, marks: Tensor, size: Tensor) -> None:
-    seen = torch.isfinite(marks).all(-1)
-    picture = f"a picture of {int(size[0])} x {int(size[1])}"
-    if int(seen.sum()) == 0:
-        raise ValueRangeError(f"landmarks: found none in view {i}, expected at least {_FEWEST}; leave that view out")
-    if int(seen[JAW:].sum()) < _FEWEST:
-        raise ValueRangeError(
-            f"landmarks: found {int(seen[JAW:].sum())} on brows, eyes, nose and mouth in view {i}, expected at least "
-            f"{_FEWEST}"
-        )
-    low, high = marks[seen].amin(0), marks[seen].amax(0)
-    found = f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
-    if float((high - low).max()) < 4:
-        raise ValueRangeError(f"landmarks: found view {i}'s from {found}, expected pixels in {picture}")
-    inside = ((marks[seen] > -0.1 * size) & (marks[seen] < 1.1 * size)).all(-1)
-    if float(inside.double().mean()) < _INSIDE:
-        raise ValueRangeError(
-            f"landmarks: found view {i}'s from {found}, most of them outside {picture}; expected pixels of that picture"
-        )
-
-
-def _lens(camera: float | Tensor | None, sizes: Tensor, settings: FitSettings) -> tuple[Tensor, FitSettings]:
-    """Intrinsics (I,3,3), and the settings with what is known of the focal length."""
-    count = len(sizes)
-    if isinstance(camera, Tensor) and camera.ndim > 0:
-        intrinsics = camera.detach().cpu().double()
-        if intrinsics.shape not in ((3, 3), (count, 3, 3)):
-            raise ShapeError(f"camera: found {tuple(camera.shape)}, expected (3,3) or ({count},3,3)")
-        if not torch.isfinite(intrinsics).all() or not bool((intrinsics[..., [0, 1], [0, 1]] > 0).all()):
-            raise ValueRangeError("camera: found a focal length that is not positive, expected K with positive ones")
-        return intrinsics.expand(count, 3, 3), settings
-    if camera is None:
-        focal = _FOCAL * sizes.amax(1)
-        if settings.focal_spread == 0:
-            settings = replace(settings, focal_spread=_FOCAL_SPREAD)
-        if not bool((sizes == sizes[0]).all()):  # other sizes, other cameras or crops
-            settings = replace(settings, shared_focal=False)
-    else:
-        focal = torch.full((count,), float(camera), dtype=torch.float64)
-        if not math.isfinite(float(camera)) or not float(camera) > 0:
-            raise ValueRangeError(f"camera: found a focal length of {float(camera):g}, expected positive pixels")
-    intrinsics = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
-    intrinsics[:, :2, 2] = (sizes - 1) / 2
-    return intrinsics, settings
 
 
 def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:

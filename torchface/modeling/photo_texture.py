@@ -21,6 +21,7 @@ _SQUARELY = 0.2
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _MOST_GAIN = 4.0
+_NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +215,9 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         tone = graph.smoothed(guess / known.clamp(min=1e-9)[:, None] - under, known * (edge + 1e-3), _FILL)
         return guess + (1 - known)[:, None] * (under + tone)
     mean = (guess * alpha[:, None]).sum(0) / alpha.sum()
+    label = components(mesh.faces.cpu(), len(alpha))
+    shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
+    mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
     fixed = (known > 0.5)[:, None]
     guess = torch.where(fixed, guess / known.clamp(min=0.5)[:, None], mean)
     for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known

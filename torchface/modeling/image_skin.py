@@ -1,0 +1,65 @@
+"""The skin of a fitted head from the photographs that it was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.camera import Camera
+from torchface.mesh import Mesh
+from torchface.modeling.morphable import MorphableModel
+from torchface.modeling.photo_texture import photo_texture
+from torchface.modeling.texture import ColorFit, fit_colors
+from torchface.rendering.shading import sample_texture
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, and the colour model's answer."""
+
+    colors: Tensor | None
+    texture: Tensor | None
+    fit: ColorFit | None
+
+    def on(self, mesh: Mesh) -> Mesh:
+        """A mesh that wears it; one without a layout or a colour model keeps its own."""
+        colors = mesh.colors if self.colors is None else self.colors
+        return replace(mesh, colors=colors, texture=mesh.texture if self.texture is None else self.texture)
+
+
+def photographed_skin(
+    posed: Mesh, color: MorphableModel | None, images: Sequence[Tensor], cameras: Sequence[Camera], size: int = 1024
+) -> Skin:
+    """What photographs and a colour model tell of a head's skin.
+
+    Args:
+        posed: the head as the photographs show it; its own skin is the template's.
+        color: model of vertex colours, if there is one.
+        images: photographs, (3,H,W) each.
+        cameras: one each.
+        size: of the texture, texels a side; 0 makes none.
+
+    Returns:
+        With texture coordinates: the photographs laid on the head, and where none shows it the colour model, else the
+        template's skin. Without: the colour model's colours.
+    """
+    fit = None if color is None else fit_colors(color, posed, images, cameras)
+    base = _own_colors(posed) if fit is None else fit.colors
+    if posed.uvs is None or size == 0:
+        return Skin(base, None, fit)
+    laid = photo_texture(posed, images, cameras, size, base)
+    return Skin(laid.colors, laid.image, fit)
+
+
+def _own_colors(mesh: Mesh) -> Tensor | None:
+    """Vertex colours (V,3) of a mesh: its own, else those of its texture."""
+    if mesh.colors is not None:
+        return mesh.colors.cpu().float()
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
+        return None
+    row = torch.zeros(len(mesh.vertices), dtype=torch.int64)
+    row[mesh.faces.cpu().flatten()] = mesh.uv_faces.cpu().flatten()
+    return sample_texture(mesh.texture.cpu(), mesh.uvs.cpu()[row])
