@@ -81,16 +81,21 @@ class Attachment:
             corners // 3, barycentric, None if labels is None else tuple(labels), fingerprint=mesh.fingerprint()
         )
 
-    def check(self, mesh: Mesh) -> None:
-        """Raises ``TopologyError`` where this attachment cannot belong to ``mesh``."""
+    def check(self, mesh: Mesh, source: str | Path = "attachment", owner: str | Path = "the mesh") -> None:
+        """Raises ``TopologyError`` where this attachment cannot belong to ``mesh``.
+
+        Args:
+            mesh: what it is to sit on.
+            source, owner: what to call the attachment and the mesh in the message: their files, where known.
+        """
         if self.fingerprint is not None and self.fingerprint != mesh.fingerprint():
             raise TopologyError(
-                f"attachment: found marker sites made for topology {self.fingerprint}, expected the mesh's own, "
+                f"{source}: found marker sites made for topology {self.fingerprint}, expected {owner}'s own, "
                 f"{mesh.fingerprint()} (vertex count, hash of the triangles)"
             )
         if len(self.triangles) and (int(self.triangles.min()) < 0 or int(self.triangles.max()) >= len(mesh.faces)):
             raise TopologyError(
-                f"attachment: found triangles {int(self.triangles.min())} to {int(self.triangles.max())}, "
+                f"{source}: found triangles {int(self.triangles.min())} to {int(self.triangles.max())}, "
                 f"expected 0 to {len(mesh.faces) - 1}"
             )
 

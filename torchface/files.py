@@ -20,9 +20,9 @@ def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
     path = Path(path)
     try:
         if not path.exists():
-            raise FileFormatError(f"{path}: found no such file, expected one")
+            raise FileFormatError(f"{path}: found no such file, expected an existing one")
         if not path.is_file():
-            raise FileFormatError(f"{path}: found no plain file, expected one")
+            raise FileFormatError(f"{path}: found a folder or a device, expected a plain file")
         size = path.stat().st_size
         if size == 0:
             raise FileFormatError(f"{path}: found an empty file, expected content")

@@ -1,15 +1,18 @@
 """Commands do on disk what the library does in memory, and say clearly what is wrong."""
 
+from io import StringIO
 from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 
 from torchface.capture import MarkerSolver
-from torchface.cli import COMMANDS, main
+from torchface.cli import COMMANDS, main, progress
 from torchface.cli.export import EXPORTS
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, load_take, save_mesh, save_rig, save_take
+from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
@@ -120,3 +123,50 @@ def test_every_command_explains_itself_and_its_arguments(capsys: pytest.CaptureF
         assert ended.value.code == 0
         told = capsys.readouterr().out
         assert len(told) > 500, words
+
+
+def test_help_is_a_short_line_a_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert end.value.code == 0
+    lines = [line.split(None, 1) for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert {line[0] for line in lines} == {*COMMANDS, "export"}
+    assert all(10 < len(line[1].strip()) < 90 for line in lines)
+
+
+def test_an_attachment_without_a_rig_or_of_another_is_told_by_file(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_mesh(dome_rig.neutral, shoot / "mesh.obj")
+    save_mesh(dome_rig.neutral, shoot / "mesh.glb")
+    for name, said in (("mesh.obj", "mesh.obj: found no rig"), ("mesh.glb", "found no morph target in its one mesh")):
+        with pytest.raises(SystemExit):
+            run("info", shoot / name, "--attachment", shoot / "attachment.json")
+        assert said in " ".join(capsys.readouterr().err.split())
+    other = BlendshapeRig(Mesh(dome_rig.vertices, dome_rig.neutral.faces[:-1]), dome_rig.deltas, dome_rig.names)
+    save_rig(other, shoot / "other.glb")
+    files = (shoot / "other.glb", shoot / "take.c3d", "--attachment", shoot / "attachment.json")
+    for words in (("info", files[0], *files[2:]), ("solve", *files, "--out", shoot / "out.csv")):
+        with pytest.raises(SystemExit):
+            run(*words)
+        said = capsys.readouterr().err
+        assert "attachment.json: found marker sites made for topology" in said
+        assert "other.glb's own" in said
+
+
+def test_an_error_leaves_no_spinner_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = StringIO()
+    monkeypatch.setattr(progress, "console", Console(file=screen, force_terminal=True, width=60))
+
+    def breaks() -> None:
+        with progress.steps() as step:
+            step("done with")
+            step("at this it breaks")
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        breaks()
+    last = screen.getvalue().split("\x1b[2K")[-1]
+    assert "done with" in last
+    assert "at this" not in last

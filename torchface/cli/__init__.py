@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 
@@ -11,6 +12,9 @@ from collections.abc import Callable, Sequence
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from torchface.cli.demo import demo
 from torchface.cli.export import EXPORTS
@@ -44,6 +48,9 @@ DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship th
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command; an error that the user can mend ends with its message and exit status 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words in (["--help"], ["-h"]):
+        _overview()
+        raise SystemExit(0 if words else 2)
     try:
         if words[:1] == ["export"]:
             tyro.extras.subcommand_cli_from_dict(
@@ -54,8 +61,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 COMMANDS | {"export": _export_help}, prog="torchface", description=DESCRIPTION, args=words
             )
     except TorchfaceError as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise SystemExit(2) from None
+
+
+def _overview() -> None:
+    """A line a command; tyro would print the whole of each."""
+    table = Table(box=None, show_header=False, padding=(0, 2))
+    for name, command in (COMMANDS | {"export": _export_help}).items():
+        summary = " ".join((command.__doc__ or "").partition("\n\n")[0].split())
+        table.add_row(f"[bold]{name}[/]", escape(re.split(r"[:;,.](?:\s|$)", summary)[0]))
+    page = Console()
+    page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
+    page.print(table, highlight=False)
+    page.print("\ntorchface COMMAND --help tells more of each.", highlight=False)
 
 
 def _export_help() -> None:

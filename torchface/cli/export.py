@@ -61,6 +61,7 @@ def _write_solver(
     with steps(quiet) as step:
         step("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
+        where.check(loaded.neutral, attachment, rig)
         step("exporting and checking")
         report = export(loaded, where, out)
     table = Table(show_header=False)

@@ -30,5 +30,10 @@ def steps(quiet: bool = False) -> Iterator[Callable[[str], None]]:
             finish()
             current.append(progress.add_task(line, total=1))
 
-        yield begin
+        try:
+            yield begin
+        except BaseException:
+            for task in current:  # what did not come to an end leaves no line behind
+                progress.remove_task(task)
+            raise
         finish()

@@ -37,12 +37,18 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         except FileFormatError:
             if path.is_dir():
                 raise
+            if attachment is not None:
+                raise
             return _mesh_rows(load_mesh(path))
         rows = _rig_rows(rig)
         if attachment is not None:
-            seen = observability(MarkerSolver(rig, Attachment.load(attachment)))
+            where = Attachment.load(attachment)
+            where.check(rig.neutral, attachment, path)
+            seen = observability(MarkerSolver(rig, where))
             rows += [("what the markers see", str(seen))]
         return rows
+    if attachment is not None:
+        raise FileFormatError(f"{path}: found no rig, expected one to say what the markers of {attachment} tell apart")
     if suffix in {".obj", ".ply", ".stl"}:
         return _mesh_rows(load_mesh(path))
     if suffix in {".c3d", ".trc", ".csv"}:

@@ -39,8 +39,9 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
     if not names:
-        meshes = len(document.objects("meshes"))
-        raise FileFormatError(f"{path}: found no morph target in its {meshes} meshes, expected at least one for a rig")
+        count = len(document.objects("meshes"))
+        meshes = f"its {count} meshes" if count != 1 else "its one mesh"
+        raise FileFormatError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
     return BlendshapeRig(neutral, deltas, names)
 
 
