@@ -140,7 +140,7 @@ def rig_actor(
         TorchfaceError: neutral scan, template or an option is of no use.
     """
     options, say = options or RigOptions(), progress or (lambda line: None)
-    _check_out(out)
+    check_out(out)
     say("reading the template")
     rig = load_rig(template, part=options.part)
     shown = weights_row(options.pose, rig.names, "pose") if options.pose else torch.zeros(len(rig.names))
@@ -284,7 +284,8 @@ def _spread(distances: Tensor) -> str:
     return f"median {float(distances.median()):.3f} mm, 95th percentile {float(distances.quantile(0.95)):.3f} mm"
 
 
-def _check_out(out: Path) -> None:
+def check_out(out: Path) -> None:
+    """Refuses a rig's file that is no ``.glb`` or cannot be written to, before any work is done."""
     if out.suffix.lower() != ".glb":
         raise FileFormatError(f"{out}: found the ending {out.suffix!r}, expected .glb")
     try:

@@ -1,0 +1,54 @@
+"""``torchface fit``: a person's rig from photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import console, steps
+
+
+def fit(
+    photographs: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTO...")],
+    landmarks: tuple[Path, ...],
+    model: str,
+    out: Path,
+    template: Path | None = None,
+    focal: float | None = None,
+    inner_weight: float | None = None,
+    face: int | None = None,
+    texture_size: int = 1024,
+    quiet: bool = False,
+) -> None:
+    """Make a person's rig from one or several photographs with landmarks, and write it as .glb.
+
+    A head model is fitted to 68 landmarks in each photograph: identity, expression, poses and focal length at once.
+    All photographs show one person with one expression; profiles beside a front view tell how far things stand out.
+    The photographs become the rig's texture. Beside OUT lies a picture for each photograph: it, the fit over it, and
+    the landmarks, found green and fitted red.
+
+    Args:
+        photographs: Image files.
+        landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
+            one .xml of dlib's (imglab) that names the photographs.
+        model: A head model of the zoo by name, or its folder.
+        out: The .glb to write.
+        template: The rig whose shapes the head is given, with the model's topology; the embedded performer if absent.
+        focal: Focal length in pixels where it is known; estimated if absent.
+        inner_weight: Weight of landmarks at brows, eyes, nose and mouth beside those of the face's contour.
+        face: Which face of a photograph, from 0, where an .xml holds several.
+        texture_size: Texels a side of the rig's texture; 0 makes none.
+        quiet: Show no progress.
+    """
+    from torchface.modeling import FitSettings
+    from torchface.workflows.fit import fit_photographs
+
+    settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
+    with steps(quiet) as step:
+        made = fit_photographs(photographs, landmarks, model, out, template, focal, settings, face, texture_size, step)
+    for line in made.lines(photographs):
+        console.print(line, highlight=False, markup=False)
+    for path in (*made.pictures, out):
+        print(path)
