@@ -18,6 +18,7 @@ from rich.table import Table
 
 from torchface.cli.demo import demo
 from torchface.cli.export import EXPORTS
+from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.pick import pick
 from torchface.cli.progress import console
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "register": register,
     "rig": rig,
+    "fit": fit,
     "transfer": transfer,
     "solve": solve,
     "retarget": retarget,
