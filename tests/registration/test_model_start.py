@@ -75,16 +75,15 @@ def test_the_same_input_gives_the_same_fit(mask: Mesh, waves: Waves, rescanned: 
 @pytest.mark.real
 def test_real_shapes_known_to_the_model_do_not_slide(ict_folder: Path, rescanned: Callable) -> None:
     modes = load_identity_modes(ict_folder, part="face")
-    template, half = modes.neutral, Waves(modes.neutral.vertices, modes.deltas[:12])
+    template = modes.neutral
     head = modes.random_head(1)
     scan = rescanned(Mesh(head.vertices.double(), head.faces))
     landmarks = (template.landmarks, head.vertices[template.landmarks].double())
     whole = Waves(template.vertices, modes.deltas)
-    found = [register(template, scan, landmarks, model=model) for model in (None, whole, half)]
-    assert [result.coefficients is None for result in found] == [True, False, False]
-    without, known, partly = (float((r.mesh.vertices - head.vertices).norm(dim=1).mean()) for r in found)
+    found = [register(template, scan, landmarks, model=model) for model in (None, whole)]
+    assert [result.coefficients is None for result in found] == [True, False]
+    without, known = (float((r.mesh.vertices - head.vertices).norm(dim=1).mean()) for r in found)
     assert known < 0.3 * without
-    assert partly < 0.9 * without
 
 
 def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mask: Callable) -> None:

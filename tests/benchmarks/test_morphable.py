@@ -1,0 +1,124 @@
+"""Morphable models: speed and agreement beside scikit-learn, and ten thousand samples from disk in bounded memory.
+
+``$TORCHFACE_BENCH_SAMPLES`` sets how many samples lie on disk (10,000 if absent: 1.1 GB of file, some minutes).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from sklearn.decomposition import PCA
+
+from torchface.io import load_identity_modes
+from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.modeling import MorphableModel
+
+SAMPLES = int(os.environ.get("TORCHFACE_BENCH_SAMPLES", "10000"))
+VERTICES, COMPONENTS = 9409, 200
+
+FIT = """
+import json, resource, sys, time
+from torchface.io.mesh_sequence import MeshSequence
+from torchface.modeling.sequence_fit import fit_sequence
+from safetensors.torch import save_file
+
+path, checkpoint, out = sys.argv[1:4]
+begin, clock, limit = time.perf_counter(), time.process_time(), int(sys.argv[4])
+seen = []
+
+def progress(done, total):
+    seen.append(done)
+    print(json.dumps({"done": done, "total": total}), flush=True)
+
+model = fit_sequence(MeshSequence(path), limit, checkpoint, progress)
+save_file({"deviations": model.standard_deviations, "components": model.components[:5]}, out)
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+print(json.dumps({"gib": peak, "wall": time.perf_counter() - begin, "cpu": time.process_time() - clock}), flush=True)
+"""
+
+
+@pytest.mark.real
+def test_as_exact_as_scikit_learn_and_faster(ict_folder: Path) -> None:
+    """200 heads of 26,719 vertices: ICT-FaceKit's modes, and noise so that all 199 components are there."""
+    modes = load_identity_modes(ict_folder)
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(200, len(modes.names), generator=generator)
+    heads = torch.stack([modes.head(row).vertices for row in drawn])
+    heads += 0.1 * torch.randn(heads.shape, generator=generator)
+    flat = heads.flatten(1).numpy()
+    ways = {
+        "torchface": lambda: MorphableModel.fit(heads),
+        "scikit-learn, float32": lambda: PCA().fit(flat),
+        "scikit-learn, float64": lambda: PCA().fit(flat.astype(np.float64)),
+    }
+    seconds, results = {}, {}
+    for name, way in ways.items():
+        times = []
+        for _ in range(3):
+            begin = time.process_time()
+            results[name] = way()
+            times.append(time.process_time() - begin)
+        seconds[name] = min(times)
+    ours, exact = results["torchface"], results["scikit-learn, float64"]
+    deviations = torch.from_numpy(exact.explained_variance_[:199]).sqrt()
+    components = torch.from_numpy(exact.components_[:199])
+    gap = float(((ours.standard_deviations - deviations) / deviations).abs().max())
+    # Only where two deviations are well apart does each have a direction of its own: the twenty modes.
+    cosine = (ours.components.flatten(1).double() * components).sum(1).abs()[:20]
+    print("\n200 samples x 26,719 vertices, processor seconds")
+    for name, took in seconds.items():
+        print(f"{name:>24} {took:8.2f} s {took / seconds['torchface']:8.1f}")
+    print(f"largest relative difference of a deviation {gap:.1e}, least cosine of the modes {float(cosine.min()):.8f}")
+    assert gap <= 1e-4
+    assert float(cosine.min()) > 1 - 1e-6
+    assert seconds["scikit-learn, float32"] >= 5 * seconds["torchface"]
+
+
+@pytest.fixture(scope="module")
+def on_disk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("corpus") / "heads.safetensors"
+    generator = torch.Generator().manual_seed(0)
+    basis = 2 * torch.randn(300, 3 * VERTICES, generator=generator) * 0.98 ** torch.arange(300)[:, None]
+    with MeshSequenceWriter(path, SAMPLES, VERTICES, torch.tensor([[0, 1, 2]])) as writer:
+        while writer.done < SAMPLES:
+            count = min(500, SAMPLES - writer.done)
+            mixed = torch.randn(count, 300, generator=generator) @ basis
+            noise = 0.05 * torch.randn(count, 3 * VERTICES, generator=generator)
+            writer.append((100 + mixed + noise).reshape(count, VERTICES, 3))
+    return path
+
+
+def test_ten_thousand_from_disk_within_four_gigabytes_killed_once(on_disk: Path, tmp_path: Path) -> None:
+    words = [sys.executable, "-c", FIT, str(on_disk), str(tmp_path / "check"), str(tmp_path / "state")]
+    words.append(str(min(COMPONENTS, SAMPLES // 4)))
+    killed_at = 0
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            step = json.loads(line)
+            killed_at = step["done"]
+            if killed_at > 0.6 * step["total"]:
+                child.send_signal(signal.SIGKILL)
+                break
+    kept = len(list((tmp_path / "check").glob("gram_*.npy")))
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout.splitlines()[-1])
+    print(f"\n{SAMPLES} samples x {VERTICES} vertices, {on_disk.stat().st_size / 2**30:.2f} GiB on disk")
+    print(f"killed after {killed_at} blocks, {kept} stripes of the Gram matrix kept; then")
+    print(f"peak {told['gib']:.2f} GiB, {told['wall']:.0f} s, {told['cpu']:.0f} processor seconds")
+    assert told["gib"] < 4
+    assert kept > 0
+    # A few hundred of the samples tell the same spread, as far as so few can.
+    few = MorphableModel.fit(MeshSequence(on_disk).read(0, min(600, SAMPLES)), 5)
+    found = load_file(tmp_path / "state")
+    assert torch.allclose(found["deviations"][:5], few.standard_deviations, rtol=0.15)
