@@ -6,10 +6,13 @@ from pathlib import Path
 
 import torch
 
+from torchface.registration import register
 from torchface.rendering.compositing import caption, from_pillow, save_picture, sheet
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.scanner import eyes_closed, scan_head
 from torchface.viz.faces import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
+from torchface.viz.registration import registration_sheet
 
 HERE = Path(__file__).resolve().parent
 SIZE = {"width": 232, "height": 290}
@@ -43,10 +46,20 @@ def performer_sheet() -> torch.Tensor:
     return sheet([*views, *expressions, *heads], 6)
 
 
+def registration_picture() -> torch.Tensor:
+    """Another head's raw scan, the performer bent onto it, and how far off it is."""
+    identity = draw_identities(1, torch.Generator().manual_seed(11))[0]
+    scan = scan_head(eyes_closed(performer(identity)), seed=50)
+    template = eyes_closed(performer())
+    found = register(template, scan.mesh, (template.landmarks, scan.ibug), texture_size=2048)
+    return registration_sheet(scan.mesh, found, maximum=0.5)
+
+
 def main() -> None:
     from PIL import Image
 
     save_picture(performer_sheet(), HERE / "images" / "performer.jpg")
+    save_picture(registration_picture(), HERE / "images" / "registration.jpg")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_picture(from_pillow(image), HERE / "images" / "demo.jpg")
 
