@@ -17,7 +17,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.head_model import HeadModel
 from torchface.modeling.image_input import check_images, checked_landmark_vertices, checked_sizes, lens
 from torchface.modeling.image_skin import photographed_skin
-from torchface.modeling.image_solve import FitSettings, Problem, State, covariance, solve
+from torchface.modeling.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
 from torchface.modeling.landmark_view import JAW, LANDMARKS, LinearPoints, Views
 from torchface.modeling.texture import ColorFit
 from torchface.modeling.transfer import transfer_with_report
@@ -131,7 +131,7 @@ def fit_images(
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
     )
     say("fitting identity and expression")
-    state = solve(problem, start)
+    problem, state = solve_either(problem, start)
     for turn in range(transfers):
         say(f"transferring the shapes that show, {turn + 1} of {transfers}")
         weights = state.coefficients[len(modes) :].float()

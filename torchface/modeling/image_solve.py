@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torchface.modeling.landmark_view import (
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
+_ILL = 1.5
 _LEAST_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 
 
@@ -31,7 +32,8 @@ class FitSettings:
         inner_weight: of a squared error at brows, eyes, nose and mouth beside one at the contour.
         contour_slide: how much less an error along the face's contour counts than one across it, 0 to 1; 1 takes
             contour landmarks as points.
-        sliding: contour landmarks of the far side move to the visible silhouette.
+        sliding: contour landmarks of the far side move to the visible silhouette, as people and detectors mark them;
+            False where they are vertices that may be hidden. Absent, what fits better is taken.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
         identity_bound: on each coefficient, standard deviations.
@@ -43,7 +45,7 @@ class FitSettings:
 
     inner_weight: float = 2.0
     contour_slide: float = 0.3
-    sliding: bool = True
+    sliding: bool | None = None
     expression_mean: float = 0.2
     expression_ridge: float = 0.5
     identity_bound: float = 3.0
@@ -182,6 +184,32 @@ def energy(problem: Problem, state: State, picked: PickedPoints, factors: Tensor
         logs = (state.views.intrinsics[:, 0, 0] / problem.focal).log()
         total = total + 0.5 * ((focal / focal.sum(0)).T @ logs).square().sum() / problem.settings.focal_spread**2
     return float(total)
+
+
+def solve_either(problem: Problem, start: State) -> tuple[Problem, State]:
+    """``solve``, with sliding contour landmarks and where they fit ill without, whichever leaves less."""
+    if problem.settings.sliding is not None:
+        return problem, solve(problem, start)
+    sliding = replace(problem, settings=replace(problem.settings, sliding=True))
+    state = solve(sliding, start)
+    if _contour_error(sliding, state) < _ILL:
+        return sliding, state
+    fixed = replace(problem, settings=replace(problem.settings, sliding=False))
+    other = solve(fixed, start)
+    return (fixed, other) if _contour_error(fixed, other) < _contour_error(sliding, state) else (sliding, state)
+
+
+def _contour_error(problem: Problem, state: State) -> float:
+    """Root mean square of contour landmarks in what is expected of them beside the inner ones: 1 if all is well."""
+    picked = problem.points.picked(state.rows)
+    factors = whitening(problem, state, picked)
+    r = residuals(picked, state.coefficients, state.views, problem.targets, factors).square().sum(-1)
+    contour, inner = problem.seen.clone(), problem.seen.clone()
+    contour[:, JAW:], inner[:, :JAW] = False, False
+    if not contour.any():
+        return 0.0
+    each = r[contour].mean() / (0.5 * (1 + problem.settings.contour_slide**2))
+    return float((each / r[inner].mean().clamp(min=1e-12)).sqrt())
 
 
 def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
