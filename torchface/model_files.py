@@ -171,6 +171,8 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
         )
     try:
         model.load_state_dict(state, assign=True)
+        if check := getattr(model, "check_state", None):
+            check()
     except (RuntimeError, TorchfaceError) as error:
         raise FileFormatError(f"{path}: config and state do not fit ({error})") from error
     return model.eval()

@@ -138,6 +138,10 @@ class HeadModel(nn.Module):
             annotations=mean.annotations,
         )
 
+    def check_state(self) -> None:
+        """Raises ``TorchfaceError`` where a loaded state makes no mesh."""
+        self.template()
+
     @property
     def config(self) -> dict[str, Any]:
         """Sizes and names from which :meth:`from_config` makes a model for the state to be loaded into."""

@@ -20,6 +20,8 @@ NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 Form = Literal["offsets", "expressions"]
 
 _STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
+# Of the vertex that moves most. The form of ears and neck tells little of a smile, and would fill the components.
+_MOVES = 0.05
 
 
 class ExpressionRegression(nn.Module):
@@ -32,11 +34,13 @@ class ExpressionRegression(nn.Module):
     away, and it is here for comparison.
 
     A neutral face may have any pose: it is laid onto the mean neutral first, rotation and translation only, and
-    what is predicted is turned back. Vertices that no example moves are not stored and stay exactly where they are.
+    what is predicted is turned back. N is the part of the neutral that moves in some expression. Vertices that no
+    example moves are not stored and stay exactly where they are.
 
     Args:
         vertices: V.
         names: of the N expressions.
+        region: how many of the vertices the prediction looks at.
         moving: how many of the N·V places are predicted.
         neutral_components, offset_components: of the two bases.
         topology: ``Mesh.fingerprint()`` of the faces learned from, checked where known.
@@ -46,6 +50,7 @@ class ExpressionRegression(nn.Module):
     """
 
     neutral_mean: Tensor
+    region: Tensor
     neutral_components: Tensor
     offset_mean: Tensor
     offset_components: Tensor
@@ -56,6 +61,7 @@ class ExpressionRegression(nn.Module):
         self,
         vertices: int,
         names: Sequence[str],
+        region: int,
         moving: int,
         neutral_components: int,
         offset_components: int,
@@ -71,7 +77,8 @@ class ExpressionRegression(nn.Module):
         self.names: tuple[str, ...] = tuple(names)
         self.topology, self.form = topology, form
         self.register_buffer("neutral_mean", torch.zeros(vertices, 3))
-        self.register_buffer("neutral_components", torch.zeros(neutral_components, vertices, 3))
+        self.register_buffer("region", torch.zeros(region, dtype=torch.int64))
+        self.register_buffer("neutral_components", torch.zeros(neutral_components, region, 3))
         self.register_buffer("offset_mean", torch.zeros(moving, 3))
         self.register_buffer("offset_components", torch.zeros(offset_components, moving, 3))
         self.register_buffer("coefficients", torch.zeros(neutral_components, offset_components))
@@ -83,6 +90,7 @@ class ExpressionRegression(nn.Module):
         return {
             "vertices": len(self.neutral_mean),
             "names": list(self.names),
+            "region": len(self.region),
             "moving": len(self.places),
             "neutral_components": len(self.neutral_components),
             "offset_components": len(self.offset_components),
@@ -106,6 +114,7 @@ class ExpressionRegression(nn.Module):
         names: Sequence[str] | None = None,
         topology: str | None = None,
         form: Form = "offsets",
+        region: Tensor | None = None,
     ) -> ExpressionRegression:
         """Learns from people in correspondence, each with a neutral face and the same expressions.
 
@@ -118,6 +127,8 @@ class ExpressionRegression(nn.Module):
             names: of the expressions; ``expression0``, ... if absent.
             topology: ``Mesh.fingerprint()`` of the faces.
             form: "offsets" (equation 32) or "expressions" (equation 31).
+            region: mask (V,) of the vertices to look at; those that move by a twentieth as far as the one that moves
+                most in some expression, if absent; all of them for the form "expressions", as in the thesis.
 
         Raises:
             ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
@@ -136,18 +147,25 @@ class ExpressionRegression(nn.Module):
         if form == "offsets":
             predicted = predicted @ poses.rotation.double().transpose(-1, -2)[:, None]
             places = (predicted.abs().amax((0, -1)) > _STILL).flatten().nonzero()[:, 0]
+            looked_at = _moving(predicted) if region is None else region
         else:
             predicted = poses.apply(predicted.flatten(1, 2)).view_as(predicted)
             places = torch.arange(predicted.shape[1] * predicted.shape[2])
+            looked_at = torch.ones(laid.shape[1], dtype=torch.bool) if region is None else region
+        if looked_at.dtype != torch.bool or looked_at.shape != laid.shape[1:2] or not bool(looked_at.any()):
+            raise ShapeError(
+                f"region: found {looked_at.dtype} {tuple(looked_at.shape)}, expected a mask (V,), not empty"
+            )
         moving = predicted.flatten(1, 2)[:, places].flatten(1).float()
-        flat = laid.flatten(1).float()
+        flat = laid[:, looked_at].flatten(1).float()
         if neutral_components is None or offset_components is None or ridge is None:
             choice = choose_components(flat, moving, neutral_components, offset_components, ridge)
             neutral_components, offset_components, ridge = choice.inputs, choice.outputs, choice.ridge
         neutral, offset = principal_components(flat), _components_or_mean(moving)
         kept = min(neutral_components, len(neutral.components)), min(offset_components, len(offset.components))
-        self = cls(laid.shape[1], names, len(places), *kept, topology, form)
-        self.neutral_mean.copy_(neutral.mean.view(-1, 3))
+        self = cls(laid.shape[1], names, int(looked_at.sum()), len(places), *kept, topology, form)
+        self.neutral_mean.copy_(laid.mean(0))
+        self.region.copy_(looked_at.nonzero()[:, 0])
         self.neutral_components.copy_(neutral.components[: kept[0]].unflatten(1, (-1, 3)))
         self.offset_mean.copy_(offset.mean.view(-1, 3))
         self.offset_components.copy_(offset.components[: kept[1]].reshape(kept[1], len(places), 3))
@@ -173,7 +191,9 @@ class ExpressionRegression(nn.Module):
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         pose = similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
         laid = pose.apply(neutrals)
-        X = (laid - self.neutral_mean.to(laid)).flatten(1) @ self.neutral_components.flatten(1).T.to(laid)
+        X = (laid - self.neutral_mean.to(laid))[:, self.region].flatten(1) @ self.neutral_components.flatten(1).T.to(
+            laid
+        )
         Y = X @ self.coefficients.to(X)
         told = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
         whole = told.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
@@ -181,6 +201,15 @@ class ExpressionRegression(nn.Module):
         if self.form == "expressions":
             whole = whole - laid[:, None]
         return whole @ pose.rotation.to(whole)[:, None]
+
+    def check_state(self) -> None:
+        """Raises ``TopologyError`` where a loaded state points to vertices that there are not."""
+        for name, ids, count in (
+            ("region", self.region, len(self.neutral_mean)),
+            ("places", self.places, len(self.names) * len(self.neutral_mean)),
+        ):
+            if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < count:
+                raise TopologyError(f"{name}: found {int(ids.min())} to {int(ids.max())}, expected 0 to {count - 1}")
 
     def extra_repr(self) -> str:
         bases = f"{len(self.neutral_components)} to {len(self.offset_components)} components"
@@ -241,6 +270,13 @@ def _laid_together(neutrals: Tensor) -> tuple[Tensor, Similarity]:
         poses = similarity_transform(points, mean.expand_as(points), scale=False)
         mean = poses.apply(points).mean(0)
     return poses.apply(points), poses
+
+
+def _moving(offsets: Tensor) -> Tensor:
+    """Which vertices (V,) move in some expression, of offsets (M,N,V,3); all of them where none does."""
+    moved = offsets.square().sum(-1).mean(0).sqrt()
+    moves = (moved > _MOVES * moved.amax(1, keepdim=True)).any(0)
+    return moves if bool(moves.any()) else torch.ones_like(moves)
 
 
 def _components_or_mean(samples: Tensor) -> PrincipalComponents:

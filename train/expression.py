@@ -1,0 +1,218 @@
+"""``python -m train.expression --pairs DIR --out models/NAME``: expressions predicted from the neutral face.
+
+``--performers 60`` learns from so many embedded performers instead, and needs no file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface.geometry.alignment import similarity_transform
+from torchface.modeling import ExpressionRegression
+from torchface.rendering.compositing import save_picture
+from torchface.synthetic import draw_identities, performer
+from train.expression_table import Comparison, People, compare, picture
+
+_SETTLED, _ROUNDS, _NOTHING = 1.0, 20, 0.01  # millimetres, of the robust alignment
+_PICTURED = 4
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        pairs: Folder with an entry a person: a .glb, or a folder of OBJ files, neutral.obj and one an expression, all
+            of one topology, registered.
+        performers: Learn from so many embedded performers instead.
+        expressions: Which to learn, such as jawOpen mouthSmileLeft+mouthSmileRight; all that everyone has, if absent.
+        out: Folder for the model, its card and its picture.
+        template: A rig whose shapes deformation transfer takes; the mean of the other people if absent.
+        neutral_components: How many, at most; None chooses by leaving out one after the other.
+        offset_components: Likewise.
+        ridge: As a share of the neutrals' mean variance a component; None chooses it.
+        align: Lay each expression onto its neutral by what does not move, rotation and translation only.
+        seed: Draws performers.
+        licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
+        compared: Leave one out for the table of errors.
+    """
+
+    pairs: Path | None = None
+    performers: int = 0
+    expressions: tuple[str, ...] = ()
+    out: Path = Path("models/expressions")
+    template: Path | None = None
+    neutral_components: int | None = 14
+    offset_components: int | None = 13
+    ridge: float | None = 0.0
+    align: bool = True
+    seed: int = 0
+    licence: str = ""
+    compared: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A regression, and the table of errors of those left out."""
+
+    model: ExpressionRegression
+    comparison: Comparison | None
+
+
+def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+    """Loads, aligns, leaves one out after the other, fits, saves.
+
+    Raises:
+        TorchfaceError: there is neither a folder nor a number of performers, or people do not fit each other.
+    """
+    say = say or (lambda line: None)
+    people = gather(settings, say)
+    say(f"{len(people.who)} people, {len(people.names)} expressions")
+    comparison = None
+    if settings.compared:
+        template = None if settings.template is None else load_rig(settings.template)
+        comparison = compare(people, lambda rest: fit(rest, settings), template, _PICTURED, say)
+    model = fit(people, settings)
+    save(model, people, comparison, settings)
+    return Trained(model, comparison)
+
+
+def fit(people: People, settings: Settings) -> ExpressionRegression:
+    """The regression of these people."""
+    return ExpressionRegression.fit(
+        people.neutrals,
+        people.neutrals[:, None] + people.offsets,
+        settings.neutral_components,
+        settings.offset_components,
+        settings.ridge,
+        people.names,
+        people.template.fingerprint(),
+    )
+
+
+def gather(settings: Settings, say: Callable[[str], None]) -> People:
+    """The people of a folder, or performers."""
+    if (settings.pairs is None) == (settings.performers == 0):
+        raise TorchfaceError("train.expression: expected either --pairs DIR or --performers COUNT")
+    if settings.pairs is None:
+        identities = draw_identities(settings.performers, torch.Generator().manual_seed(settings.seed))
+        rigs = {}
+        for number, identity in enumerate(identities):
+            rigs[f"performer{number:03d}"] = selected(performer(identity, texture=False), settings.expressions)
+            say(f"made {number + 1} of {settings.performers}")
+    else:
+        rigs = {path.name: read(path, settings) for path in entries(settings.pairs)}
+    first = next(iter(rigs.values()))
+    names = tuple(name for name in first.names if all(name in rig.names for rig in rigs.values()))
+    if not names:
+        raise TorchfaceError(f"{settings.pairs}: found no expression that all {len(rigs)} people have, expected one")
+    for who, rig in rigs.items():
+        if rig.neutral.fingerprint() != first.neutral.fingerprint():
+            raise TorchfaceError(
+                f"{settings.pairs}: found {who} of topology {rig.neutral.fingerprint()}, expected that of "
+                f"{next(iter(rigs))}, {first.neutral.fingerprint()}"
+            )
+    return People(
+        tuple(rigs),
+        first.neutral,
+        torch.stack([rig.vertices for rig in rigs.values()]),
+        torch.stack([rig.deltas[rig.index(names)] for rig in rigs.values()]),
+        names,
+    )
+
+
+def entries(folder: Path) -> list[Path]:
+    """An entry a person, sorted by name."""
+    if not folder.is_dir():
+        raise TorchfaceError(f"{folder}: found no such folder, expected one with an entry a person")
+    found = sorted(path for path in folder.iterdir() if path.is_dir() or path.suffix in (".glb", ".gltf"))
+    if len(found) < 3:
+        raise TorchfaceError(f"{folder}: found {len(found)} people, expected at least three: a .glb or a folder each")
+    return found
+
+
+def read(path: Path, settings: Settings) -> BlendshapeRig:
+    """One person's expressions, laid onto the neutral."""
+    rig = selected(load_rig(path), settings.expressions)
+    if not settings.align:
+        return rig
+    settled = [settle(rig.vertices, rig.vertices + delta) - rig.vertices for delta in rig.deltas]
+    return BlendshapeRig(rig.neutral, torch.stack(settled), rig.names)
+
+
+def selected(rig: BlendshapeRig, expressions: tuple[str, ...]) -> BlendshapeRig:
+    """The rig of these expressions; with a plus sign between shapes, their sum."""
+    if not expressions:
+        return rig
+    deltas = [rig.deltas[rig.index(expression.split("+"))].sum(0) for expression in expressions]
+    return BlendshapeRig(rig.neutral, torch.stack(deltas), expressions)
+
+
+def settle(neutral: Tensor, expression: Tensor) -> Tensor:
+    """An expression (V,3) moved onto its neutral by what stays: far-off vertices lose their say, round by round."""
+    moved = expression
+    for _ in range(_ROUNDS):
+        away = (moved - neutral).norm(dim=-1)
+        weights = 1 / (1 + (away / _SETTLED) ** 2) ** 2
+        pose = similarity_transform(expression[None], neutral[None], weights[None], scale=False)
+        moved = pose.apply(expression[None])[0]
+    return expression if float((moved - expression).norm(dim=-1).max()) < _NOTHING else moved
+
+
+def save(model: ExpressionRegression, people: People, comparison: Comparison | None, settings: Settings) -> None:
+    """Writes the model with its table, card and picture."""
+    effective = {key: value for key, value in asdict(settings).items() if value is not None}
+    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
+    if settings.performers:
+        data = f"{len(people.who)} embedded performers drawn by seed {settings.seed}; no person's face."
+        flags = f"--performers {settings.performers} --seed {settings.seed}"
+    else:
+        data = f"{len(people.who)} people of {settings.pairs and settings.pairs.name}."
+        flags = f"--pairs {settings.pairs and settings.pairs.name}" + " --no-align" * (not settings.align)
+    if settings.template is not None:
+        flags += f" --template {settings.template.name}"
+    if settings.expressions:
+        flags += f" --expressions {' '.join(settings.expressions)}"
+    for name in ("neutral_components", "offset_components", "ridge"):
+        flags += f" --{name.replace('_', '-')} {getattr(settings, name)}"
+    zoo.save_model(
+        model,
+        settings.out,
+        licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
+        data=data,
+        metrics={} if comparison is None else comparison.metrics(),
+        recipe=f"python -m train.expression {flags} --out models/{settings.out.name}",
+        card=(
+            f"Predicts {', '.join(people.names)} from a neutral face of the same topology: linear, "
+            f"{len(model.neutral_components)} components of the part that moves to {len(model.offset_components)} of "
+            "the offsets. Good for a first rig of a person of whom there is one scan; where there are scans of "
+            "expressions, learn from those. Measured by leaving out one person after the other, against deformation "
+            "transfer and the mean offset of the others: in how many cases each has the lowest error, and the "
+            "squared error summed over the vertices. It knows only people like those it has learned from."
+        ),
+        settings=effective,
+        half=("neutral_components", "offset_mean", "offset_components"),
+    )
+    if comparison is not None and comparison.predicted:
+        folder = settings.out / "pictures"
+        folder.mkdir(exist_ok=True)
+        for row, name in enumerate(people.names[:3]):
+            save_picture(picture(people, comparison, row), folder / f"{name}.png")
+
+
+def main() -> None:
+    """Parses flags, trains, prints."""
+    trained = train(tyro.cli(Settings, description=__doc__), print)
+    if trained.comparison is not None:
+        print(trained.comparison)
+
+
+if __name__ == "__main__":
+    main()
