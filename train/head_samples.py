@@ -23,6 +23,7 @@ from torchface.synthetic import draw_identities, head
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 
 _CAST_VERTICES = 4000
+_CAST_SAMPLES = 6_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,8 @@ def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, say: C
     if not white_balance:
         return colors
     weights = texture_areas(template) if template.uvs is not None else torch.ones(len(template.vertices))
-    chosen = torch.arange(0, len(weights), max(1, len(weights) // _CAST_VERTICES))
+    most = max(200, min(_CAST_VERTICES, _CAST_SAMPLES // colors.shape[0]))
+    chosen = torch.arange(0, len(weights), max(1, -(-len(weights) // most)))
     some = torch.cat([colors.read(*block)[:, chosen] for block in blocks(colors)])
     casts = color_casts(some, weights[chosen])
     brightest = float(casts.mean(1).abs().max().exp())
