@@ -171,12 +171,29 @@ def _lines_of_contacts(template: Mesh, pairs: Tensor, landmarks: dict[str, int])
         own = (along > 0) & (along < 1) & (off < _SAME_LINE)
         if int(own.sum()) < 2:
             continue
-        order = along[own].argsort()
-        path = torch.cat([start[None], middle[own][order], end[None]])
+        own = own.nonzero()[:, 0]
+        own = own[_outermost(middle[own], chord, vertices.mean(0))]
+        own = own[along[own].argsort()]
+        path = torch.cat([start[None], middle[own], end[None]])
         steps = (path[1:] - path[:-1]).norm(dim=-1).cumsum(0)
         shares = (steps / steps[-1])[:-1]
-        lines[name] = (pairs[own][order].flatten(), shares.repeat_interleave(2))
+        lines[name] = (pairs[own].flatten(), shares.repeat_interleave(2))
     return lines
+
+
+def _outermost(points: Tensor, chord: Tensor, inside: Tensor) -> Tensor:
+    """Which points (K,3) have none before them, seen from outside: lids are thick and touch on all of their edge, and a
+    scan shows where they begin to.
+
+    One lies before another where it is further out than aside: a line itself is nowhere that steep.
+    """
+    along = torch.nn.functional.normalize(chord, dim=0)
+    outward = points.mean(0) - inside
+    outward = torch.nn.functional.normalize(outward - (outward @ along) * along, dim=0)
+    apart = points - points[:, None]
+    out = apart @ outward
+    aside = (apart - out[..., None] * outward).norm(dim=-1)
+    return ~(out > aside).any(1)
 
 
 def _lines_of_traces(template: Mesh, found: ScanLandmarks, points: int) -> dict[str, tuple[Tensor, Tensor]]:
