@@ -89,6 +89,10 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, say
     colored, size = first.colors is not None, len(template.vertices)
     files = (work / "shapes.safetensors", work / "colors.safetensors")
     count = len(source.names)
+    known = [MeshSequence(path) if path.is_file() else None for path in files]
+    shape, color = (one if one is not None and one.key == source.key and len(one) == count else None for one in known)
+    if shape is not None and (color is not None or not colored):
+        return Gathered(template, shape, color, held_out)
     shapes, colors = (MeshSequenceWriter(path, count, size, template.faces, key=source.key) for path in files)
     with shapes, colors:
         for number in range(min(shapes.done, colors.done) if colored else shapes.done, count):

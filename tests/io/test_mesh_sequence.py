@@ -47,6 +47,7 @@ def test_a_killed_writer_continues_where_it_was(tmp_path: Path) -> None:
     with MeshSequenceWriter(path, 7, 4, FACES, key="a") as second:
         assert second.done == 3
         second.append(MESHES[3:])
+    assert MeshSequence(path).key == "a"
     assert torch.equal(MeshSequence(path).read(0, 7), MESHES)
     MeshSequenceWriter(path, 7, 4, FACES, key="a").append(MESHES[:3])
     assert MeshSequenceWriter(path, 7, 4, FACES, key="b").done == 0  # made of something else

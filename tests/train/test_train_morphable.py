@@ -129,12 +129,20 @@ def test_a_killed_run_goes_on_where_it_was(
 
         return replace(source, read=one)
 
+    def stop(*parts: object) -> None:
+        raise KeyboardInterrupt
+
     monkeypatch.setattr(recipe, "registered", counted)
     with pytest.raises(KeyboardInterrupt):
         train(settings)
     assert read == [0, 1, 2, 3, 4, 5]
-    again = train(settings)
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "laid", stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
     assert read[6:] == [0, 5, 6, 7, 8]  # the first is the template
+    again = train(settings)
+    assert read[11:] == [0]
     assert torch.equal(again.model.shape.components, trained[0].model.shape.components)
 
 

@@ -19,7 +19,7 @@ _LARGEST_COUNT = 2**31
 
 
 class MeshSequence:
-    """Vertices (M,V,C) float32 on disk, mapped into memory as they are read.
+    """Vertices (M,V,C) float32 on disk, mapped into memory as they are read; ``faces`` and the writer's ``key``.
 
     Args:
         path: what a :class:`MeshSequenceWriter` wrote; any safetensors file with ``vertices`` and ``faces`` will do.
@@ -35,6 +35,7 @@ class MeshSequence:
         try:
             with safe_open(self.path, framework="pt") as file:
                 names = set(file.keys())
+                self.key: str = (file.metadata() or {}).get("key", "")
                 if not {"vertices", "faces"} <= names:
                     raise FileFormatError(f"{self.path}: found {sorted(names)[:5]}, expected vertices and faces")
                 vertices, faces = file.get_slice("vertices"), file.get_slice("faces")
