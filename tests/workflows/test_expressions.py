@@ -47,6 +47,9 @@ def test_a_table_tells_them_in_its_order(tmp_path: Path) -> None:
         (("a.obj",), "file,jawOpen\na.obj,1\n", FileFormatError, "no column 'scan'"),
         (("a.obj",), "scan,smile\na.obj,1\n", NameMismatchError, "found 'smile'"),
         (("a.obj",), "scan,jawOpen\na.obj,-1\n", ValueRangeError, "expected weights from 0 to 1"),
+        (("jawOpen=0.5+jawOpen=0.2.obj",), None, ValueRangeError, "'jawOpen' twice in its name"),
+        (("a.obj",), "scan,jawOpen\na.obj,much\n", TorchfaceError, "much"),
+        (("a.obj",), "scan,jawOpen\na.obj,1\na.obj,0.5\n", FileFormatError, "more than one row for a.obj"),
         (("a.obj",), "scan,jawOpen\na.obj,\n", ValueRangeError, "no weight above 0"),
     ],
 )

@@ -67,8 +67,8 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
         names: the rig's shapes.
 
     Raises:
-        FileFormatError: no such folder, a table without the column ``scan``, or a file that it names and that is
-            not there.
+        FileFormatError: no such folder, a table without the column ``scan`` or with two rows for a file, or a file
+            that it names and that is not there.
         NameMismatchError: a name that means no shape of the rig.
         ValueRangeError: a weight outside [0,1], or an expression without any.
     """
@@ -96,7 +96,10 @@ def _by_table(table: Path, names: Sequence[str]) -> list[Expression]:
     reader.require(["scan"])
     rows = reader.read(["scan"], lambda cells: not any(cell.strip() for cell in cells))
     shapes = rows.names
-    files = rows.texts["scan"]
+    files = list(rows.texts["scan"])
+    twice = sorted({file for file in files if files.count(file) > 1})
+    if twice:
+        raise FileFormatError(f"{table}: found more than one row for {', '.join(twice[:5])}, expected one a scan")
     found = []
     for number, file in enumerate(files):
         path = table.parent / file
@@ -114,9 +117,11 @@ def _by_name(folder: Path, names: Sequence[str]) -> list[Expression]:
     for path in _scans(folder):
         if path.stem.lower() == NEUTRAL:
             continue
-        given = {}
+        given: dict[str, float] = {}
         for word in path.stem.split("+"):
             name, equals, number = word.partition("=")
+            if name.strip() in given:
+                raise ValueRangeError(f"{path}: found {name.strip()!r} twice in its name, expected each shape once")
             try:
                 given[name.strip()] = float(number) if equals else 1.0
             except ValueError:
