@@ -1,5 +1,24 @@
 """Blendshape weights from what cameras and marker systems saw."""
 
-from torchface.capture.markers import HelmetSolver, HybridSolver, MarkerSolver, align_take, fit_attachment, rest_residual
+from torchface.capture.action_units import ActionUnitClassifier, action_unit_curves
+from torchface.capture.markers import (
+    HelmetSolver,
+    HybridSolver,
+    MarkerSolver,
+    WholeTakeSolver,
+    align_take,
+    fit_attachment,
+    rest_residual,
+)
 
-__all__ = ["HelmetSolver", "HybridSolver", "MarkerSolver", "align_take", "fit_attachment", "rest_residual"]
+__all__ = [
+    "ActionUnitClassifier",
+    "HelmetSolver",
+    "HybridSolver",
+    "MarkerSolver",
+    "WholeTakeSolver",
+    "action_unit_curves",
+    "align_take",
+    "fit_attachment",
+    "rest_residual",
+]

@@ -7,6 +7,7 @@ from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
 from torchface.capture.markers.take_alignment import align_take, rest_residual
+from torchface.capture.markers.whole_take import WholeTakeSolver
 
 __all__ = [
     "AttachmentFit",
@@ -16,6 +17,7 @@ __all__ = [
     "MarkerSolver",
     "Observability",
     "SparsityTrial",
+    "WholeTakeSolver",
     "align_take",
     "fit_attachment",
     "gamma_curves",
