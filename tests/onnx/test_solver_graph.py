@@ -123,7 +123,7 @@ def test_a_graph_that_disagrees_is_not_written(
     rig: BlendshapeRig, attachment: Attachment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = solver_model(SolverGraph(MarkerSolver(rig, attachment, sparsity=0.031)))
-    monkeypatch.setattr("torchface.onnx.solver_export.solver_model", lambda graph: other)
+    monkeypatch.setattr("torchface.onnx.solver_export.solver_model", lambda graph, facts: other)
     with pytest.raises(ValueRangeError, match="ONNX Runtime differs from PyTorch"):
         export_solver(rig, attachment, tmp_path / "solver.onnx")
     assert not list(tmp_path.iterdir())

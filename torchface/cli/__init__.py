@@ -18,6 +18,7 @@ from rich.table import Table
 
 from torchface.cli.demo import demo
 from torchface.cli.export import EXPORTS
+from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.pick import pick
@@ -54,7 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _overview()
         raise SystemExit(0 if words else 2)
     try:
-        if words[:1] == ["export"]:
+        if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
+            tyro.cli(export_model, prog="torchface export", args=words[1:])
+        elif words[:1] == ["export"]:
             tyro.extras.subcommand_cli_from_dict(
                 EXPORTS, prog="torchface export", description="Write an ONNX graph.", args=words[1:]
             )
@@ -80,4 +83,4 @@ def _overview() -> None:
 
 
 def _export_help() -> None:
-    """Write an ONNX graph: `torchface export solver --help`."""
+    """Write an ONNX graph of a solver or of a model of the zoo: `torchface export --help`."""

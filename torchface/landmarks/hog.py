@@ -11,8 +11,8 @@ from torch.nn.functional import avg_pool2d, normalize, one_hot, pad, unfold
 
 from torchface.errors import ShapeError, ValueRangeError
 
-_FAINT = 0.01  # gradients below this, in units of the image a pixel, count as flat
-_CLIP = 0.4
+FAINT = 0.01  # gradients below this, in units of the image a pixel, count as flat
+CLIP = 0.4
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
     cells = avg_pool2d(votes, layout.cell, layout.stride, padding=layout.cell // 2)
     reach = 2 * layout.cell // layout.stride
     around = avg_pool2d(cells.square().sum(1, keepdim=True), reach + 1, 1, reach // 2, count_include_pad=False)
-    return (cells / (around + _FAINT**2).sqrt()).clamp(max=_CLIP).sqrt()
+    return (cells / (around + FAINT**2).sqrt()).clamp(max=CLIP).sqrt()
 
 
 def _votes(along_x: Tensor, along_y: Tensor, bins: int) -> Tensor:

@@ -9,12 +9,17 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 
+def gaussian_kernel(sigma: float) -> Tensor:
+    """Weights (2R+1,) that sum to 1, out to three standard deviations."""
+    reach = max(1, math.ceil(3 * sigma))
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sigma) ** 2)
+    return kernel / kernel.sum()
+
+
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     """Images (B,C,H,W) blurred with standard deviation ``sigma`` pixels; the border is repeated outward."""
-    reach = max(1, math.ceil(3 * sigma))
-    offsets = torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device)
-    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)
-    kernel = kernel / kernel.sum()
+    kernel = gaussian_kernel(sigma).to(image)
+    reach = len(kernel) // 2
     batch, channels, height, width = image.shape
     flat = pad(image.reshape(batch * channels, 1, height, width), (reach,) * 4, mode="replicate")
     blurred = conv2d(conv2d(flat, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))

@@ -21,7 +21,7 @@ from torchface.landmarks.smoothing import unsharp
 from torchface.landmarks.twelve import LINES, TWELVE
 from torchface.mesh import Mesh
 
-_FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
+FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
 _PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that
 
 
@@ -233,7 +233,7 @@ class UVLandmarkDetector(nn.Module):
         clusters = mean_shift(points, self.settings.bandwidth, votes)
         offset = clusters.centres - mean
         squared = (offset * torch.linalg.solve(covariance, offset.T).T).sum(-1)
-        near = torch.exp(-0.5 * squared) * (squared < _FARTHEST**2)
+        near = torch.exp(-0.5 * squared) * (squared < FARTHEST**2)
         value = clusters.sizes * near
         best = int(value.argmax())
         if float(value[best]) <= 0:

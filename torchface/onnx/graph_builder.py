@@ -46,6 +46,13 @@ class GraphBuilder:
         self._nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
 
+    def first_of_two(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """Adds a node with two outputs and returns the name of the first."""
+        first, second = f"v{self._root._count}", f"v{self._root._count + 1}"
+        self._root._count += 2
+        self._nodes.append(helper.make_node(kind, list(inputs), [first, second], **attributes))
+        return first
+
     def branch(self, output: str) -> onnx.GraphProto:
         """The nodes as a branch of an ``If`` with one float output."""
         info = helper.make_tensor_value_info(output, onnx.TensorProto.FLOAT, None)

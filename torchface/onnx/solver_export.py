@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,10 +126,29 @@ def export_solver(
         ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
             written.
     """
-    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
+    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
+    return export_marker_solver(solver, path, steps, steps_with_gaps, markers)
+
+
+def export_marker_solver(
+    solver: MarkerSolver,
+    path: str | Path,
+    steps: int = STEPS,
+    steps_with_gaps: int = STEPS_WITH_GAPS,
+    markers: Tensor | None = None,
+    facts: Mapping[str, object] | None = None,
+) -> SolverReport:
+    """Writes a solver as ONNX, and checks it; see :func:`export_solver`.
+
+    Args:
+        solver: of N shapes and M markers.
+        path, steps, steps_with_gaps, markers: as there.
+        facts: further metadata, such as licence and data.
+    """
+    solver = copy.deepcopy(solver).cpu().float()
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
     graph = SolverGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
-    return _export(graph, solver, frames, (), path)
+    return _export(graph, solver, frames, (), path, facts)
 
 
 def export_hybrid_solver(
@@ -166,9 +186,10 @@ def _export(
     frames: Tensor,
     more: tuple[Tensor, ...],
     path: str | Path,
+    facts: Mapping[str, object] | None = None,
 ) -> SolverReport:
     """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
-    model = solver_model(graph)
+    model = solver_model(graph, facts)
     session = _session(model)
     gaps = tuple(_gap(session, graph, solver, frames, more, missing) for missing in (0.0, 0.1, 0.3))
     for gap in gaps:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import onnx
 import torch
 
@@ -12,7 +14,7 @@ from torchface.onnx.solver import NEWTON_START, SolverGraph, stretches
 from torchface.optim.splitting import RELAXATION
 
 
-def solver_model(graph: SolverGraph) -> onnx.ModelProto:
+def solver_model(graph: SolverGraph, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph as ONNX: plain operators, two branches of unrolled steps under one ``If``.
 
     A ``HybridGraph`` has two inputs more. Built node by node: at batch 1 the number of nodes is what costs, and a step
@@ -60,6 +62,7 @@ def solver_model(graph: SolverGraph) -> onnx.ModelProto:
             "sparsity": graph.sparsity,
             "ridge": graph.ridge,
             "steps": [graph.steps, graph.steps_with_gaps],
+            **(facts or {}),
         },
     )
 

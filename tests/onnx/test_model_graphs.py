@@ -1,0 +1,151 @@
+"""Learned models as ONNX graphs: ONNX Runtime computes what the models do, at any batch size."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchface import Attachment, BlendshapeRig, zoo
+from torchface.capture import MarkerSolver
+from torchface.cli import main
+from torchface.errors import ValueRangeError
+from torchface.landmarks import DetectorSettings, UVLandmarkDetector
+from torchface.landmarks.hog import HogLayout
+from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
+from torchface.onnx import export_model
+from torchface.onnx.landmark_bank import LandmarkBank, export_landmark_bank
+
+FACTS = {"licence": "MIT", "data": "noise", "metrics": {"error": 1.5}, "recipe": "none"}
+SIZE = 160
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def run(path: Path, inputs: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    found = session.run(names, {name: value.numpy() for name, value in inputs.items()})
+    tensors = {name: torch.from_numpy(np.asarray(value)) for name, value in zip(names, found, strict=True)}
+    return tensors, session.get_modelmeta().custom_metadata_map
+
+
+@pytest.fixture(scope="module")
+def head(dome_rig: BlendshapeRig) -> HeadModel:
+    vertices = dome_rig.vertices
+    colors = torch.rand(6, *vertices.shape, generator=torch.Generator().manual_seed(1))
+    return HeadModel.on(
+        dome_rig.neutral, MorphableModel.fit(vertices + noise(6, *vertices.shape)), MorphableModel.fit(colors)
+    )
+
+
+@pytest.fixture(scope="module")
+def regression(dome_rig: BlendshapeRig) -> ExpressionRegression:
+    neutrals = dome_rig.vertices + noise(8, *dome_rig.vertices.shape)
+    moved = dome_rig.deltas * (1 + 0.3 * noise(8, 4, 1, 1, seed=2))
+    return ExpressionRegression.fit(neutrals, neutrals[:, None] + moved, names=dome_rig.names)
+
+
+def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Cloudy pictures (M,1,S,S) with a cross and a ring, and where these are, (M,2,2)."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(count, 1, 10, 10, generator=generator)
+    images = 0.6 + 0.1 * nn.functional.interpolate(coarse, size=(SIZE, SIZE), mode="bicubic")
+    places = torch.tensor([[50.0, 60.0], [105.0, 90.0]]) + 4 * torch.randn(count, 2, 2, generator=generator)
+    grid = torch.stack(torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="xy"), -1)
+    across, down = (grid - places[:, 0, None, None]).unbind(-1)
+    near = torch.exp(-(((across**2 + down**2) / 14**2) ** 4))
+    images[:, 0] -= 0.4 * near * (torch.exp(-((across / 2) ** 2)) + torch.exp(-((down / 2) ** 2))).clamp(max=1)
+    away = (grid - places[:, 1, None, None]).norm(dim=-1)
+    images[:, 0] -= 0.4 * torch.exp(-(((away - 8) / 2) ** 2))
+    return images, places
+
+
+@pytest.fixture(scope="module")
+def detector() -> UVLandmarkDetector:
+    images, places = pictures(6, 0)
+    settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
+    return UVLandmarkDetector.fit(images, places, ("cross", "ring"), "relief", settings)
+
+
+def test_a_head_is_decoded(head: HeadModel, tmp_path: Path) -> None:
+    report = export_model(head, tmp_path / "head.onnx", FACTS)
+    assert "ONNX Runtime against PyTorch" in str(report)
+    shape, color = noise(7, 5, seed=3), noise(7, 5, seed=4)
+    found, metadata = run(tmp_path / "head.onnx", {"shape": shape, "color": color})
+    heads = head(shape, color)
+    torch.testing.assert_close(found["vertices"], heads.vertices, rtol=0, atol=1e-3)
+    torch.testing.assert_close(found["colors"], heads.colors.clamp(0, 1), rtol=0, atol=1e-5)
+    assert torch.equal(torch.tensor(json.loads(metadata["triangles"])), head.faces)
+    assert (metadata["units"], metadata["licence"]) == ("millimetres", "MIT")
+
+
+def test_offsets_come_with_any_pose(regression: ExpressionRegression, tmp_path: Path) -> None:
+    export_model(regression, tmp_path / "r.onnx", FACTS)
+    turn = torch.linalg.qr(noise(5, 3, 3, seed=7))[0]
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    neutrals = (regression.neutral_mean + noise(5, *regression.neutral_mean.shape, seed=5)) @ turn + 80.0
+    found, metadata = run(tmp_path / "r.onnx", {"neutrals": neutrals})
+    torch.testing.assert_close(found["offsets"], regression.offsets(neutrals.double()).float(), rtol=0, atol=1e-3)
+    still = regression.offsets(neutrals).abs().amax((0, 1, 3)) == 0
+    assert still.any()
+    assert (found["offsets"][:, :, still] == 0).all()
+    assert tuple(json.loads(metadata["shape_names"])) == regression.names
+    assert json.loads(metadata["metrics"]) == {"error": 1.5}
+
+
+def test_the_bank_finds_what_the_detector_finds(detector: UVLandmarkDetector, tmp_path: Path) -> None:
+    images, places = pictures(5, 9)
+    export_landmark_bank(detector, tmp_path / "uv.onnx", FACTS, images[:2])
+    found, metadata = run(tmp_path / "uv.onnx", {"images": images})
+    pixels, confidence = LandmarkBank(detector)(images)
+    torch.testing.assert_close(found["pixels"], pixels, rtol=0, atol=0.1)
+    torch.testing.assert_close(found["confidence"], confidence, rtol=0, atol=0.01)
+    exact = detector(images)
+    assert (pixels - exact.pixels).norm(dim=-1).max() < 2.0
+    assert (found["pixels"] - places).norm(dim=-1).mean() < 3.0
+    assert (detector.prior_mean - places).norm(dim=-1).mean() > 4.0
+    assert json.loads(metadata["landmark_names"]) == ["cross", "ring"]
+    nothing, _ = run(tmp_path / "uv.onnx", {"images": torch.full((1, 1, SIZE, SIZE), 0.5)})
+    torch.testing.assert_close(nothing["pixels"][0], detector.prior_mean, rtol=0, atol=12)
+
+
+def test_the_command_exports_every_kind(
+    head: HeadModel,
+    regression: ExpressionRegression,
+    detector: UVLandmarkDetector,
+    dome_rig: BlendshapeRig,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    solver = MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)))
+    kinds = {"head": "head_decoder", "regression": "expression_regression", "uv": "uv_landmarks", "solver": "solver"}
+    for name, model in zip(kinds, (head, regression, detector, solver), strict=True):
+        zoo.save_model(model, tmp_path / name, **FACTS)
+        out = tmp_path / f"{name}.onnx"
+        main(["export", str(tmp_path / name), "--out", str(out), "--quiet"])
+        assert str(out) in capsys.readouterr().out.replace("\n", "")
+        metadata = onnxruntime.InferenceSession(out).get_modelmeta().custom_metadata_map
+        assert metadata["task"] == kinds[name]
+        assert metadata["sha256"] == zoo.describe(tmp_path / name).sha256
+        assert metadata["data"] == "noise"
+    with pytest.raises(SystemExit):
+        main(["export", "nobody", "--out", str(tmp_path / "x.onnx"), "--quiet"])
+    assert not (tmp_path / "x.onnx").exists()
+
+
+def test_what_has_no_graph_is_named(regression: ExpressionRegression, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    with pytest.raises(ValueRangeError, match="found a Linear"):
+        export_model(nn.Linear(2, 2), tmp_path / "x.onnx")
+    neutrals = dome_rig.vertices + noise(4, *dome_rig.vertices.shape)
+    whole = ExpressionRegression.fit(neutrals, neutrals[:, None] + dome_rig.deltas, form="expressions")
+    with pytest.raises(ValueRangeError, match="form 'expressions'"):
+        export_model(whole, tmp_path / "x.onnx")
+    assert not (tmp_path / "x.onnx").exists()

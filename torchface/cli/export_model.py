@@ -1,0 +1,46 @@
+"""``torchface export NAME``: a model of the zoo as ONNX."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+
+from torchface.cli.progress import console, steps
+
+
+def export_model(name: str, /, out: Path, quiet: bool = False) -> None:
+    """Write a model of the zoo, or of a folder, as an ONNX file, and check it against PyTorch.
+
+    A head model gives the decoder (coefficients to vertices and colours), an expression regression the offsets of a
+    neutral face, UV landmarks the bank of filters, a marker solver the solve. Names, units, licence, data and what was
+    measured are in the file's metadata.
+
+    Args:
+        name: Of the model, or its folder.
+        out: The .onnx file to write.
+        quiet: Show no progress.
+    """
+    from torchface import zoo
+    from torchface.onnx import export_model as export
+
+    with steps(quiet) as step:
+        step("loading the model")
+        record = zoo.describe(name)
+        model = zoo.get_model(name)
+        facts = {
+            "model": record.name,
+            "kind": record.kind,
+            "licence": record.licence,
+            "data": record.data,
+            "metrics": record.metrics,
+            "recipe": record.recipe,
+            "sha256": record.sha256,
+        }
+        step("exporting and checking")
+        report = export(model, out, facts)
+    table = Table(show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    console.print(table)
+    print(out)

@@ -1,0 +1,45 @@
+"""Any learned model that has a graph, written as ONNX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import nn
+
+from torchface.capture import MarkerSolver
+from torchface.errors import ValueRangeError
+from torchface.landmarks import UVLandmarkDetector
+from torchface.modeling import ExpressionRegression, HeadModel
+from torchface.onnx.checked import ExportReport
+from torchface.onnx.expression_graph import export_expression_regression
+from torchface.onnx.head_decoder import export_head_decoder
+from torchface.onnx.landmark_bank import export_landmark_bank
+from torchface.onnx.solver_export import SolverReport, export_marker_solver
+
+
+def export_model(
+    model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
+) -> ExportReport | SolverReport:
+    """Writes a model as ONNX, and checks it against PyTorch.
+
+    Args:
+        model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector`` or ``MarkerSolver``.
+        path: the file to write; it appears only when it is complete and checked.
+        facts: further metadata, such as licence and data.
+
+    Raises:
+        ValueRangeError: there is no graph for its class, or ONNX Runtime and PyTorch differ; nothing is written.
+    """
+    if isinstance(model, HeadModel):
+        return export_head_decoder(model, path, facts)
+    if isinstance(model, ExpressionRegression):
+        return export_expression_regression(model, path, facts)
+    if isinstance(model, UVLandmarkDetector):
+        return export_landmark_bank(model, path, facts)
+    if isinstance(model, MarkerSolver):
+        return export_marker_solver(model, path, facts=facts)
+    raise ValueRangeError(
+        f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector or "
+        "MarkerSolver"
+    )
