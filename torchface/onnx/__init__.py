@@ -1,7 +1,17 @@
 """ONNX graphs of what torchface learns and solves."""
 
+from torchface.onnx.checked import ExportReport
 from torchface.onnx.hybrid import HybridGraph
+from torchface.onnx.model_export import export_model
 from torchface.onnx.solver import SolverGraph
 from torchface.onnx.solver_export import SolverReport, export_hybrid_solver, export_solver
 
-__all__ = ["HybridGraph", "SolverGraph", "SolverReport", "export_hybrid_solver", "export_solver"]
+__all__ = [
+    "ExportReport",
+    "HybridGraph",
+    "SolverGraph",
+    "SolverReport",
+    "export_hybrid_solver",
+    "export_model",
+    "export_solver",
+]
