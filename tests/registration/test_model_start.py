@@ -15,9 +15,10 @@ from torchface.errors import ShapeError, TopologyError
 from torchface.geometry.alignment import similarity_transform
 from torchface.io import load_identity_modes, load_mesh, save_mesh
 from torchface.mesh import Mesh
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register, register_corpus
 from torchface.registration.corpus_job import CorpusJob
-from torchface.registration.model_start import LinearShape
+from torchface.registration.model_start import LinearShape, shape_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +90,11 @@ def test_real_shapes_known_to_the_model_do_not_slide(ict_folder: Path, rescanned
 def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mask: Callable) -> None:
     with pytest.raises(TopologyError, match=r"found a model of \(1485, 3\).*80 vertices"):
         register(make_mask(8, 10), mask, model=waves)
+    heads = HeadModel(MorphableModel(waves.mean, waves.modes, torch.ones(5)), None, mask.faces)
+    assert shape_model(heads, mask) is heads.shape
+    turned = Mesh(mask.vertices, mask.faces.flip(1))
+    with pytest.raises(TopologyError, match="expected the template's topology"):
+        register(turned, mask, model=heads)
     with pytest.raises(ShapeError, match="found str, expected a model"):
         register(mask, mask, model="heads")  # type: ignore[arg-type]
 

@@ -4,6 +4,7 @@ from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.images import load_image, save_image, save_image16
 from torchface.io.landmarks import load_landmark_points
+from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes import load_mesh, save_mesh
 from torchface.io.normal_maps import load_normal_map, save_normal_map
 from torchface.io.picks import (
@@ -21,6 +22,8 @@ __all__ = [
     "Correspondences",
     "IdentityModes",
     "LandmarkVertices",
+    "MeshSequence",
+    "MeshSequenceWriter",
     "ShapeMatch",
     "load_correspondences",
     "load_detail_maps",

@@ -6,11 +6,13 @@ from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_
 from torchface.modeling.head_model import HeadModel, Heads
 from torchface.modeling.image_fit import ImageFit, fit_images
 from torchface.modeling.image_solve import FitSettings
+from torchface.modeling.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.open_eyes import open_eyes
 from torchface.modeling.personalization import ExpressionRegression, rig_from_neutral
 from torchface.modeling.photo_texture import PhotoTexture, photo_texture
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
+from torchface.modeling.sequence_fit import fit_sequence
 from torchface.modeling.texture import ColorFit, fit_colors
 from torchface.modeling.transfer import TransferredRig, TransferReport, transfer_deformation, transfer_with_report
 
@@ -23,6 +25,7 @@ __all__ = [
     "HeadModel",
     "Heads",
     "ImageFit",
+    "ModelQuality",
     "MorphableModel",
     "NormalMap",
     "PhotoTexture",
@@ -36,6 +39,8 @@ __all__ = [
     "detail_maps",
     "fit_colors",
     "fit_images",
+    "fit_sequence",
+    "model_quality",
     "open_eyes",
     "photo_texture",
     "rig_from_examples",
