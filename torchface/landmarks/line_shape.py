@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.errors import ValueRangeError
 from torchface.landmarks.smoothing import gaussian_blur
 
 STATIONS = 17
@@ -66,9 +67,13 @@ class LineShape:
         return straight + length * _at(self.offset, share), length * _at(self.spread, share)
 
     def looks(self, left: Tensor, right: Tensor, columns: Tensor) -> Tensor:
-        """What columns (N,) look like round the line, (N,2·REACH+1)."""
+        """What columns (N,) look like round the line, (N,2·REACH+1).
+
+        Raises:
+            ValueRangeError: the look was not learned.
+        """
         if self.profile is None:
-            raise ValueError("LineShape.looks: the look was not learned")
+            raise ValueRangeError("LineShape: found no look, expected one learned from images")
         share = ((columns.double() - left[0].double()) / (right[0] - left[0]).double()).clamp(0, 1)
         return unit_profiles(_at(self.profile, share))
 

@@ -295,7 +295,8 @@ class UVLandmarkDetector(nn.Module):
             if len(known) >= 2:
                 shape = LineShape.fit([line for line, _ in known], [image for _, image in known])
                 self.courses[row] = torch.stack([shape.offset, shape.spread]).to(self.courses)
-                self.looks[row] = shape.profile.to(self.looks)
+                if shape.profile is not None:
+                    self.looks[row] = shape.profile.to(self.looks)
 
     def _raw_cells(self, images: Tensor) -> Tensor:
         sharp = unsharp(images.float(), self.settings.unsharp_sigma, self.settings.unsharp_amount)
