@@ -244,7 +244,10 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
     if folded:
         notes.append(f"{folded} triangles of the result are turned over")
     if not has_colors(scan):
-        notes.append("the scan has neither a texture with coordinates nor vertex colours; the result has no colours")
+        notes.append(
+            "the scan has neither a texture with coordinates nor vertex colours (is the picture that its material "
+            "names beside it?); the result has no colours"
+        )
     elif template.uvs is None and texture_size:
         notes.append("the template has no texture coordinates; the scan's colours are on the vertices only")
     return notes

@@ -103,7 +103,11 @@ def _check_unit(points: Tensor, template: Mesh) -> None:
         return
     close = [(name, code) for name, (code, size) in _UNITS.items() if 0.3 < ratio / size < 6]
     looks = f"; it looks as if the scan were in {close[0][0]}" if close else ""
-    mend = f" (load it with unit={close[0][1]!r})" if close and close[0][1] else ""
+    mend = (
+        f" (load it with unit={close[0][1]!r}; on the command line --unit {close[0][1]})"
+        if close and close[0][1]
+        else ""
+    )
     raise ValueRangeError(
         f"scan: found an extent of {sizes[1]:.4g} mm beside a template of {sizes[0]:.4g} mm{looks}{mend}; "
         "expected both in millimetres"
