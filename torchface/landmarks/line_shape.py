@@ -108,7 +108,7 @@ def _look(image: Tensor, line: Tensor) -> Tensor:
     """Profiles (K,2·REACH+1) of an image (C,S,S) across a line (N,2): the mean of the columns round each station."""
     grey = gaussian_blur(image.mean(0, keepdim=True)[None].float(), _BLUR)[0, 0].double()
     height, width = grey.shape
-    columns = torch.arange(line[0, 0].round(), line[-1, 0].round() + 1, dtype=torch.float64)
+    columns = torch.arange(int(line[0, 0].round()), int(line[-1, 0].round()) + 1, dtype=torch.float64)
     rows = _rows_at(line, columns)[:, None] + torch.arange(-REACH, REACH + 1)
     place = columns.long().clamp(0, width - 1)[:, None]
     lower = rows.floor().clamp(0, height - 2)
