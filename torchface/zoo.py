@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import nn
 
+from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.landmarks.uv import UVLandmarkDetector
@@ -20,6 +21,7 @@ from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.personalization import ExpressionRegression
 
 KINDS: dict[str, type[nn.Module]] = {
+    "action_units": ActionUnitClassifier,
     "expression_regression": ExpressionRegression,
     "head": HeadModel,
     "marker_solver": MarkerSolver,

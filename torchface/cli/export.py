@@ -71,4 +71,36 @@ def _write_solver(
     print(out)
 
 
-EXPORTS = {"solver": solver, "hybrid-solver": hybrid_solver}
+def action_units(model: str, out: Path, quiet: bool = False) -> None:
+    """Write an action unit classifier as an ONNX file, and check it.
+
+    Input of the graph: `regions` (B,R,h,w), painted patterns in [0,1]. Output: `intensities` (B,A). The names of both
+    are in the file's metadata.
+
+    Args:
+        model: Its name in the zoo, or a folder that `python -m train.action_units` wrote.
+        out: The .onnx file to write.
+        quiet: Show no progress.
+    """
+    from torchface import zoo
+    from torchface.capture import ActionUnitClassifier
+    from torchface.errors import FileFormatError
+    from torchface.onnx import export_action_units
+
+    with steps(quiet) as step:
+        step("reading the classifier")
+        classifier = zoo.get_model(model)
+        if not isinstance(classifier, ActionUnitClassifier):
+            raise FileFormatError(
+                f"{model}: found a {type(classifier).__name__}, expected a classifier of action units"
+            )
+        step("exporting and checking")
+        report = export_action_units(classifier, out)
+    table = Table(show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    console.print(table)
+    print(out)
+
+
+EXPORTS = {"solver": solver, "hybrid-solver": hybrid_solver, "action-units": action_units}

@@ -7,16 +7,16 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
-# FFmpeg and OpenCV print to the terminal of whoever imports them; what matters comes as an error.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-import cv2
+if TYPE_CHECKING:
+    import cv2
 
 _LARGEST_SIDE = 8192
 _LARGEST_FRAME = 4096 * 4096
@@ -55,7 +55,7 @@ class VideoFile:
         """
         if frames < 1:
             raise ValueRangeError(f"frames: found {frames}, expected at least 1")
-        capture = _opened(self.path)
+        cv2, capture = _opencv(), _opened(self.path)
         found = 0
         try:
             held: list[Tensor] = []
@@ -117,7 +117,7 @@ def open_video(path: str | Path) -> VideoFile:
         FileFormatError: the file is missing, no video, of a codec that is not there, or claims absurd sizes.
     """
     path = Path(path)
-    capture = _opened(path)
+    cv2, capture = _opencv(), _opened(path)
     try:
         fps = capture.get(cv2.CAP_PROP_FPS)
         width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -161,6 +161,7 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     if not (math.isfinite(fps) and 0 < fps <= _LARGEST_FPS):
         raise ValueRangeError(f"fps: found {fps}, expected a positive number")
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{suffix}")
+    cv2 = _opencv()
     writer, size, count = None, (0, 0), 0
     try:
         for chunk in frames:  # the encoder takes one frame at a time
@@ -217,10 +218,20 @@ def _opened(path: Path) -> cv2.VideoCapture:
         or start[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free")
     ):
         raise FileFormatError(f"{path}: found {start[:8]!r} at its start, expected an AVI, Matroska, MP4 or MOV video")
+    cv2 = _opencv()
     capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise FileFormatError(f"{path}: cannot be opened as a video; expected a codec that FFmpeg knows")
     return capture
+
+
+def _opencv() -> ModuleType:
+    """OpenCV, silent: it and FFmpeg would print to the terminal; what matters comes as an error."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    import cv2
+
+    return cv2
 
 
 def _short(error: Exception) -> str:

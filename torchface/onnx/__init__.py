@@ -1,5 +1,6 @@
 """ONNX graphs of what torchface learns and solves."""
 
+from torchface.onnx.action_units import ActionUnitReport, export_action_units
 from torchface.onnx.checked import ExportReport
 from torchface.onnx.hybrid import HybridGraph
 from torchface.onnx.model_export import export_model
@@ -7,10 +8,12 @@ from torchface.onnx.solver import SolverGraph
 from torchface.onnx.solver_export import SolverReport, export_hybrid_solver, export_solver
 
 __all__ = [
+    "ActionUnitReport",
     "ExportReport",
     "HybridGraph",
     "SolverGraph",
     "SolverReport",
+    "export_action_units",
     "export_hybrid_solver",
     "export_model",
     "export_solver",

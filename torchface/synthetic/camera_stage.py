@@ -186,7 +186,7 @@ def _region_vertices() -> dict[str, Tensor]:
     skin |= skin[t.mirror]
     regions = {}
     for side, name in ((1.0, "left"), (-1.0, "right")):
-        regions[f"brow_{name}"] = skin & front & (side * x > 3) & (side * x < 52) & (y > 17) & (y < 46)
+        regions[f"brow_{name}"] = skin & front & (side * x > 3) & (side * x < 52) & (y > 17) & (y < 57)
     regions["between_brows"] = skin & front & (x.abs() < 16) & (y > -24) & (y < 26)
     for side, name in enumerate(("left", "right")):
         eye = torch.zeros(t.count, dtype=torch.bool)

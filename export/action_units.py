@@ -1,0 +1,27 @@
+"""``python -m export.action_units --model NAME --out FILE``: the action unit classifier as ONNX."""
+
+from __future__ import annotations
+
+import tyro
+
+from torchface import zoo
+from torchface.capture import ActionUnitClassifier
+from torchface.errors import FileFormatError
+from torchface.onnx import export_action_units
+
+
+def action_units(model: str, out: str) -> None:
+    """Write an action unit classifier as an ONNX file, and check it.
+
+    Args:
+        model: Its name in the zoo, or a folder.
+        out: The .onnx file to write.
+    """
+    classifier = zoo.get_model(model)
+    if not isinstance(classifier, ActionUnitClassifier):
+        raise FileFormatError(f"{model}: found a {type(classifier).__name__}, expected a classifier of action units")
+    print(export_action_units(classifier, out))
+
+
+if __name__ == "__main__":
+    tyro.cli(action_units)

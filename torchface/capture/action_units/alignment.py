@@ -1,0 +1,70 @@
+"""One performer's pattern laid on another's: a dense flow between their neutral pictures that warps every frame."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from torchface.errors import ShapeError
+
+Method = Literal["dis", "farneback"]
+
+
+def neutral_flow(own: Tensor, reference: Tensor, method: Method = "farneback") -> Tensor:
+    r"""For each pixel of the reference's neutral pattern, how far off the same spot lies in one's own.
+
+    .. math:: \text{own}(x + u(x)) \approx \text{reference}(x)
+
+    Found once a performer, at rest, and used for every frame: a flow a frame would take the expression away.
+
+    Args:
+        own, reference: neutral patterns, (R,h,w) in [0,1].
+        method: OpenCV's dense flow: Farnebäck's polynomials or DIS.
+
+    Returns:
+        u, (R,h,w,2), pixels of the region, x first.
+
+    Raises:
+        ShapeError: the patterns differ in shape.
+
+    Source: Farnebäck 2003; Kroeger et al. 2016; thesis 4.1.12.
+    """
+    if own.shape != reference.shape or own.ndim != 3:
+        raise ShapeError(f"patterns: found {tuple(own.shape)} and {tuple(reference.shape)}, expected (R,h,w) twice")
+    flows = [_flow(a, b, method) for a, b in zip(_grey(reference), _grey(own), strict=True)]
+    return torch.stack(flows)
+
+
+def aligned_grid(grid: Tensor, flow: Tensor) -> Tensor:
+    """The pixels at which regions are read, moved by a flow in region pixels; both (R,h,w,2)."""
+    step = torch.stack([grid[:, 0, 1, 0] - grid[:, 0, 0, 0], grid[:, 1, 0, 1] - grid[:, 0, 0, 1]], dim=-1)
+    return grid + flow * step[:, None, None]
+
+
+def _grey(patterns: Tensor, sigma: float = 1.0) -> np.ndarray:
+    """Softened 8-bit pictures: what is thresholded has edges that a flow cannot follow."""
+    offsets = torch.arange(-3, 4).float()
+    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    wide = pad(patterns[:, None], (3, 3, 3, 3), mode="replicate")
+    soft = conv2d(conv2d(wide, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[:, 0]
+    return (255 * soft.clamp(0, 1)).round().byte().numpy()
+
+
+def _flow(start: np.ndarray, end: np.ndarray, method: Method) -> Tensor:
+    import cv2
+
+    still = np.zeros((*start.shape, 2), dtype=np.float32)
+    if method == "dis":
+        solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        solver.setFinestScale(0)
+        flow = solver.calc(start, end, still)
+    else:
+        flow = cv2.calcOpticalFlowFarneback(
+            start, end, still, pyr_scale=0.5, levels=3, winsize=13, iterations=10, poly_n=7, poly_sigma=1.5, flags=256
+        )
+    return torch.from_numpy(np.ascontiguousarray(flow))

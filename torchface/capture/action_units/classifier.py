@@ -1,0 +1,210 @@
+"""Which action units a face shows, and how strongly, told from its painted regions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.action_units.gabor import GaborBank
+from torchface.capture.action_units.one_vs_one import OneVsOne
+from torchface.capture.action_units.regions import GROUPS, RegionGroup
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+
+if TYPE_CHECKING:
+    from torchface.capture.action_units.region_video import RegionVideo
+    from torchface.capture.action_units.training import TrainingSettings
+    from torchface.io.action_labels import ActionLabels
+
+_LARGEST = 4096
+
+
+class GroupClassifier(nn.Module):
+    """Gabor features of merged regions, their principal components, a vote between classes, a table of intensities.
+
+    Args:
+        group: regions and units.
+        size: pixels a side of a region.
+        components: K.
+        classes: C; the first is rest.
+    """
+
+    mean: Tensor
+    components: Tensor
+    deviations: Tensor
+    intensities: Tensor
+
+    def __init__(self, group: RegionGroup, size: int, components: int, classes: int) -> None:
+        super().__init__()
+        self.group = group
+        self.gabor = GaborBank()
+        places = self.gabor.places(size)
+        features = len(group.regions) * len(self.gabor.even) * places**2
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("components", torch.zeros(components, features))
+        self.register_buffer("deviations", torch.ones(components))
+        self.machine = OneVsOne(classes, components)
+        self.register_buffer("intensities", torch.zeros(classes, len(group.units)))
+
+    def features(self, images: Tensor) -> Tensor:
+        """Gabor magnitudes (B,D) of the group's regions (B,G,h,w), merged."""
+        batch, regions = images.shape[:2]
+        return self.gabor(images.flatten(0, 1)).reshape(batch, regions, -1).flatten(1)
+
+    def scores(self, images: Tensor) -> Tensor:
+        """Of every class, (B,C), for regions (B,G,h,w)."""
+        reduced = (self.features(images) - self.mean) @ self.components.T / self.deviations
+        scores: Tensor = self.machine(reduced)
+        return scores
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Intensities (B,A) of the group's units, for its regions (B,G,h,w)."""
+        return self.intensities[self.scores(images).argmax(1)]
+
+
+@dataclass(frozen=True)
+class GroupSize:
+    """How many components and classes a group's classifier has learned."""
+
+    components: int
+    classes: int
+
+
+class ActionUnitClassifier(nn.Module):
+    """Intensities of action units from painted regions, every frame on its own.
+
+    Args:
+        groups: which regions tell which units.
+        sizes: what each group has learned.
+        size: pixels a side of a region.
+
+    Raises:
+        NameMismatchError: a unit is told by two groups, or a group holds nothing.
+
+    Source: thesis 4.1.10 to 4.1.12.
+    """
+
+    neutral: Tensor
+
+    def __init__(self, groups: Sequence[RegionGroup], sizes: Sequence[GroupSize], size: int) -> None:
+        super().__init__()
+        check_groups(groups)
+        self.groups, self.size = tuple(groups), size
+        self.regions = group_regions(groups)
+        self.units: tuple[str, ...] = tuple(unit for group in groups for unit in group.units)
+        self.parts = nn.ModuleList(
+            GroupClassifier(group, size, own.components, own.classes) for group, own in zip(groups, sizes, strict=True)
+        )
+        # The first training performer's face at rest, on which others are laid.
+        self.register_buffer("neutral", torch.zeros(len(self.regions), size, size))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What :meth:`from_config` needs beside the state: plain values only."""
+        return {
+            "size": self.size,
+            "groups": [
+                {
+                    "name": part.group.name,
+                    "regions": list(part.group.regions),
+                    "units": list(part.group.units),
+                    "components": len(part.components),
+                    "classes": len(part.intensities),
+                }
+                for part in self.group_classifiers()
+            ],
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> ActionUnitClassifier:
+        """A classifier of zeros for the state to be loaded into.
+
+        Raises:
+            FileFormatError: a value is missing or out of range.
+        """
+        entries = config.get("groups")
+        if not isinstance(entries, list) or not 1 <= len(entries) <= 64:
+            raise FileFormatError(f"config: found groups = {entries!r:.80}, expected a list of tables")
+        groups, sizes = [], []
+        for entry in entries:
+            if not isinstance(entry, Mapping):
+                raise FileFormatError(f"config: found the group {entry!r:.80}, expected a table")
+            groups.append(RegionGroup(str(entry.get("name")), _texts(entry, "regions"), _texts(entry, "units")))
+            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2)))
+        return cls(groups, sizes, _whole(config, "size", 8))
+
+    @classmethod
+    def fit(
+        cls,
+        videos: Sequence[RegionVideo],
+        labels: Sequence[ActionLabels],
+        groups: Sequence[RegionGroup] = GROUPS,
+        settings: TrainingSettings | None = None,
+    ) -> ActionUnitClassifier:
+        """Learns from performed action units; see :func:`torchface.capture.action_units.fit_classifier`."""
+        from torchface.capture.action_units.training import TrainingSettings, fit_classifier  # it builds this class
+
+        return fit_classifier(videos, labels, groups, settings or TrainingSettings())
+
+    def group_classifiers(self) -> list[GroupClassifier]:
+        """One a group."""
+        return [part for part in self.parts if isinstance(part, GroupClassifier)]
+
+    def forward(self, regions: Tensor) -> Tensor:
+        """Intensities (B,A) in [0,1], in the order of ``units``.
+
+        Args:
+            regions: patterns (B,R,h,w) in [0,1], in the order of ``regions``, laid on ``neutral``; see
+                :func:`torchface.capture.action_units.read_regions`.
+
+        Raises:
+            ShapeError: another shape.
+        """
+        parts = self.group_classifiers()
+        return torch.cat([part(own) for part, own in zip(parts, self.split(regions), strict=True)], dim=1)
+
+    def classes(self, regions: Tensor) -> Tensor:
+        """The class of every group, (B,groups) int64, for regions (B,R,h,w); 0 is rest."""
+        parts = self.group_classifiers()
+        found = [part.scores(own).argmax(1) for part, own in zip(parts, self.split(regions), strict=True)]
+        return torch.stack(found, dim=1)
+
+    def split(self, regions: Tensor) -> list[Tensor]:
+        """Each group's regions (B,G,h,w)."""
+        if regions.ndim != 4 or tuple(regions.shape[1:]) != (len(self.regions), self.size, self.size):
+            raise ShapeError(
+                f"regions: found {tuple(regions.shape)}, expected (B,{len(self.regions)},{self.size},{self.size})"
+            )
+        return [regions[:, [self.regions.index(name) for name in group.regions]] for group in self.groups]
+
+
+def group_regions(groups: Sequence[RegionGroup]) -> tuple[str, ...]:
+    """Every region of the groups once, in order."""
+    return tuple(dict.fromkeys(region for group in groups for region in group.regions))
+
+
+def check_groups(groups: Sequence[RegionGroup]) -> None:
+    """Raises ``NameMismatchError`` where groups hold nothing, or tell a unit twice."""
+    units = [unit for group in groups for unit in group.units]
+    if not groups or any(not group.regions or not group.units for group in groups):
+        raise NameMismatchError(f"groups: found {list(groups)!r:.120}, expected regions and units in each")
+    twice = sorted({unit for unit in units if units.count(unit) > 1})
+    if twice:
+        raise NameMismatchError(f"groups: found {', '.join(twice)} in more than one group, expected each unit in one")
+
+
+def _texts(entry: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    found = entry.get(name)
+    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+        raise FileFormatError(f"config: found {name} = {found!r:.80}, expected a list of names")
+    return tuple(found)
+
+
+def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1) -> int:
+    found = entry.get(name)
+    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found <= _LARGEST:
+        raise FileFormatError(f"config: found {name} = {found!r:.80}, expected a whole number from {smallest}")
+    return found

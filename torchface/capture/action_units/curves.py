@@ -1,0 +1,95 @@
+"""A classified video as weight curves of a rig, for the hybrid solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.action_units.classifier import ActionUnitClassifier
+from torchface.capture.action_units.region_video import RegionVideo, read_regions
+from torchface.capture.action_units.shape_table import ShapeTable
+from torchface.capture.action_units.smoothing import WINDOWS, smooth_intensities
+from torchface.errors import NameMismatchError
+from torchface.io.action_labels import ActionLabels
+from torchface.io.video import VideoFile
+
+_CHUNK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class ActionUnitCurves:
+    """What a classifier saw, in a rig's shapes.
+
+    Args:
+        names: of the shapes, N.
+        weights: what the classifier predicts, smooth, (T,N) in [0,1].
+        active: the frames in which it saw a unit that moves the shape, (T,N) bool; where it shall lead the solve.
+        units: of the classifier, A.
+        intensities: smooth, (T,A) in [0,1].
+        levels: as they were told frame by frame, (T,A).
+        fps: frames a second.
+    """
+
+    names: tuple[str, ...]
+    weights: Tensor
+    active: Tensor
+    units: tuple[str, ...]
+    intensities: Tensor
+    levels: Tensor
+    fps: float
+
+
+def action_unit_curves(
+    classifier: ActionUnitClassifier,
+    video: VideoFile | RegionVideo | str | Path,
+    labels: ActionLabels,
+    table: ShapeTable,
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    windows: Mapping[str, int] = WINDOWS,
+    progress: Callable[[int, int], None] | None = None,
+) -> ActionUnitCurves:
+    r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
+
+    A shape that several units move follows the one that moves it most.
+
+    Args:
+        classifier: a trained one.
+        video: the file, or its regions where they have been read already.
+        labels: where helmet, markers and regions are in it.
+        table: units in the rig's shapes.
+        names: of the rig's shapes, N.
+        units: which of the classifier's may lead the solve; all if absent.
+        windows: frames over which each unit is smoothed.
+        progress: is told how many frames are done, and of how many.
+
+    Raises:
+        NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.
+        FileFormatError, ShapeError, ValueRangeError, AlignmentError: the video cannot be used; see ``read_regions``.
+
+    Source: thesis 4.1.12.
+    """
+    unknown = sorted(set(units or ()) - set(classifier.units))
+    if unknown:
+        raise NameMismatchError(f"units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
+    matrix = table.matrix(classifier.units, names)
+    if units is not None:
+        matrix = matrix * torch.tensor([[float(unit in units)] for unit in classifier.units])
+    if not isinstance(video, RegionVideo):
+        video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
+    levels = classify(classifier, video)
+    intensities = smooth_intensities(levels, classifier.units, windows)
+    weights = (intensities[:, :, None] * matrix).amax(1)
+    active = ((levels > 0)[:, :, None] & (matrix > 0)).any(1)
+    return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
+
+
+@torch.no_grad()
+def classify(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
+    """Levels of intensity (T,A), every frame on its own."""
+    rows = [video.names.index(name) for name in classifier.regions]
+    return torch.cat([classifier(chunk[:, rows]) for chunk in video.patterns.split(_CHUNK)])

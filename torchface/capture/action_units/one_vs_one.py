@@ -1,0 +1,78 @@
+"""A linear support vector machine for many classes: a plane between every two, and a vote."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.action_units.scikit import scikit
+from torchface.errors import ShapeError, ValueRangeError
+
+
+class OneVsOne(nn.Module):
+    r"""Votes of one plane for every two classes.
+
+    .. math:: d_{ij} = w_{ij} \cdot x + b_{ij}, \qquad
+        s_c = \sum_{c\text{ wins}} 1 + \frac{m_c}{3 (\lvert m_c \rvert + 1)}, \quad
+        m_c = \sum_j d_{cj} - \sum_i d_{ic}
+
+    where d > 0 is a vote for i. The second term, below a vote, decides between equally many.
+
+    Args:
+        classes: C, at least 2.
+        features: K.
+
+    Source: thesis 4.1.11; scikit-learn's ``SVC`` with ``break_ties``.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    for_first: Tensor
+    for_second: Tensor
+
+    def __init__(self, classes: int, features: int) -> None:
+        super().__init__()
+        pairs = torch.tensor(list(combinations(range(classes), 2))).view(-1, 2)
+        self.register_buffer("weight", torch.zeros(len(pairs), features))
+        self.register_buffer("bias", torch.zeros(len(pairs)))
+        one_hot = torch.nn.functional.one_hot(pairs, classes).float()
+        self.register_buffer("for_first", one_hot[:, 0].clone())
+        self.register_buffer("for_second", one_hot[:, 1].clone())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Scores (B,C) of features (B,K); the highest wins."""
+        distance = features @ self.weight.T + self.bias
+        first = (distance > 0).to(distance.dtype)
+        votes = first @ self.for_first + (1 - first) @ self.for_second
+        margin = distance @ (self.for_first - self.for_second)
+        return votes + margin / (3 * (margin.abs() + 1))
+
+    def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> OneVsOne:
+        """Learns the planes.
+
+        Args:
+            features: (T,K).
+            classes: (T,) int64; every class from 0 to C-1 occurs.
+            penalty: C of the machine, what a sample on the wrong side costs.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+            ValueRangeError: a class never occurs.
+            MissingExtraError: scikit-learn is not installed.
+        """
+        count = self.for_first.shape[1]
+        if features.shape != (len(classes), self.weight.shape[1]):
+            raise ShapeError(
+                f"features: found {tuple(features.shape)}, expected ({len(classes)},{self.weight.shape[1]})"
+            )
+        if not torch.equal(classes.unique(), torch.arange(count)):
+            raise ValueRangeError(f"classes: found {classes.unique().tolist()}, expected every one of 0 to {count - 1}")
+        machine = scikit("svm").SVC(kernel="linear", C=penalty, cache_size=500)
+        machine.fit(features.double().numpy(), classes.numpy())
+        # scikit-learn turns the sign of the only plane between two classes, so that the second is positive.
+        sign = -1.0 if count == 2 else 1.0
+        self.weight.copy_(sign * torch.tensor(machine.coef_))
+        self.bias.copy_(sign * torch.tensor(machine.intercept_))
+        return self

@@ -1,0 +1,85 @@
+"""The painted pattern told from the skin by its brightness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+
+_BINS = 128
+_LEAST_CONTRAST = 0.15
+_SHARES = (0.01, 0.7)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternLevels:
+    """Mean grey of skin and of paint in each region, (R,) each."""
+
+    skin: Tensor
+    paint: Tensor
+
+    def pattern(self, images: Tensor) -> Tensor:
+        """How much of a pixel is paint, (...,R,h,w) in [0,1].
+
+        A threshold half way between skin and paint; within a quarter of their distance round it a pixel that is partly
+        covered counts in part, so that motion of less than a pixel is not lost.
+        """
+        skin, paint = self.skin[:, None, None], self.paint[:, None, None]
+        share = (images - skin) / (paint - skin)
+        return (2 * share - 0.5).clamp(0, 1)
+
+
+def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
+    """The greys of skin and paint, by Otsu's threshold in each region.
+
+    Args:
+        neutral: regions of a picture of the face at rest, (R,h,w) in [0,1].
+        names: of the regions.
+
+    Raises:
+        ValueRangeError: a region shows no pattern: too little contrast, or too much or too little of it.
+
+    Source: Otsu 1979; thesis 4.1.9.
+    """
+    skin, paint = [], []
+    for name, region in zip(names, neutral, strict=True):
+        values = region.flatten()
+        threshold = otsu_threshold(values)
+        bright, dark = values[values > threshold], values[values <= threshold]
+        share = len(bright) / len(values)
+        contrast = float(bright.mean() - dark.mean()) if len(bright) and len(dark) else 0.0
+        if contrast < _LEAST_CONTRAST or not _SHARES[0] <= share <= _SHARES[1]:
+            raise ValueRangeError(
+                f"region {name!r} shows no painted pattern: {share:.0%} of it is brighter than the rest by "
+                f"{contrast:.2f}, expected {_SHARES[0]:.0%} to {_SHARES[1]:.0%} brighter by {_LEAST_CONTRAST} at least"
+            )
+        skin.append(dark.mean())
+        paint.append(bright.mean())
+    return PatternLevels(torch.stack(skin), torch.stack(paint))
+
+
+def otsu_threshold(values: Tensor) -> float:
+    r"""The threshold that leaves the most variance between the two classes.
+
+    .. math:: \max_t \; p_0 p_1 (\mu_0 - \mu_1)^2
+
+    Args:
+        values: (N,).
+    """
+    low, high = float(values.min()), float(values.max())
+    if high <= low:
+        return high
+    counts = torch.histc(values.float(), _BINS, low, high).double()
+    middle = low + (high - low) * (torch.arange(_BINS, dtype=torch.float64) + 0.5) / _BINS
+    below = counts.cumsum(0)
+    above = below[-1] - below
+    mean_below = (counts * middle).cumsum(0) / below.clamp(min=1)
+    mean_above = ((counts * middle).sum() - (counts * middle).cumsum(0)) / above.clamp(min=1)
+    between = below * above * (mean_below - mean_above) ** 2
+    # A gap between the classes leaves many thresholds equally good: its middle.
+    best = (between >= between.max() * (1 - 1e-9)).nonzero()[:, 0].double().mean()
+    return low + (high - low) * (float(best) + 1) / _BINS

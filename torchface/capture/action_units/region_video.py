@@ -1,0 +1,104 @@
+"""From a head-camera video to steady pictures of its painted regions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.action_units.alignment import Method, aligned_grid, neutral_flow
+from torchface.capture.action_units.pattern import pattern_levels
+from torchface.capture.action_units.regions import region_grid, sample_regions
+from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
+from torchface.errors import ShapeError
+from torchface.io.action_labels import ActionLabels
+from torchface.io.video import VideoFile, open_video
+
+SIZE = 48
+_CHUNK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class RegionVideo:
+    """The painted regions of a video, steady.
+
+    Args:
+        names: of the regions, R.
+        patterns: (T,R,h,w) in [0,1], how much of a pixel is paint.
+        neutral: the regions at rest, (R,h,w), before they were laid on another performer's.
+        fps: frames a second.
+    """
+
+    names: tuple[str, ...]
+    patterns: Tensor
+    neutral: Tensor
+    fps: float
+
+
+def read_regions(
+    video: VideoFile | str | Path,
+    labels: ActionLabels,
+    names: Sequence[str],
+    reference: Tensor | None = None,
+    size: int = SIZE,
+    method: Method = "farneback",
+    progress: Callable[[int, int], None] | None = None,
+) -> RegionVideo:
+    """Stabilises a video, cuts its regions out, thresholds the pattern and lays it on a reference's.
+
+    Args:
+        video: the file.
+        labels: where helmet, markers and regions are.
+        names: which regions, R, in which order.
+        reference: another performer's neutral patterns (R,h,w), on which these are laid; as they are if absent.
+        size: pixels a side of a region.
+        method: of the flow that lays them on the reference.
+        progress: is told how many frames are done, and of how many.
+
+    Raises:
+        FileFormatError: the video cannot be decoded.
+        ShapeError: video and labels differ in length.
+        ValueRangeError: a region reaches out of the picture, or shows no pattern.
+        AlignmentError: helmet or markers cannot be followed.
+        NameMismatchError: a region has no box.
+    """
+    video = video if isinstance(video, VideoFile) else open_video(video)
+    grid = region_grid(labels.regions, names, size, video.width, video.height)
+    _check_length(video, labels, video.count)
+    still = video.frame(labels.neutral)
+    # Neighbours of the neutral frame share its noise out; without a face that moves they show the same.
+    levels = pattern_levels(sample_regions(still[None].float() / 255, grid, _identity())[0], names)
+    neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
+    if reference is not None:
+        grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
+    points = torch.tensor([labels.helmet, *labels.markers])
+    tracker = PointTracker(still, points, torch.tensor([False, True, True]))
+    tracked = []
+    for chunk in video.chunks(_CHUNK):  # once to follow the points, once to read: no whole video is in memory
+        tracked.append(tracker(chunk))
+    _check_length(video, labels, sum(len(chunk) for chunk in tracked))
+    transforms = steady_transforms(tracker.points, torch.cat(tracked))
+    patterns, done = [], 0
+    for chunk in islice(video.chunks(_CHUNK), len(tracked)):
+        regions = sample_regions(chunk.float() / 255, grid, transforms[done : done + len(chunk)])
+        patterns.append(levels.pattern(regions).half())
+        done += len(chunk)
+        if progress is not None:
+            progress(done, labels.frames)
+    return RegionVideo(tuple(names), torch.cat(patterns).float(), neutral, video.fps)
+
+
+def _identity() -> Tensor:
+    return torch.eye(2, 3)[None]
+
+
+def _check_length(video: VideoFile, labels: ActionLabels, found: int) -> None:
+    if found != labels.frames:
+        raise ShapeError(
+            f"{video.path}: found {found} frames, expected {labels.frames} as its labels say; they belong to another "
+            "video or another cut"
+        )

@@ -1,0 +1,93 @@
+"""Regions of the face cut out of every frame, held still, brought to one size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.action_labels import Box
+
+
+@dataclass(frozen=True)
+class RegionGroup:
+    """Regions whose features are merged, and the action units that are told from them.
+
+    Args:
+        name: of the group.
+        regions: names of its regions.
+        units: names of its action units.
+    """
+
+    name: str
+    regions: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+GROUPS: tuple[RegionGroup, ...] = (
+    RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2",)),
+    RegionGroup("between_brows", ("between_brows",), ("4", "9")),
+    RegionGroup("eyes", ("eye_left", "eye_right"), ("7", "45", "6+43")),
+    RegionGroup("mouth", ("mouth",), ("18L",)),
+)
+"""The forehead's two regions and the two eyes merge their features; ``18L`` is the lip pucker to the left."""
+
+
+def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:
+    """The pixels of a neutral picture at which regions of ``size`` x ``size`` are read, (R,size,size,2).
+
+    Args:
+        boxes: (left, top, right, bottom) by name.
+        names: which regions, R, in which order.
+        size: pixels a side that every region is brought to.
+        width, height: of the picture.
+
+    Raises:
+        NameMismatchError: a region has no box.
+        ValueRangeError: a box reaches out of the picture.
+    """
+    lacking = [name for name in names if name not in boxes]
+    if lacking:
+        raise NameMismatchError(f"regions: found no {', '.join(lacking)}, expected {', '.join(names)}")
+    grids = []
+    for name in names:
+        left, top, right, bottom = boxes[name]
+        if left < -0.5 or top < -0.5 or right > width - 0.5 or bottom > height - 0.5:
+            raise ValueRangeError(
+                f"region {name!r} is ({left:.1f}, {top:.1f}) to ({right:.1f}, {bottom:.1f}), expected it inside the "
+                f"picture of {width} x {height} pixels"
+            )
+        step = (torch.arange(size) + 0.5) / size
+        y, x = torch.meshgrid(top + (bottom - top) * step, left + (right - left) * step, indexing="ij")
+        grids.append(torch.stack([x, y], dim=-1))
+    return torch.stack(grids).float()
+
+
+def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
+    """Regions (t,R,h,w) of frames, each read in one interpolation.
+
+    Args:
+        frames: (t,H,W), floats.
+        grid: pixels of the neutral picture, (R,h,w,2).
+        transforms: neutral picture to frame, (t,2,3).
+
+    Raises:
+        ShapeError: the shapes do not fit.
+    """
+    if frames.ndim != 3 or grid.ndim != 4 or transforms.shape != (len(frames), 2, 3):
+        raise ShapeError(
+            f"regions: found frames {tuple(frames.shape)}, grid {tuple(grid.shape)}, transforms "
+            f"{tuple(transforms.shape)}, expected (t,H,W), (R,h,w,2), (t,2,3)"
+        )
+    regions, height, width = grid.shape[:3]
+    pixels = torch.einsum("nc,tdc->tnd", grid.reshape(-1, 2), transforms[..., :2]) + transforms[:, None, :, 2]
+    size = torch.tensor([frames.shape[2], frames.shape[1]], dtype=torch.float32)
+    places = (2 * pixels + 1) / size - 1
+    sampled = grid_sample(
+        frames[:, None], places.view(len(frames), -1, width, 2), padding_mode="border", align_corners=False
+    )
+    return sampled.view(len(frames), regions, height, width)

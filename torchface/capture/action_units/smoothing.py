@@ -1,0 +1,41 @@
+"""Steps of intensity, one a frame, made into curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+from torchface.temporal import savitzky_golay
+
+WINDOW = 25
+"""Frames; a blink is over sooner than the others, so its window is the shortest."""
+
+WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29}
+"""Windows of units that have their own."""
+
+
+def smooth_intensities(
+    intensities: Tensor, units: Sequence[str], windows: Mapping[str, int] = WINDOWS, order: int = 2
+) -> Tensor:
+    """A classifier's levels as continuous curves in [0,1].
+
+    Args:
+        intensities: (T,A).
+        units: their names, A.
+        windows: frames of the Savitzky-Golay filter by unit; ``WINDOW`` for the others.
+        order: of its polynomial.
+
+    Raises:
+        ShapeError: ``intensities`` is not (T,A).
+
+    Source: thesis 4.1.12.
+    """
+    if intensities.ndim != 2 or intensities.shape[1] != len(units):
+        raise ShapeError(f"intensities: found {tuple(intensities.shape)}, expected (T,{len(units)})")
+    curves = [
+        savitzky_golay(intensities[:, a].double(), windows.get(unit, WINDOW), order) for a, unit in enumerate(units)
+    ]
+    return torch.stack(curves, dim=1).clamp(0, 1).float()
