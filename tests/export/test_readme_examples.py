@@ -1,0 +1,123 @@
+"""What export/README.md shows runs: Python with onnxruntime, JavaScript with onnxruntime-web under Node."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import Attachment, BlendshapeRig
+from torchface.capture import MarkerSolver
+from torchface.landmarks import DetectorSettings, UVLandmarkDetector
+from torchface.landmarks.hog import HogLayout
+from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
+from torchface.onnx import export_model
+
+EXPORT = Path(__file__).resolve().parents[2] / "export"
+WEB = EXPORT / "web"
+SIZE = 64
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def blocks(language: str) -> dict[str, str]:
+    """The code of this language under each heading."""
+    sections = (EXPORT / "README.md").read_text().split("\n## ")[1:]
+    found = {}
+    for section in sections:
+        (code,) = re.findall(rf"```{language}\n(.*?)```", section, re.DOTALL)
+        found[section.splitlines()[0]] = code
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every graph and input that the examples open."""
+    path = tmp_path_factory.mktemp("graphs")
+    vertices = dome_rig.vertices
+    people = vertices + noise(6, *vertices.shape)
+    head = HeadModel.on(dome_rig.neutral, MorphableModel.fit(people), MorphableModel.fit(0.5 + 0.1 * people / 50))
+    offsets = dome_rig.deltas * (1 + 0.3 * noise(6, 4, 1, 1))
+    regression = ExpressionRegression.fit(people, people[:, None] + offsets, names=dome_rig.names)
+    solver = MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)))
+    images = torch.rand(3, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    places = torch.tensor([[20.0, 20.0], [40.0, 44.0]]) + noise(3, 2, 2)
+    settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
+    detector = UVLandmarkDetector.fit(images, places, ("left", "right"), "relief", settings)
+    for name, model in {"head": head, "expressions": regression, "uv_landmarks": detector, "solver": solver}.items():
+        export_model(model, path / f"{name}.onnx")
+    markers = solver.rest + solver.basis[..., 0] * torch.linspace(0, 1, 5)[:, None, None]
+    markers[2, 3] = torch.nan
+    for name, values in {"neutral": people[0], "image": images[0], "markers": markers}.items():
+        array = values.numpy().astype(np.float32)
+        np.save(path / f"{name}.npy", array)
+        (path / f"{name}.f32").write_bytes(array.tobytes())
+    return path
+
+
+@pytest.fixture(scope="module")
+def node() -> str:
+    """The path of node, with onnxruntime-web installed in export/web; kept there for the next run."""
+    node, npm = shutil.which("node"), shutil.which("npm")
+    if node is None or npm is None:
+        pytest.skip("node and npm are not installed; onnxruntime-web comes from npm")
+    mark = WEB / "node_modules" / ".torchface-lock.json"
+    wanted = (WEB / "package-lock.json").read_text()
+    if not mark.is_file() or mark.read_text() != wanted:
+        done = subprocess.run(
+            [npm, "ci", "--no-audit", "--no-fund", "--ignore-scripts"],
+            cwd=WEB,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        if done.returncode != 0:
+            pytest.skip(f"npm could not install onnxruntime-web: {done.stderr[-300:]}")
+        mark.write_text(wanted)
+    return node
+
+
+RESULTS = {
+    "A head from coefficients": "vertices",
+    "A rig from a neutral face": "offsets",
+    "Landmarks of an unwrapped head": "pixels",
+    "Weights from markers": "previous",
+}
+
+
+def in_python(folder: Path, monkeypatch: pytest.MonkeyPatch, title: str) -> np.ndarray:
+    monkeypatch.chdir(folder)
+    names: dict = {}
+    exec(compile(blocks("python")[title], f"{title} in README.md", "exec"), names)
+    return np.asarray(names[RESULTS[title]])
+
+
+@pytest.mark.parametrize("title", RESULTS)
+def test_python_runs(folder: Path, monkeypatch: pytest.MonkeyPatch, title: str) -> None:
+    assert set(blocks("python")) == set(blocks("js")) == set(RESULTS)
+    assert np.isfinite(in_python(folder, monkeypatch, title)).all()
+
+
+@pytest.mark.browser
+def test_javascript_computes_the_same(folder: Path, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "node_modules").symlink_to(WEB / "node_modules")
+    for title, name in RESULTS.items():
+        code = blocks("js")[title] + f"\nconsole.log(JSON.stringify(Array.from({name}.data)));\n"
+        (folder / "example.mjs").write_text(code)
+        done = subprocess.run(
+            [node, "example.mjs"], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, f"{title}: {done.stderr[-3000:]}"
+        found = np.array(json.loads(done.stdout.splitlines()[-1]))
+        expected = in_python(folder, monkeypatch, title).ravel()
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3, err_msg=title)
