@@ -93,27 +93,27 @@ class GradientReconstruction:
             ValueRangeError: a value is NaN or infinite.
         """
         self._check(gradients, positions, pinned)
+        prepared = self.prepare(pinned, constraints)
+        return prepared.solve(gradients, positions, [constraint.values for constraint in constraints])
+
+    def prepare(self, pinned: Tensor, constraints: Sequence[SoftConstraints] = ()) -> PreparedReconstruction:
+        """Factors the system once, for many solves with the same pins and the same matrices of constraints.
+
+        Args:
+            pinned: (V,) bool.
+            constraints: their values are not looked at.
+        """
         free = (~pinned).nonzero()[:, 0].cpu().numpy()
-        result = positions.detach().double().cpu().numpy().copy()
-        if len(free) == 0:
-            return torch.from_numpy(result)
-        count = len(result)
-        # Unknown is the step away from ``positions``: pins are then zeros, and what already fits is left as it is.
-        anchored = result.transpose(1, 0, 2).reshape(self.vertex_count, -1)
-        asked = gradients.detach().double().cpu().permute(1, 3, 0, 2).reshape(3 * self.triangle_count, -1).numpy()
         matrix = self.stiffness[free]
-        rhs = self._transposed[free] @ asked - matrix @ anchored
         system = matrix[:, free] + self._anchor * sparse.eye_array(len(free), format="csr")
+        pulls = []
         for constraint in constraints:
-            values = torch.as_tensor(constraint.values).double().cpu().expand(count, -1, 3)
-            missing = values.permute(1, 0, 2).flatten(1).numpy() - constraint.matrix @ anchored
             rows = constraint.matrix[:, free]
-            pull = rows.T @ sparse.diags_array(constraint.weights.double().cpu().numpy())
-            system = system + pull @ rows
-            rhs = rhs + pull @ missing
-        step = SparseCholesky(system).solve(rhs)
-        result[:, free] += step.reshape(len(free), count, 3).transpose(1, 0, 2)
-        return torch.from_numpy(result)
+            pulls.append(rows.T @ sparse.diags_array(constraint.weights.double().cpu().numpy()))
+            system = system + pulls[-1] @ rows
+        return PreparedReconstruction(
+            free, matrix, self._transposed[free], [held.matrix for held in constraints], pulls, SparseCholesky(system)
+        )
 
     def _check(self, gradients: Tensor, positions: Tensor, pinned: Tensor) -> None:
         count = len(positions)
@@ -128,3 +128,46 @@ class GradientReconstruction:
         for name in ("gradients", "positions"):
             if not torch.isfinite(wanted[name][0]).all():
                 raise ValueRangeError(f"{name}: found NaN or infinite values; expected none")
+
+
+class PreparedReconstruction:
+    """A factored reconstruction: gradients and the constraints' values in, vertices out."""
+
+    def __init__(
+        self,
+        free: np.ndarray,
+        stiffness: sparse.csr_array,
+        transposed: sparse.csr_array,
+        matrices: Sequence[sparse.csr_array],
+        pulls: Sequence[sparse.csr_array],
+        factor: SparseCholesky,
+    ) -> None:
+        self._free, self._stiffness, self._transposed = free, stiffness, transposed
+        self._matrices, self._pulls, self._factor = matrices, pulls, factor
+        self.vertex_count = stiffness.shape[1]
+
+    def solve(self, gradients: Tensor, positions: Tensor, values: Sequence[Tensor]) -> Tensor:
+        """Vertices for N sets of gradients.
+
+        Args:
+            gradients: (N,F,3,3).
+            positions: where pinned vertices are held, and where the others are drawn by next to nothing, (N,V,3).
+            values: of each constraint, (N,K,3) or (K,3), millimetres.
+
+        Returns:
+            Vertices (N,V,3), float64.
+        """
+        result = positions.detach().double().cpu().numpy().copy()
+        if len(self._free) == 0:
+            return torch.from_numpy(result)
+        count = len(result)
+        # Unknown is the step away from ``positions``: pins are then zeros, and what already fits is left as it is.
+        anchored = result.transpose(1, 0, 2).reshape(self.vertex_count, -1)
+        asked = gradients.detach().double().cpu().permute(1, 3, 0, 2).reshape(self._transposed.shape[1], -1).numpy()
+        rhs = self._transposed @ asked - self._stiffness @ anchored
+        for matrix, pull, given in zip(self._matrices, self._pulls, values, strict=True):
+            wanted = torch.as_tensor(given).double().cpu().expand(count, -1, 3)
+            rhs = rhs + pull @ (wanted.permute(1, 0, 2).flatten(1).numpy() - matrix @ anchored)
+        step = self._factor.solve(rhs)
+        result[:, self._free] += step.reshape(len(self._free), count, 3).transpose(1, 0, 2)
+        return torch.from_numpy(result)

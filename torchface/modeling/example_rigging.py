@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
@@ -18,6 +19,8 @@ from torchface.modeling.transfer import CONTACT_WEIGHT, TransferReport, transfer
 from torchface.optim import box_qp
 from torchface.rig import BlendshapeRig
 
+_EXACT = 0.01  # millimetres a vertex; a rig that misses examples by less has nothing to tell of how good weights are
+
 
 @dataclass(frozen=True)
 class RiggingSchedule:
@@ -25,9 +28,14 @@ class RiggingSchedule:
 
     Args:
         rounds: how often shapes and weights are solved in turn.
-        beta: weight of the prior beside the fit, first and last round; in between it goes evenly.
-        gamma: how firmly weights are held to the given ones, first and last round, square millimetres summed over
-            the vertices at the template's size; in between evenly. Raise it where the weights are well known.
+        beta: weight of the prior beside the fit, first and last round; in between it goes evenly. What is left at the
+            end is for examples as good as the person's own shapes; scans are noisier.
+        gamma: how firmly weights are held to the given ones, first and last round; in between evenly. Its unit is what
+            the transferred shapes leave of an example at the weights that suit them best (squared distances summed
+            over the vertices, the mean of the examples): with 100, a weight that leaves the given one by 0.1 costs as
+            much as all of that. Much lower, and the weights take in what is the person's own; weights that are mere
+            guesses want 10 to 25.
+        unnamed: how many times more firmly a weight is held that was given as 0: what was not asked for.
         kappa: where the prior's stiffness levels off, in gradients without unit.
         theta: how steeply the stiffness falls where the template deforms.
 
@@ -38,8 +46,9 @@ class RiggingSchedule:
     """
 
     rounds: int = 10
-    beta: tuple[float, float] = (0.5, 0.1)
-    gamma: tuple[float, float] = (1000.0, 100.0)
+    beta: tuple[float, float] = (0.5, 0.03)
+    gamma: tuple[float, float] = (100.0, 100.0)
+    unnamed: float = 20.0
     kappa: float = 0.1
     theta: float = 2.0
 
@@ -52,6 +61,7 @@ class RiggingSchedule:
         for name, numbers in (
             ("beta", self.beta),
             ("gamma", self.gamma),
+            ("unnamed", (self.unnamed,)),
             ("kappa and theta", (self.kappa, self.theta)),
         ):
             if not all(0 < number < float("inf") for number in numbers):
@@ -102,11 +112,12 @@ def rig_from_examples(
     for the gradients M of the shapes' triangles, with :math:`M^*` what deformation transfer gives and w high where the
     template hardly deforms; then, for the weights of each example, all in [0,1],
 
-    .. math:: \min_\alpha \lVert B_0 + \sum_i \alpha_i B_i - S \rVert^2 + \gamma \lVert \alpha - \alpha^* \rVert^2,
+    .. math:: \min_\alpha \lVert B_0 + \sum_i \alpha_i B_i - S \rVert^2 + \sum_i \gamma_i (\alpha_i - \alpha_i^*)^2,
 
-    in turn, with falling :math:`\beta` and :math:`\gamma`. Vertices that the template leaves still in a shape stay
-    still. Separate parts of the head and contacts of lids and lips are held as in ``transfer_deformation``; how far
-    they part is learned from the examples as triangles are.
+    in turn, with falling :math:`\beta`: wrong weights are put right while the shapes are still the template's. Vertices
+    that the template leaves still in a shape stay still. Separate parts of the head and contacts of lids and lips are
+    held as in ``transfer_deformation``; how far they part is learned from the examples as triangles are. What no
+    example shows is learned for no shape: have every shape in one, apart from others that move the same skin.
 
     Args:
         template: N shapes, V vertices, millimetres.
@@ -171,6 +182,7 @@ class _Rigging:
         self.schedule = schedule
         self.transfer = ShapeTransfer(template, neutral, contact_weight)
         self.groups = self.transfer.groups()
+        self.followers = {group[0]: self.transfer.follower(group[0]) for group in self.groups}
         faces = self.transfer.faces
         self.prior = self.transfer.transfer()
         self.personal = torch.zeros_like(self.prior)
@@ -182,8 +194,21 @@ class _Rigging:
         self.prior_gradients = self._gradients(self.prior)
         self.example_gradients = self._gradients(self.offsets)
         self.compliance = self._compliance()
-        self.vertex_compliance = self._vertex_means(self.compliance)
+        self.vertex_compliance = self._vertex_means(self.compliance).T.contiguous()  # (V,N)
+        self.left = self._left_by_transfer()
         self.errors = [self.example_errors()]
+
+    def _left_by_transfer(self) -> float:
+        """The squared distance between an example and the transferred rig's nearest pose, square millimetres.
+
+        A person's own shapes are mostly stronger or weaker ones, which other weights of the transferred shapes fit
+        as well. How far weights may leave the given ones is therefore told by what no weights can fit.
+        """
+        least = _EXACT**2 * len(self.transfer.goal)
+        shapes, offsets = self.prior.flatten(1), self.offsets.flatten(1)
+        hessian = shapes @ shapes.T + least * torch.eye(len(shapes), dtype=torch.float64)
+        best = box_qp(hessian, -(offsets @ shapes.T), start=self.given)
+        return max(float((offsets - best @ shapes).square().sum(-1).mean()), least)
 
     def _gradients(self, displacements: Tensor) -> Tensor:
         """What displacements (K,V,3) add to the gradients of triangles, (K,F,9)."""
@@ -215,36 +240,35 @@ class _Rigging:
     def solve_shapes(self, beta: float) -> None:
         """Shapes at fixed weights: triangle by triangle what the examples say, then vertices that agree with it."""
         residuals = self.example_gradients - _combined(self.weights, self.prior_gradients)
-        missing = self.offsets - _combined(self.weights, self.prior)
+        missing = (self.offsets - _combined(self.weights, self.prior)).transpose(0, 1).flatten(1).numpy()
         shares = example_shares(residuals, self.weights, self.compliance / beta)
         used = (self.weights > 0).any(0)
-        for group in self.groups:  # a loop over factorisations
+        self.personal = torch.zeros_like(self.prior)
+        for group in self.groups:  # a loop over systems: shapes that move other vertices need another
             learning = [shape for shape in group if used[shape]]
             if not learning:
                 continue
             more = personal_part(shares, self.weights[:, learning], self.compliance[learning] / beta)
-            constraints = [
-                replace(held, values=self._offsets_between(held.matrix, learning, missing, beta))
-                for held in self.transfer.constraints(learning[0])
-            ]
-            self.personal[learning] = self.transfer.follow(learning, more.unflatten(-1, (3, 3)), constraints)
+            follower = self.followers[group[0]]
+            apart = [self._offsets_between(pairs, learning, missing, beta) for pairs in follower.matrices]
+            self.personal[learning] = follower.follow(more.unflatten(-1, (3, 3)), apart)
 
-    def _offsets_between(self, pairs: sparse.csr_array, shapes: list[int], missing: Tensor, beta: float) -> Tensor:
+    def _offsets_between(self, pairs: sparse.csr_array, shapes: list[int], missing: np.ndarray, beta: float) -> Tensor:
         """How vertices that are tied or in contact move apart beyond the transfer, (G,K,3).
 
         A gap is one more thing to fit, as free to change as the skin on its two sides.
         """
-        columns = missing.permute(1, 0, 2).flatten(1).numpy()
-        residuals = torch.from_numpy(pairs @ columns).view(-1, len(missing), 3).transpose(0, 1)
-        compliance = torch.from_numpy(0.5 * abs(pairs) @ self.vertex_compliance.T.numpy()).T / beta
+        residuals = torch.from_numpy(pairs @ missing).view(-1, len(self.given), 3).transpose(0, 1)
+        compliance = torch.from_numpy(0.5 * abs(pairs) @ self.vertex_compliance.numpy()).T / beta
         shares = example_shares(residuals, self.weights, compliance)
         return personal_part(shares, self.weights[:, shapes], compliance[shapes])
 
     def solve_weights(self, gamma: float) -> None:
         """Weights at fixed shapes: a quadratic program in [0,1] for each example."""
         shapes = (self.prior + self.personal).flatten(1)
-        hessian = shapes @ shapes.T + gamma * torch.eye(len(shapes), dtype=torch.float64)
-        self.weights = box_qp(hessian, -(self.offsets.flatten(1) @ shapes.T + gamma * self.given), start=self.weights)
+        hold = gamma * self.left * torch.where(self.given > 0, 1.0, self.schedule.unnamed)
+        pull = self.offsets.flatten(1) @ shapes.T + hold * self.given
+        self.weights = box_qp(shapes @ shapes.T + hold.diag_embed(), -pull, start=self.weights)
 
     def example_errors(self) -> Tensor:
         missing = self.offsets - _combined(self.weights, self.prior + self.personal)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.geometry.deformation import degenerate_triangles, triangle_frames
 from torchface.geometry.operators import vertex_normals
-from torchface.geometry.reconstruction import GradientReconstruction, SoftConstraints, offset_constraints
+from torchface.geometry.reconstruction import (
+    GradientReconstruction,
+    PreparedReconstruction,
+    SoftConstraints,
+    offset_constraints,
+)
 from torchface.mesh import Mesh
 from torchface.modeling.contact import ContactPairs
 from torchface.modeling.parts import PartLinks, part_links
@@ -82,28 +88,15 @@ class ShapeTransfer:
                 progress(done, len(moved))
         return moved
 
-    def constraints(self, shape: int) -> list[SoftConstraints]:
-        """What holds a shape's separate parts and its contacts beyond the transfer: offsets change by nothing more."""
+    def follower(self, shape: int) -> Follower:
+        """What lets this shape, and those that share its group, go further than the transfer took them."""
         below = self.seams.undoes.get(shape)
         pose = self.rest + self.deltas[shape] + (0 if below is None else self.deltas[below])
         asked = [*self._link_constraints(shape, self.goal), *self._contact_constraints(shape, pose, below)]
-        return [replace(constraint, values=torch.zeros_like(constraint.values)) for constraint in asked]
-
-    def follow(self, group: list[int], gradients: Tensor, constraints: Sequence[SoftConstraints]) -> Tensor:
-        """How far vertices go beyond their transferred places where gradients ask for more.
-
-        The transfer's energy is quadratic: what is added to its gradients adds to its solution. Pins stay.
-
-        Args:
-            group: shapes that share a factorisation, one of ``groups()`` or a part of it.
-            gradients: what is added to the target's gradients in each of them, (G,F,3,3), in the source's frame.
-            constraints: those of ``constraints(group[0])``, with other values (G,K,3) where offsets change too.
-
-        Returns:
-            Displacements (G,V,3), in the source's frame.
-        """
-        none = torch.zeros_like(self.deltas[group])
-        return self.reconstruction.solve(gradients, none, ~self.moving[group[0]], constraints)
+        return Follower(
+            [constraint.matrix for constraint in asked],
+            self.reconstruction.prepare(~self.moving[shape], asked),
+        )
 
     def rig(self, source: BlendshapeRig, target: Mesh, moved: Tensor) -> BlendshapeRig:
         """The target's rig with deltas (N,V,3) that were solved in the source's frame."""
@@ -167,6 +160,32 @@ class ShapeTransfer:
             constraints.append(offset_constraints(closing.pairs, offsets, weights, len(pose)))
         self.contacts[shape] = sum(len(constraint.values) for constraint in constraints)
         return constraints
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """How far vertices go beyond their transferred places where gradients ask for more.
+
+    The transfer's energy is quadratic: what is added to its gradients adds to its solution. Pins stay.
+
+    Args:
+        matrices: of ties and contacts, each (K,V): what they measure may change too.
+        system: factored once, for the rounds to come.
+    """
+
+    matrices: list[sparse.csr_array]
+    system: PreparedReconstruction
+
+    def follow(self, gradients: Tensor, values: Sequence[Tensor]) -> Tensor:
+        """Displacements (G,V,3) in the source's frame.
+
+        Args:
+            gradients: what is added to the target's gradients in G shapes of one group, (G,F,3,3), in the source's
+                frame.
+            values: how much each of the ``matrices`` measures more, (G,K,3), millimetres.
+        """
+        none = torch.zeros(len(gradients), self.system.vertex_count, 3, dtype=torch.float64)
+        return self.system.solve(gradients, none, values)
 
 
 @dataclass(frozen=True, eq=False)

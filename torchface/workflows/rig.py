@@ -24,6 +24,7 @@ from torchface.modeling import (
     rig_from_examples,
     transfer_with_report,
 )
+from torchface.modeling.example_rigging import RiggingSchedule
 from torchface.modeling.scanned_examples import seen_example
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
@@ -33,6 +34,8 @@ from torchface.workflows.register import in_place_of
 from torchface.workflows.skin import dressed_as, hidden_parts
 
 _FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
+# Registered scans are noisier than shapes are a person's own, and what they show is known roughly.
+_SCANNED = RiggingSchedule(beta=(0.5, 0.1), gamma=(25.0, 25.0))
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ class _Actor:
         if not used:
             raise AlignmentError(f"examples: none of {len(expressions)} could be used; {self.skipped[0]}")
         self.say(f"learning from {len(used)} examples")
-        rig = rig_from_examples(self.template, neutral, torch.stack(vertices), torch.stack(weights))
+        rig = rig_from_examples(self.template, neutral, torch.stack(vertices), torch.stack(weights), _SCANNED)
         return rig, tuple(used)
 
     def baked(self, actor: BlendshapeRig, fine: list[Expression]) -> dict[str, tuple[tuple[str, ...], NormalMap]]:
