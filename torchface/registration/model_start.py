@@ -17,7 +17,8 @@ from torchface.registration.correspondence import correspondences, evenly_spread
 
 _SAMPLES = 3000
 _REACHES = (30.0, 25.0, 20.0, 16.0, 13.0, 10.0, 8.0, 7.0, 6.0, 5.0, 5.0, 5.0, 5.0, 5.0)
-_CORRELATED = 10.0
+_CORRELATED = 20.0
+_OUTLYING, _LEAST_OUTLYING = 3.0, 0.5
 _LEAST_NOISE, _MOST_NOISE = 0.1, 5.0
 _LEAST_LANDMARK_NOISE = 1.5
 _LARGEST_COEFFICIENT = 4.0
@@ -109,8 +110,8 @@ def fit_to_scan(
         x = s R (\bar x + M a) + t
 
     The noise :math:`\nu` is what the last step has left (1.48 times the median), so that the coefficients come to
-    life as the surfaces meet. What a model cannot explain it misses by patches, not by vertices: however many
-    vertices there are, a square of :math:`\ell` = 10 mm counts once.
+    life as the surfaces meet; what lies off by several times as much, such as hair, counts little. What a model cannot
+    explain it misses by patches, not by vertices: however many there are, a square of :math:`\ell` = 20 mm counts once.
 
     Args:
         model: mean and modes.
@@ -140,11 +141,13 @@ def fit_to_scan(
         used = found.weights > 0
         if bool(used.any()):
             noise = min(max(1.4826 * float(left[used].abs().median()), _LEAST_NOISE), _MOST_NOISE)
+        # Hair and collars stand off the head: what misses by more than the rest counts little.
+        weights = found.weights * (1 + (left / max(_OUTLYING * noise, _LEAST_OUTLYING)).square()).pow(-2)
         share = area / _CORRELATED**2 / len(chosen) / noise**2
         centre = current.mean(0)
         rows = _jacobian(modes, current, chosen, pose, centre)  # (n,3,7+K)
         across = (found.normals[:, :, None] * rows).sum(1)
-        weighted = across * (share * found.weights)[:, None]
+        weighted = across * (share * weights)[:, None]
         matrix, downhill = weighted.T @ across, weighted.T @ left
         if len(ids):
             pull = _jacobian(modes, current, ids, pose, centre).flatten(0, 1)
