@@ -1,20 +1,23 @@
 """What a user installs: the wheel brings the command, the type marker and the zoo, and nothing of tests or recipes."""
 
+import json
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+pytestmark = [pytest.mark.wheel, pytest.mark.slow]
 
 
-@pytest.mark.wheel
-@pytest.mark.slow
-def test_wheel_holds_the_package_and_runs_alone(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
     built = subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, REPOSITORY],
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, REPOSITORY],
         capture_output=True,
         text=True,
         check=False,
@@ -22,23 +25,63 @@ def test_wheel_holds_the_package_and_runs_alone(tmp_path: Path) -> None:
     if built.returncode != 0 and "No matching distribution" in built.stderr:
         pytest.skip("the build backend cannot be installed here")
     assert built.returncode == 0, built.stderr
-    (wheel,) = tmp_path.glob("torchface-*.whl")
+    (found,) = folder.glob("torchface-*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an empty environment with the wheel in it; what torchface depends on is borrowed from here."""
+    folder = tmp_path_factory.mktemp("environment")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    python = folder / "bin" / "python"
+    subprocess.run(
+        [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel],
+        check=True,
+    )
+    asked = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    own = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    # A path in a .pth file is looked through after the environment's own, and its .pth files (an editable install's
+    # among them) are not read.
+    Path(own, "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return python
+
+
+def run(python: Path, code: str, folder: Path) -> str:
+    done = subprocess.run(
+        [python, "-I", "-c", code], capture_output=True, text=True, check=False, cwd=folder, env={"PATH": ""}
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
-        archive.extractall(tmp_path / "site")
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"torchface"}
     assert "torchface/py.typed" in names
     assert any(name.startswith("torchface/_models/") for name in names)
-    code = "import torchface, torchface.cli; print(torchface.__file__); torchface.cli.main(['--help'])"
-    ran = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(tmp_path / "site"), "PATH": ""},
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert str(tmp_path / "site") in ran.stdout
-    assert "transfer" in ran.stdout
+
+
+def test_the_command_runs(python: Path, tmp_path: Path) -> None:
+    shown = run(python, "import torchface.cli; print(torchface.__file__); torchface.cli.main(['--help'])", tmp_path)
+    assert str(python.parent.parent) in shown
+    assert "transfer" in shown
+
+
+def test_every_model_of_the_zoo_loads(wheel: Path, python: Path, tmp_path: Path) -> None:
+    code = """
+import json, torchface
+from torchface import zoo
+names = zoo.list_models()
+kinds = {name: type(zoo.get_model(name)).__name__ for name in names}
+print(json.dumps([torchface.__file__, kinds, [str(zoo.find(name)) for name in names]]))
+"""
+    file, kinds, folders = json.loads(run(python, code, tmp_path).splitlines()[-1])
+    assert str(python.parent.parent) in file
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {Path(name).parent.name for name in archive.namelist() if name.endswith("/model.toml")}
+    assert set(kinds) == packed
+    assert kinds["marker_solver"] == "MarkerSolver"
+    assert all("_models" in folder for folder in folders)
