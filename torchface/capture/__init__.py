@@ -7,6 +7,7 @@ from torchface.capture.markers import (
     MarkerSolver,
     WholeTakeSolver,
     align_take,
+    clean_take,
     fit_attachment,
     rest_residual,
 )
@@ -19,6 +20,7 @@ __all__ = [
     "WholeTakeSolver",
     "action_unit_curves",
     "align_take",
+    "clean_take",
     "fit_attachment",
     "rest_residual",
 ]

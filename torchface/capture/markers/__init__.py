@@ -1,6 +1,7 @@
 """Capture from 3D markers."""
 
 from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachment
+from torchface.capture.markers.cleanup import Cleanup, Defect, clean_take
 from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.observability import Observability, observability
@@ -11,6 +12,8 @@ from torchface.capture.markers.whole_take import WholeTakeSolver
 
 __all__ = [
     "AttachmentFit",
+    "Cleanup",
+    "Defect",
     "HelmetMotion",
     "HelmetSolver",
     "HybridSolver",
@@ -19,6 +22,7 @@ __all__ = [
     "SparsityTrial",
     "WholeTakeSolver",
     "align_take",
+    "clean_take",
     "fit_attachment",
     "gamma_curves",
     "observability",
