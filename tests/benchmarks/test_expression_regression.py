@@ -1,0 +1,96 @@
+"""The thesis's table 1 on embedded performers: expressions from the neutral face, against transfer and mean offset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.modeling import ExpressionRegression
+from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
+from torchface.rendering.shading import render
+from torchface.synthetic import draw_identities, performer
+from torchface.viz.faces import clay_colors, frame_face
+from train.expression_table import METHODS, People, compare, picture
+
+OUT = Path(__file__).resolve().parents[2] / "out" / "expression_regression"
+COUNT = 27
+TEN = ["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "mouthFrownLeft", "mouthFrownRight",
+       "browInnerUp", "cheekPuff", "eyeBlinkLeft", "eyeBlinkRight"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def ten() -> People:
+    """27 performers, ten expressions."""
+    identities = draw_identities(COUNT, torch.Generator().manual_seed(0))
+    rigs = [performer(identity, texture=False).select(TEN) for identity in identities]
+    return People(
+        tuple(f"performer {i}" for i in range(COUNT)),
+        rigs[0].neutral,
+        torch.stack([rig.vertices for rig in rigs]),
+        torch.stack([rig.deltas for rig in rigs]),
+        tuple(TEN),
+    )
+
+
+@pytest.fixture(scope="module")
+def smile(ten: People) -> People:
+    """The same 27, neutral and smile."""
+    both = ten.offsets[:, 2:4].sum(1, keepdim=True)
+    return People(ten.who, ten.template, ten.neutrals, both, ("smile",))
+
+
+def fit(people: People, form: str = "offsets") -> ExpressionRegression:
+    faces = people.neutrals[:, None] + people.offsets
+    return ExpressionRegression.fit(people.neutrals, faces, names=people.names, form=form)  # type: ignore[arg-type]
+
+
+def test_table_1_for_the_smile(smile: People) -> None:
+    found = compare(smile, fit, keep=3)
+    print(f"\n{COUNT} performers, neutral to smile, 14 to 13 components, each left out once\n{found}")
+    OUT.mkdir(parents=True, exist_ok=True)
+    save_picture(picture(smile, found), OUT / "figure_49.png")
+    assert found.counts[METHODS.index("regression")] >= 0.72 * COUNT
+    assert found.sums[2] <= 0.46 * found.sums[1]
+    assert found.sums[2] <= 0.43 * found.sums[0]
+
+
+def test_table_1_for_ten_expressions(ten: People) -> None:
+    found = compare(ten, fit)
+    print(f"\n{COUNT} performers, ten expressions at once\n{found}")
+    print(f"{'expression':20}" + "".join(f"{method:>22}" for method in METHODS))
+    for name, row in zip(ten.names, found.squared.sum(0).tolist(), strict=True):
+        print(f"{name:20}" + "".join(f"{value:22.0f}" for value in row))
+    assert found.counts[2] >= 0.72 * COUNT * len(TEN)
+    assert found.sums[2] <= 0.46 * found.sums[1]
+    assert found.sums[2] <= 0.43 * found.sums[0]
+
+
+def test_equation_31_leaks_identity(smile: People) -> None:
+    """How far vertices move that no smile moves, and figure 47."""
+    still = smile.offsets.abs().amax((0, 1, 3)) == 0
+    leaks: dict[str, list[float]] = {"offsets": [], "expressions": []}
+    rows = []
+    for i in range(COUNT):
+        rest, neutral = smile.without(i), smile.neutrals[i : i + 1]
+        for form, found in leaks.items():
+            offsets = fit(rest, form).offsets(neutral)[0, 0]
+            found.append(float(offsets[still].norm(dim=-1).mean()))
+            if i < 3:
+                face = smile.template.with_vertices(neutral[0] + offsets)
+                away = (offsets - smile.offsets[i, 0]).norm(dim=-1)
+                camera = frame_face(smile.template.with_vertices(neutral[0]), 20.0, width=300, height=360)
+                name = {"offsets": "equation 32", "expressions": "equation 31"}[form]
+                rows.append(caption(render(face, camera, heat_colors(away, 4.0), samples=2), f"{name}, red is 4 mm"))
+                rows.append(caption(render(face, camera, clay_colors(face), samples=2), name))
+        if i < 3:
+            truth = smile.template.with_vertices(neutral[0] + smile.offsets[i, 0])
+            rows.append(caption(render(truth, camera, clay_colors(truth), samples=2), "truth"))
+    OUT.mkdir(parents=True, exist_ok=True)
+    save_picture(sheet(rows, 5), OUT / "figure_47.png")
+    means = {form: sum(found) / COUNT for form, found in leaks.items()}
+    print(f"\nmean distance of what no smile moves: equation 31 {means['expressions']:.3f} mm, equation 32 "
+          f"{means['offsets']:.3f} mm")  # fmt: skip
+    assert means["offsets"] == 0
+    assert means["expressions"] > 0.3
