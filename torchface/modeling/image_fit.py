@@ -119,7 +119,7 @@ def fit_images(
     found = landmarks.detach().cpu().double()
     mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
     deltas = _in_place(rig, mean)
-    curves = _contour_curves(mean, model.faces.cpu(), vertices)
+    curves = contour_curves(mean, model.faces.cpu(), vertices)
     points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
     say("placing the cameras")
     pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
@@ -184,8 +184,8 @@ def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
     return similarity_transform(rest[None], mean[None]).apply_vectors(deltas).float()
 
 
-def _contour_curves(mean: Tensor, faces: Tensor, landmarks: Tensor) -> LevelCurves:
-    """Where contour landmarks slide: over the skin, but not over the nose."""
+def contour_curves(mean: Tensor, faces: Tensor, landmarks: Tensor) -> LevelCurves:
+    """Where the contour landmarks of a head (V,3) slide: over the skin, but not over the nose."""
     x, y = mean[:, 0].abs(), mean[:, 1]
     wing, top, bottom = float(x[landmarks[[31, 35]]].max()), float(y[landmarks[27]]), float(y[landmarks[33]])
     nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))

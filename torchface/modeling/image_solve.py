@@ -20,7 +20,7 @@ from torchface.modeling.landmark_view import (
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
-_ILL = 1.5
+_ILL, _SETTLED, _TRIAL = 1.5, 0.02, 5
 _LEAST_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 
 
@@ -191,12 +191,13 @@ def solve_either(problem: Problem, start: State) -> tuple[Problem, State]:
     if problem.settings.sliding is not None:
         return problem, solve(problem, start)
     sliding = replace(problem, settings=replace(problem.settings, sliding=True))
-    state = solve(sliding, start)
-    if _contour_error(sliding, state) < _ILL:
-        return sliding, state
-    fixed = replace(problem, settings=replace(problem.settings, sliding=False))
-    other = solve(fixed, start)
-    return (fixed, other) if _contour_error(fixed, other) < _contour_error(sliding, state) else (sliding, state)
+    state = solve(replace(sliding, settings=replace(sliding.settings, rounds=_TRIAL)), start)
+    if _contour_error(sliding, state) >= _ILL:
+        fixed = replace(problem, settings=replace(problem.settings, sliding=False))
+        other = solve(fixed, start)
+        if _contour_error(fixed, other) < _contour_error(sliding, state):
+            return fixed, other
+    return sliding, solve(sliding, state)
 
 
 def _contour_error(problem: Problem, state: State) -> float:
@@ -225,7 +226,7 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
     for _ in range(problem.settings.rounds):
         if problem.settings.sliding:
             rows = chosen_points(problem.points, state.coefficients, state.views)
-            state = State(state.coefficients, state.views, rows, state.noise)
+            state = replace(state, rows=rows)
         picked = problem.points.picked(state.rows)
         factors = whitening(problem, state, picked)
         at = linearised(picked, state.coefficients, state.views, problem.targets, factors)
@@ -238,9 +239,11 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
         before = energy(problem, state, picked, factors)
         moved, after = _searched(problem, state, picked, factors, normal, goal - x, before)
         state = moved
+        noise = state.noise
         if problem.settings.noise is None:
-            state = State(state.coefficients, state.views, state.rows, _noise(problem, state, picked, factors, normal))
-        if before - after < _DONE * max(abs(before), 1.0):
+            state = replace(state, noise=_noise(problem, state, picked, factors, normal))
+        # A falling noise changes what the energy weighs: there is more to come.
+        if before - after < _DONE * max(abs(before), 1.0) and abs(state.noise - noise) < _SETTLED * noise:
             break
     return state
 

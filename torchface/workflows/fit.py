@@ -21,13 +21,14 @@ from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, tra
 from torchface.modeling.landmark_view import LANDMARKS
 from torchface.rendering.compositing import save_picture
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.shading import render, sample_texture
+from torchface.rendering.shading import Lighting, render, sample_texture
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.rig import check_out
 from torchface.workflows.skin import dressed_as, hidden_parts
 
 _OVER, _MARGIN, _SHARE = 480, 0.45, 0.7
+_LIGHT = Lighting(occlusion_rays=0)
 _FOUND, _FIT = (0.1, 1.0, 0.2), (1.0, 0.1, 0.1)
 
 
@@ -215,7 +216,7 @@ def overlay(fit: ImageFit, view: int, image: Tensor, found: Tensor) -> Tensor:
     camera, place = _cut(fit.cameras[view], found)
     piece = _sampled(image, place)
     mesh = fit.posed
-    drawn = render(_clay(mesh), camera, samples=1)
+    drawn = render(_clay(mesh), camera, lighting=_LIGHT, samples=1)
     origins, directions = camera.rays()
     caster = RayCaster(mesh.vertices, mesh.faces)
     hit = (caster.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).triangle >= 0).view(_OVER, _OVER)

@@ -1,0 +1,126 @@
+"""A performer is photographed, and the command makes a rig of the pictures that looks as the performer does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import load_rig, save_rig, zoo
+from torchface.cli import main
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
+from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.camera import look_at
+from torchface.io.images import load_image, save_image
+from torchface.modeling import HeadModel, MorphableModel
+from torchface.rendering.shading import render
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.complexion import complexion_colors, draw_complexions
+from torchface.synthetic.identity import anatomy
+from torchface.workflows.fit import fit_photographs, landmarks_of, matching_template
+
+YAWS = (-35.0, 0.0, 35.0)
+SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
+
+
+@pytest.fixture(scope="module")
+def actor() -> BlendshapeRig:
+    return performer(draw_identities(1, torch.Generator().manual_seed(9))[0])
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory, actor: BlendshapeRig) -> Path:
+    """A folder with a head model, three photographs of a smile and their landmarks."""
+    folder = tmp_path_factory.mktemp("studio")
+    generator = torch.Generator().manual_seed(0)
+    heads = torch.stack([anatomy(who).vertices for who in draw_identities(60, generator)]).float()
+    colors = complexion_colors(draw_complexions(30, generator))
+    model = HeadModel.on(actor.neutral, MorphableModel.fit(heads, 15), MorphableModel.fit(colors, 4))
+    zoo.save_model(model, folder / "heads", licence="MIT", data="performers", metrics={}, recipe="none")
+    save_rig(performer().select(SHAPES), folder / "template.glb")
+    weights = torch.zeros(1, len(actor.names))
+    weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
+    smiling = actor.neutral.with_vertices(actor(weights)[0])
+    for i, yaw in enumerate(YAWS):
+        camera = look_at(smiling.vertices[smiling.landmarks].mean(0), yaw, span=320.0, width=240, height=300)
+        save_image(render(smiling, camera, background=(0.2, 0.3, 0.6), samples=1), folder / f"p{i}.png")
+        marks = camera.project(smiling.vertices[smiling.landmarks].double()) + 1
+        rows = "\n".join(f"{x:.3f} {y:.3f}" for x, y in marks.tolist())
+        (folder / f"p{i}.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
+    return folder
+
+
+def aligned_error(found: Tensor, true: Tensor) -> float:
+    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
+    return float((moved - true.double()).norm(dim=-1).mean())
+
+
+def test_the_command_makes_the_actors_rig(
+    studio: Path, actor: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rig.glb"
+    photographs = [str(studio / f"p{i}.png") for i in range(3)]
+    marks = [str(studio / f"p{i}.pts") for i in range(3)]
+    rest = ["--model", str(studio / "heads"), "--template", str(studio / "template.glb"), "--out", str(out)]
+    main(["fit", *photographs, "--landmarks", *marks, *rest, "--texture-size", "256", "--quiet"])
+    printed = capsys.readouterr()
+    assert str(out) in printed.out
+    assert "mouthSmile" in printed.err
+    made = load_rig(out)
+    assert list(made.names) == SHAPES
+    assert made.neutral.annotations is not None
+    assert actor.neutral.annotations is not None
+    skin = actor.neutral.annotations.regions["face"]
+    mean = performer(texture=False)
+    assert aligned_error(made.vertices[skin], actor.vertices[skin]) < 0.6 * aligned_error(
+        mean.vertices[skin], actor.vertices[skin]
+    )
+    assert made.neutral.texture is not None
+    assert made.neutral.texture.shape == (3, 256, 256)
+    blue = made.neutral.texture[2] > made.neutral.texture[0] + 0.15
+    assert float(blue.float().mean()) < 0.01  # none of the background
+    for i in range(3):
+        assert load_image(tmp_path / f"rig_{i + 1}_p{i}.png").shape == (3, 480, 1440)
+
+
+def dlib_xml(path: Path, faces: list[tuple[str, int]]) -> Path:
+    boxes = "".join(
+        f"<image file='{name}'><box top='1' left='{k}' width='9' height='9'>"
+        + "".join(f"<part name='{n:02d}' x='{n + k}' y='{2 * n}'/>" for n in range(count))
+        + "</box></image>"
+        for k, (name, count) in enumerate(faces)
+    )
+    path.write_text(f"<dataset><images>{boxes}</images></dataset>")
+    return path
+
+
+def test_an_xml_tells_whose_face_is_meant(tmp_path: Path) -> None:
+    photographs = [Path("a.png"), Path("b.png")]
+    file = dlib_xml(tmp_path / "faces.xml", [("x/a.png", 68), ("b.png", 68), ("b.png", 68), ("c.png", 5)])
+    with pytest.raises(NameMismatchError, match=r"found 2 faces in b\.png, choose one of --face 0: at \(1, 1\), 1: at"):
+        landmarks_of(photographs, [file])
+    with pytest.raises(NameMismatchError, match=r"found 1 faces in a\.png, expected more than 1"):
+        landmarks_of(photographs, [file], face=1)
+    first, second = landmarks_of(photographs, [file], face=0)
+    assert (float(first[0, 0]), float(second[0, 0])) == (0.0, 1.0)
+    with pytest.raises(NameMismatchError, match=r"found no face in d\.png"):
+        landmarks_of([Path("d.png")], [file])
+    with pytest.raises(ShapeError, match=r"found 5 landmarks in c\.png, expected 68"):
+        landmarks_of([Path("c.png")], [file])
+
+
+def test_files_that_do_not_belong_together_are_named(studio: Path, tmp_path: Path, dome_rig: BlendshapeRig) -> None:
+    photographs = [studio / f"p{i}.png" for i in range(3)]
+    with pytest.raises(NameMismatchError, match="found 1 files for 3 photographs"):
+        landmarks_of(photographs, [studio / "p0.pts"])
+    (tmp_path / "space.pts").write_text("version: 1\nn_points: 68\n{\n" + "1 2 3\n" * 68 + "}\n")
+    with pytest.raises(FileFormatError, match="three numbers each"):
+        landmarks_of(photographs[:1], [tmp_path / "space.pts"])
+    with pytest.raises(FileFormatError, match=r"expected \.glb"):
+        fit_photographs(photographs, [], studio / "heads", tmp_path / "rig.obj")
+    dome = HeadModel.on(dome_rig.neutral, MorphableModel(dome_rig.vertices, dome_rig.deltas[:1], torch.ones(1)))
+    with pytest.raises(TopologyError, match="name a rig with --template"):
+        matching_template(dome, None)
