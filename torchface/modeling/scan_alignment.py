@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.alignment import Similarity, similarity_transform
-from torchface.geometry.operators import border_vertices, triangle_areas, triangle_normals, vertex_normals
+from torchface.geometry.operators import border_vertices, triangle_areas, vertex_normals
 from torchface.mesh import Mesh
 
 Correspondences = tuple[Tensor, Tensor]
@@ -147,14 +147,12 @@ class _Samples:
 
 
 def _samples(mesh: Mesh, count: int) -> _Samples:
-    """Points spread evenly by area, with their triangle's normal."""
+    """Vertices drawn evenly by area: they lie on the skin, which bulges out of the triangles between them."""
     vertices = mesh.vertices.double()
-    generator = torch.Generator().manual_seed(_SEED)
-    triangle = torch.multinomial(triangle_areas(vertices, mesh.faces), count, True, generator=generator)
-    u, v = torch.rand(2, count, 1, generator=generator, dtype=torch.float64)
-    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
-    a, b, c = vertices[mesh.faces[triangle]].unbind(1)
-    return _Samples(a + u * (b - a) + v * (c - a), triangle_normals(vertices, mesh.faces)[triangle])
+    areas = torch.zeros(len(vertices), dtype=torch.float64)
+    areas.index_add_(0, mesh.faces.flatten(), triangle_areas(vertices, mesh.faces).repeat_interleave(3))
+    chosen = torch.multinomial(areas, count, True, generator=torch.Generator().manual_seed(_SEED))
+    return _Samples(vertices[chosen], vertex_normals(vertices, mesh.faces)[chosen])
 
 
 @dataclass(frozen=True, eq=False)
