@@ -13,7 +13,7 @@ from torchface.geometry.rotations import cross_matrix, rotation_matrix
 _FEWEST = 4
 _NEAREST = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
 _FLAT = 1e-2  # relative; points that extend less in their third direction are flat for the start
-_START_ROUNDS, _ROUNDS, _DONE = 10, 60, 1e-10
+_START_ROUNDS, _ROUNDS, _DONE = 5, 60, 1e-10
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from torchface.modeling.landmark_view import (
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
-_ILL, _SETTLED, _TRIAL = 1.5, 0.02, 5
+_ILL, _SETTLED, _TRIAL = 1.5, 0.02, 3
 _LEAST_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 
 
