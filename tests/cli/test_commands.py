@@ -170,3 +170,43 @@ def test_an_error_leaves_no_spinner_behind(monkeypatch: pytest.MonkeyPatch) -> N
     last = screen.getvalue().split("\x1b[2K")[-1]
     assert "done with" in last
     assert "at this" not in last
+
+
+def test_solve_cleans_a_slipping_take_and_reports_it(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    attachment = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(240)[:, None] / 9 + torch.arange(4))
+    flaws = StageFlaws(noise=0.05, missing=0.02, slip_translation=6, slip_rotation=3)
+    recording = record(dome_rig, attachment, weights, torch.Generator().manual_seed(0), flaws)
+    assert recording.take.markers is not None
+    values = recording.take.markers.values.clone()
+    values[100:130, [3, 20]] = values[100:130, [20, 3]]
+    save_take(Take(60.0, markers=Track(recording.take.markers.names, values)), shoot / "dirty.c3d")
+    out, page = shoot / "weights.csv", shoot / "report"
+    common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
+    run("solve", shoot / "rig.glb", shoot / "dirty.c3d", *common, "--slip", "--clean", "--whole", "--report", page)
+    told = capsys.readouterr().err
+    assert "helmet: moved by up to" in told
+    assert "swap M004 ↔ M021 100–129" in told
+    html = (page / "index.html").read_text()
+    assert "M004 ↔ M021" in html
+    assert {path.name for path in page.glob("*.png")} >= {"error.png", "helmet.png", "weights1.png"}
+    written = load_take(out).weights
+    assert written is not None
+    assert float((dome_rig.weights_from(written).float() - weights).abs().mean()) < 0.05
+
+
+def test_solve_aligns_a_take_without_a_neutral_frame(shoot: Path, dome_rig: BlendshapeRig) -> None:
+    take = load_take(shoot / "take.c3d")
+    assert take.markers is not None
+    space = Similarity(torch.tensor([1.0]), torch.eye(3)[None], torch.tensor([[100.0, -900, 40]]))
+    moved = Track(take.markers.names, space.apply(take.markers.values))
+    save_take(Take(take.fps, markers=moved), shoot / "moved.c3d")
+    out = shoot / "weights.csv"
+    common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
+    run("solve", shoot / "rig.glb", shoot / "moved.c3d", *common, "--align", "--keep-rest")
+    written = load_take(out).weights
+    assert written is not None
+    true = torch.load(shoot / "true.pt", weights_only=True)
+    assert float((dome_rig.weights_from(written).float() - true).abs().mean()) < 0.05

@@ -16,7 +16,13 @@ def solve(
     attachment: Path,
     out: Path = Path("out/weights.csv"),
     animation: Path | None = None,
-    neutral_frame: int | None = None,
+    neutral: Annotated[int | None, arg(aliases=["--neutral-frame"])] = None,
+    align: bool = False,
+    keep_rest: bool = False,
+    slip: bool = False,
+    clean: bool = False,
+    whole: bool = False,
+    report: Path | None = None,
     sparsity: float | None = None,
     ridge: float | None = None,
     part: str | None = None,
@@ -30,17 +36,24 @@ def solve(
         attachment: Where the markers sit on the rig, as JSON; markers match by label.
         out: The weights to write: Live Link Face CSV.
         animation: Also write the rig with this animation as .glb.
-        neutral_frame: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation,
-            scale). Without it the markers are taken to be in the rig's space.
+        neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
+        align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
+        keep_rest: Do not subtract what is left at rest between a moved take and the rig.
+        slip: The helmet moves on the head: find its motion, and keep it out of the weights.
+        clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
+        whole: Solve the whole take at once: smooth curves, gaps bridged; fast motion keeps its height.
+        report: A folder for a page with every curve and a table of what was wrong with the take.
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface.workflows.solve import solve_take
+    from torchface.workflows.solve import SolveSettings, solve_take
 
+    terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
+    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, whole, **terms)
     with steps(quiet) as step:
-        report = solve_take(rig, take, attachment, out, animation, neutral_frame, sparsity, ridge, part, step)
-    for line in report.lines():
+        done = solve_take(rig, take, attachment, out, animation, settings, part, report, step)
+    for line in done.lines():
         console.print(line)
     print(out)

@@ -4,21 +4,77 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture import MarkerSolver
+from torchface.capture import (
+    HelmetSolver,
+    MarkerSolver,
+    WholeTakeSolver,
+    align_take,
+    clean_take,
+    rest_residual,
+)
+from torchface.capture.markers import Cleanup, HelmetMotion
+from torchface.capture.markers.solve import RIDGE, SPARSITY
 from torchface.errors import ValueRangeError
 from torchface.evaluation import marker_rmse
-from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, load_take, save_animation
 from torchface.io.live_link import save_live_link
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, require_seen
+
+_SHOWN_DEFECTS = 12
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How a take is solved.
+
+    Args:
+        neutral: a frame with the face at rest, which lays the take on the rig; whole take if absent and ``align``.
+        align: lay the take on the rig; otherwise its markers are in the rig's space already, unless ``neutral`` says.
+        subtract_rest: subtract what is left at rest between markers and sites, where the take is laid on the rig.
+        slip: the helmet moves on the head.
+        clean: find and repair swapped labels, spikes and markers that drift or fell off.
+        whole: weights of the whole take at once, smooth over time.
+        sparsity, ridge: see ``MarkerSolver``.
+    """
+
+    neutral: int | None = None
+    align: bool = False
+    subtract_rest: bool = True
+    slip: bool = False
+    clean: bool = False
+    whole: bool = False
+    sparsity: float = SPARSITY
+    ridge: float = RIDGE
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What came of a take's markers.
+
+    Args:
+        take: with the solved weights.
+        markers: as the solve used them, (T,M,3), in rig space, without slip, bad samples NaN.
+        attachment: the sites, with what was subtracted at rest; of the take's markers.
+        alignment: marker space to rig space, where one was estimated.
+        motion: the helmet's, where it was asked for.
+        cleanup: what was wrong with the take, where that was asked for.
+    """
+
+    take: Take
+    markers: Tensor
+    attachment: Attachment
+    alignment: Similarity | None
+    motion: HelmetMotion | None
+    cleanup: Cleanup | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +87,8 @@ class SolveReport:
         seen: share of marker samples that were seen.
         alignment: the similarity from marker space to rig space, where one was estimated.
         seconds: what the solve itself took.
+        motion: the helmet's, where it was asked for.
+        cleanup: what was wrong with the take, where that was asked for.
     """
 
     take: Take
@@ -38,6 +96,8 @@ class SolveReport:
     seen: float
     alignment: Similarity | None
     seconds: float
+    motion: HelmetMotion | None = None
+    cleanup: Cleanup | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -55,32 +115,85 @@ class SolveReport:
                 f"alignment: scale {float(self.alignment.scale[0]):.4f}, moved by "
                 f"({moved[0]:.1f}, {moved[1]:.1f}, {moved[2]:.1f}) mm",
             )
+        if self.motion is not None:
+            slid = float(self.motion.translation.norm(dim=1).max())
+            turned = float(self.motion.degrees().norm(dim=1).max())
+            lines.append(f"helmet: moved by up to {slid:.1f} mm and {turned:.1f} degrees; not in the weights")
+        if self.cleanup is not None:
+            lines.append(f"cleanup: {self.cleanup.summary()}")
+            rows = self.cleanup.table(gaps=False)
+            lines.extend(f"  {' '.join(cell for cell in row if cell)}" for row in rows[:_SHOWN_DEFECTS])
+            if len(rows) > _SHOWN_DEFECTS:
+                lines.append(f"  and {len(rows) - _SHOWN_DEFECTS} more; the report (--report DIR) lists all")
         return lines
 
 
-def align_by_frame(rig: BlendshapeRig, attachment: Attachment, markers: Track, frame: int) -> Similarity:
-    """The similarity that moves a frame with the face at rest onto the rig's neutral; one for the whole take.
+def solve_markers(
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    take: Take,
+    settings: SolveSettings = SolveSettings(),
+    progress: Callable[[str], None] | None = None,
+) -> Solution:
+    """A take's weights: laid on the rig, cleaned, freed of slip and of what is left at rest, solved.
 
     Args:
         rig: the performer's.
         attachment: where the markers sit; markers match by label.
-        markers: values (T,M,3), millimetres.
-        frame: which one.
+        take: markers, in any space.
+        settings: which of these steps.
+        progress: told what begins.
 
     Raises:
-        ValueRangeError: no such frame.
-        ShapeError: fewer than three markers are seen in it.
-
-    Source: thesis 4.1.2.
+        TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
-    if not 0 <= frame < len(markers):
-        raise ValueRangeError(
-            f"neutral frame: found a take of {len(markers)} frames, expected frame {frame} among them"
-        )
-    labels = tuple(label for label in attachment.labels or () if label in markers.names)
-    here = attachment.select(labels)
-    at_rest = here.on(rig.neutral.faces, rig.vertices)
-    return similarity_transform(markers.select(labels).values[frame : frame + 1].to(at_rest), at_rest[None])
+    say = progress or (lambda line: None)
+    alignment = None
+    if settings.align or settings.neutral is not None:
+        say("laying the take on the rig")
+        alignment = align_take(rig, attachment, take, settings.neutral)
+    terms = {"sparsity": settings.sparsity, "ridge": settings.ridge}
+    cleanup = None
+    if settings.clean:
+        say("looking for what is wrong with the take")
+        cleanup = clean_take(MarkerSolver(rig, attachment, alignment, **terms), take, settings.slip)
+        take = cleanup.take
+    if not settings.whole:
+        require_seen(take)
+    say("solving")
+    motion = None
+    steady, space = take, alignment
+    assert take.markers is not None
+    if settings.slip:
+        steady, motion = _without_slip(rig, attachment, alignment, settings, take)
+        space = None
+    if settings.subtract_rest and alignment is not None:
+        attachment = rest_residual(rig, attachment, steady, space)
+        if settings.slip:
+            steady, motion = _without_slip(rig, attachment, alignment, settings, take)
+    solver = MarkerSolver(rig, attachment, space, **terms)
+    solved = WholeTakeSolver(solver).solve_take(steady) if settings.whole else solver.solve_take(steady)
+    labels = tuple(label for label in attachment.labels or () if label in take.markers.names)
+    assert steady.markers is not None
+    markers = steady.markers.select(labels).values
+    if space is not None:
+        markers = space.apply(markers)
+    return Solution(
+        replace(take, weights=solved.weights), markers, attachment.select(labels), alignment, motion, cleanup
+    )
+
+
+def _without_slip(
+    rig: BlendshapeRig, attachment: Attachment, alignment: Similarity | None, settings: SolveSettings, take: Take
+) -> tuple[Take, HelmetMotion]:
+    """The take in rig space as a steady helmet would have seen it, and the helmet's motion."""
+    require_seen(take)
+    _, motion = HelmetSolver(rig, attachment, alignment, settings.sparsity, settings.ridge).solve_take(take)
+    assert take.markers is not None
+    values = take.markers.values.double()
+    if alignment is not None:
+        values = alignment.apply(values)
+    return replace(take, markers=Track(take.markers.names, motion.undo(values).to(take.markers.values))), motion
 
 
 def solve_take(
@@ -89,10 +202,9 @@ def solve_take(
     attachment: Path,
     out: Path,
     animation: Path | None = None,
-    neutral_frame: int | None = None,
-    sparsity: float | None = None,
-    ridge: float | None = None,
+    settings: SolveSettings = SolveSettings(),
     part: str | None = None,
+    report: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
@@ -105,19 +217,15 @@ def solve_take(
     say("reading the rig")
     loaded = load_rig(rig, part=part)
     where = Attachment.load(attachment)
-    where.check(loaded.neutral, attachment, rig)
+    where.check(loaded.neutral)
     say("reading the take")
     played = load_take(take)
     if played.markers is None:
         raise ValueRangeError(f"{take}: found no markers, expected a marker take (.c3d, .trc, .csv)")
-    require_seen(played)
-    alignment = None if neutral_frame is None else align_by_frame(loaded, where, played.markers, neutral_frame)
-    terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
-    solver = MarkerSolver(loaded, where, alignment, **terms)
-    say("solving")
     started = time.perf_counter()
-    solved = solver.solve_take(played)
+    solution = solve_markers(loaded, where, played, settings, say)
     seconds = time.perf_counter() - started
+    solved = solution.take
     assert solved.weights is not None
     say("writing")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -125,9 +233,21 @@ def solve_take(
     if animation is not None:
         animation.parent.mkdir(parents=True, exist_ok=True)
         save_animation(loaded, solved, animation)
-    labels = tuple(label for label in where.labels or () if label in played.markers.names)
-    markers = played.markers.select(labels).values
-    if alignment is not None:
-        markers = alignment.apply(markers)
-    rmse = marker_rmse(loaded, where.select(labels), solved.weights.values[..., 0], markers)
-    return SolveReport(solved, rmse, float(torch.isfinite(markers).all(-1).float().mean()), alignment, seconds)
+    sites = solution.attachment
+    offset = torch.zeros(len(sites.triangles), 3) if sites.residual is None else sites.residual
+    rmse = marker_rmse(loaded, sites, solved.weights.values[..., 0], solution.markers - offset.to(solution.markers))
+    done = SolveReport(
+        solved,
+        rmse,
+        float(torch.isfinite(solution.markers).all(-1).float().mean()),
+        solution.alignment,
+        seconds,
+        solution.motion,
+        solution.cleanup,
+    )
+    if report is not None:
+        say("writing the report")
+        from torchface.workflows.solve_page import write_solve_page
+
+        write_solve_page(report, take.name, done)
+    return done
