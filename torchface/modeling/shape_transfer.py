@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.contact import ContactPairs
 from torchface.geometry.deformation import degenerate_triangles, triangle_frames
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.reconstruction import (
@@ -20,7 +21,6 @@ from torchface.geometry.reconstruction import (
     offset_constraints,
 )
 from torchface.mesh import Mesh
-from torchface.modeling.contact import ContactPairs
 from torchface.modeling.parts import PartLinks, part_links
 from torchface.modeling.seams import Seams, find_seams
 from torchface.rig import BlendshapeRig
