@@ -21,6 +21,7 @@ _SQUARELY = 0.2
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _MOST_GAIN = 4.0
+_DARK, _MOST_TONE = 0.05, 0.5
 _NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
 
 
@@ -205,15 +206,15 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     if mirror is not None:
         there = alpha[mirror.cpu()]
         other = colors[mirror.cpu()]
-        tone = graph.smoothed(colors - other, alpha * there, _BROAD)
-        guess = guess + ((1 - alpha) * there)[:, None] * (other + tone)
+        other = _toned(other, colors, alpha * there, graph, _BROAD)
+        guess = guess + ((1 - alpha) * there)[:, None] * other
         known = known + (1 - alpha) * there
     if base is not None:
         under = base.detach().cpu().double()
         # The tone at the edge of what is known counts, not that of the face as a whole.
         edge = graph.smoothed(1 - known[:, None], torch.ones_like(known), _FEATHER)[:, 0]
-        tone = graph.smoothed(guess / known.clamp(min=1e-9)[:, None] - under, known * (edge + 1e-3), _FILL)
-        return guess + (1 - known)[:, None] * (under + tone)
+        told = guess / known.clamp(min=1e-9)[:, None]
+        return guess + (1 - known)[:, None] * _toned(under, told, known * (edge + 1e-3), graph, _FILL)
     mean = (guess * alpha[:, None]).sum(0) / alpha.sum()
     label = components(mesh.faces.cpu(), len(alpha))
     shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
@@ -223,3 +224,9 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known
         guess = torch.where(fixed, guess, graph.sum(guess) / graph.degree[:, None])
     return guess
+
+
+def _toned(colors: Tensor, goal: Tensor, weights: Tensor, graph: _Graph, rounds: int) -> Tensor:
+    """Colours (V,3) times what makes them as bright as a goal where weights (V,) compare them, carried on beyond."""
+    ratio = goal.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()
+    return colors * graph.smoothed(ratio, weights, rounds).clamp(-_MOST_TONE, _MOST_TONE).exp()
