@@ -206,7 +206,8 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     if mirror is not None:
         there = alpha[mirror.cpu()]
         other = colors[mirror.cpu()]
-        other = _toned(other, colors, alpha * there, graph, _BROAD)
+        # The other side stands in other light, in one factor: channels apart would tint what is dark.
+        other = _toned(other, colors, alpha * there, graph, _BROAD, apart=False)
         guess = guess + ((1 - alpha) * there)[:, None] * other
         known = known + (1 - alpha) * there
     if base is not None:
@@ -226,7 +227,8 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     return guess
 
 
-def _toned(colors: Tensor, goal: Tensor, weights: Tensor, graph: _Graph, rounds: int) -> Tensor:
+def _toned(colors: Tensor, goal: Tensor, weights: Tensor, graph: _Graph, rounds: int, apart: bool = True) -> Tensor:
     """Colours (V,3) times what makes them as bright as a goal where weights (V,) compare them, carried on beyond."""
     ratio = goal.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()
+    ratio = ratio if apart else ratio.mean(-1, keepdim=True)
     return colors * graph.smoothed(ratio, weights, rounds).clamp(-_MOST_TONE, _MOST_TONE).exp()
