@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
+from torchface.capture.markers.initial_sites import sites_by_shape
 from torchface.capture.markers.sites import PathMoments, best_sites
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
@@ -135,3 +136,19 @@ def test_bad_takes_say_what_is_wrong(performance: Performance) -> None:
         fit_attachment(rig, Take(60.0), replace(attachment, fingerprint="another"))
     with pytest.raises(ValueRangeError, match="expected frame 30 among them"):
         align_take(rig, attachment, Take(60.0, markers=Track(labels, still)), neutral_frame=30)
+
+
+def test_the_first_guess_is_found_by_shape(performance: Performance, stage_space: Similarity) -> None:
+    rig, attachment, _ = performance
+    take = filmed(performance, 1, stage_space)
+    guess = sites_by_shape(rig, take)
+    assert guess.labels == attachment.labels
+    assert site_distances(rig, guess, attachment).median() < 4.0
+    assert site_distances(rig, guess, attachment).max() < 10.0
+    assert take.markers is not None
+    few = Take(60.0, markers=take.markers.select(take.markers.names[:8]))
+    with pytest.raises(ValueRangeError, match="found 8, expected at least 12"):
+        sites_by_shape(rig, few)
+    small = Take(60.0, markers=Track(take.markers.names, 0.1 * take.markers.values))
+    with pytest.raises(AlignmentError, match="is the take's unit right"):
+        sites_by_shape(rig, small)

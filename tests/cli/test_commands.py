@@ -7,15 +7,19 @@ import pytest
 import torch
 from rich.console import Console
 
+from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver
 from torchface.cli import COMMANDS, main, progress
 from torchface.cli.export import EXPORTS
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, load_take, save_mesh, save_rig, save_take
+from torchface.io.picks import LandmarkVertices, save_landmarks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.synthetic.marker_sites import misplaced, site_distances
 from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
+from torchface.workflows.attach import load_sites
 
 
 @pytest.fixture
@@ -210,3 +214,42 @@ def test_solve_aligns_a_take_without_a_neutral_frame(shoot: Path, dome_rig: Blen
     assert written is not None
     true = torch.load(shoot / "true.pt", weights_only=True)
     assert float((dome_rig.weights_from(written).float() - true).abs().mean()) < 0.05
+
+
+def test_attach_finds_the_sites_and_draws_them(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    true = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(300)[:, None] * torch.tensor([0.05, 0.11, 0.17, 0.23]))
+    recording = record(dome_rig, true, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.05))
+    save_take(recording.take, shoot / "rom.c3d")
+    guess = misplaced(dome_rig, true, torch.Generator().manual_seed(1), 2.0, 5.0)
+    guess.save(shoot / "guess.json")
+    out, picture = shoot / "sites.json", shoot / "sites.png"
+    run("attach", shoot / "rig.glb", shoot / "rom.c3d", "--initial", shoot / "guess.json", "--out", out)
+    run(
+        "attach",
+        shoot / "rig.glb",
+        shoot / "rom.c3d",
+        "--initial",
+        shoot / "guess.json",
+        "--picture",
+        picture,
+        "--out",
+        shoot / "again.json",
+    )
+    found = Attachment.load(out)
+    off = site_distances(dome_rig, found, true)
+    assert off.mean() < 0.35 * site_distances(dome_rig, guess, true).mean()
+    assert picture.stat().st_size > 10_000
+    assert "30 markers over 300 frames" in capsys.readouterr().err
+    # Labelled vertices, as picked, do as well as an attachment.
+    ids = torch.cdist(guess.on(dome_rig.neutral.faces, dome_rig.vertices), dome_rig.vertices).argmin(1)
+    save_landmarks(LandmarkVertices(ids, guess.labels or (), dome_rig.neutral.fingerprint()), shoot / "picks.json")
+    assert torch.equal(
+        load_sites(shoot / "picks.json", dome_rig.neutral).on(dome_rig.neutral.faces, dome_rig.vertices),
+        dome_rig.vertices[ids],
+    )
+    with pytest.raises(SystemExit):
+        run("attach", shoot / "rig.glb", shoot / "rom.c3d", "--initial", shoot / "rom.c3d")
+    assert "rom.c3d: " in capsys.readouterr().err

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from torchface.cli.attach import attach
 from torchface.cli.demo import demo
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
@@ -38,6 +39,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "rig": rig,
     "fit": fit,
     "transfer": transfer,
+    "attach": attach,
     "solve": solve,
     "retarget": retarget,
     "render": render,

@@ -217,7 +217,7 @@ def solve_take(
     say("reading the rig")
     loaded = load_rig(rig, part=part)
     where = Attachment.load(attachment)
-    where.check(loaded.neutral)
+    where.check(loaded.neutral, attachment, rig)
     say("reading the take")
     played = load_take(take)
     if played.markers is None:

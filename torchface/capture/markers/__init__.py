@@ -4,6 +4,7 @@ from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachme
 from torchface.capture.markers.cleanup import Cleanup, Defect, clean_take
 from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
+from torchface.capture.markers.initial_sites import sites_by_shape
 from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
@@ -27,6 +28,7 @@ __all__ = [
     "gamma_curves",
     "observability",
     "rest_residual",
+    "sites_by_shape",
     "sparsity_by_rule",
     "sparsity_experiment",
 ]
