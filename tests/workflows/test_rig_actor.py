@@ -11,12 +11,14 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from torchface import zoo
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
 from torchface.geometry.alignment import similarity_transform
 from torchface.io import load_detail_maps, load_rig, save_mesh, save_rig
 from torchface.io.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
+from torchface.modeling import MorphableModel
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head import head
 from torchface.workflows.rig import RigOptions, rig_actor
@@ -103,6 +105,27 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     assert maps.names == ("jawOpen",)
     assert maps.maps.shape == (1, 3, 64, 64)
     assert maps.neutral is not None
+
+
+def test_a_model_of_heads_holds_the_sliding(actor: Actor, tmp_path: Path) -> None:
+    template = load_rig(actor.folder / "template.glb")
+    to_actor = actor.true.vertices - template.vertices
+    people = torch.linspace(-1.5, 1.5, 5)[:, None, None] * to_actor + template.vertices
+    model = MorphableModel.fit(people, 1)
+    zoo.save_model(model, tmp_path / "people", licence="MIT", data="planted", metrics={}, recipe="none")
+    files = (
+        actor.folder / "neutral.ply",
+        actor.folder / "template.glb",
+        tmp_path / "a.glb",
+        actor.folder / "neutral.json",
+    )
+    plain, held = (
+        inner_error(rig_actor(*files, options=RigOptions(model=name)).rig, actor.true)[0]
+        for name in (None, tmp_path / "people")
+    )
+    assert held < 0.6 * plain
+    with pytest.raises(ValueRangeError, match="beside a model of heads at rest"):
+        rig_actor(*files, options=RigOptions(model=tmp_path / "people", pose={"jawOpen": 1.0}))
 
 
 def test_a_neutral_scanned_in_a_pose_is_brought_back_to_rest(actor: Actor, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ def rig(
     part: str | None = None,
     unit: str | None = None,
     detector: Path | None = None,
+    model: str | None = None,
     texture_size: int = 2048,
     detail_size: int = 2048,
     quiet: bool = False,
@@ -47,6 +48,8 @@ def rig(
         part: Keep this region of the template only, such as face.
         unit: Unit of all scans (mm, cm, m) where it is not the format's own.
         detector: Folder of a landmark detector for scans without landmarks.
+        model: Model of heads in the template's topology, by name or folder, from which the neutral's registration
+            starts; see `python -m train.morphable`.
         texture_size: Texels a side of the rig's texture; 0 makes none.
         detail_size: Texels a side of each normal map.
         quiet: Show no progress.
@@ -54,7 +57,7 @@ def rig(
     from torchface.workflows.pose import pose_weights
     from torchface.workflows.rig import RigOptions, rig_actor
 
-    options = RigOptions(part, unit, pose_weights(pose), detector, texture_size, detail_size)
+    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size)
     with steps(quiet) as step:
         report = rig_actor(scan, template, out, landmarks, examples, detail, options, step)
     for line in report.lines():

@@ -17,6 +17,8 @@ from torchface.landmarks.detector_files import load_detector
 from torchface.mesh import Mesh
 from torchface.modeling import (
     ExampleRig,
+    HeadModel,
+    MorphableModel,
     NormalMap,
     bake_normal_map,
     detail_maps,
@@ -30,7 +32,7 @@ from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.workflows.expressions import LAYOUT, Expression, expressions_in, neutral_in, weights_row
-from torchface.workflows.register import in_place_of
+from torchface.workflows.register import in_place_of, load_shape_model
 from torchface.workflows.skin import dressed_as, hidden_parts
 
 _FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
@@ -48,6 +50,7 @@ class RigOptions:
         pose: what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened
             again by deformation transfer.
         detector: folder of a landmark detector, for scans without landmarks.
+        model: of heads in the template's topology, by name or folder; the neutral's registration starts from it.
         texture_size: of the actor's texture, texels a side.
         detail_size: of each normal map, texels a side.
     """
@@ -56,6 +59,7 @@ class RigOptions:
     unit: str | None = None
     pose: dict[str, float] = field(default_factory=dict)
     detector: Path | None = None
+    model: str | Path | None = None
     texture_size: int = 2048
     detail_size: int = 2048
 
@@ -153,7 +157,10 @@ def rig_actor(
     fine = [] if detail is None else _detail_scans(detail, rig)
     job = _Actor(rig, options, say)
     say("registering the neutral scan")
-    registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size)
+    model = None if options.model is None else load_shape_model(options.model)
+    if model is not None and bool(shown.any()):
+        raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
+    registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
     neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     say(f"transferring {len(rig.names)} shapes")
@@ -182,14 +189,21 @@ class _Actor:
     def posed(rig: BlendshapeRig, weights: Tensor) -> Mesh:
         return rig.neutral.with_vertices(rig(weights[None].to(rig.deltas))[0])
 
-    def registered(self, mesh: Mesh, scan: Path, landmarks: Path | None, texture_size: int) -> Registration:
+    def registered(
+        self,
+        mesh: Mesh,
+        scan: Path,
+        landmarks: Path | None,
+        texture_size: int,
+        model: MorphableModel | HeadModel | None = None,
+    ) -> Registration:
         options = self.options
         read = load_mesh(scan, options.unit)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
             detector = AutomaticLandmarks(load_detector(options.detector), mesh)
-        return register(mesh, read, marks, detector=detector, texture_size=texture_size)
+        return register(mesh, read, marks, model=model, detector=detector, texture_size=texture_size)
 
     def learned(
         self, actor: BlendshapeRig, neutral: Mesh, matched: Tensor, expressions: list[Expression]
