@@ -21,7 +21,6 @@ from torchface.synthetic import draw_identities, performer
 from train.expression_table import Comparison, People, compare, picture
 
 _SETTLED, _ROUNDS, _NOTHING = 1.0, 20, 0.01  # millimetres, of the robust alignment
-_PICTURED = 4
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,7 @@ class Settings:
         seed: Draws performers.
         licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
         compared: Leave one out for the table of errors.
+        pictured: How many people, the first, are shown with what each method makes of them.
     """
 
     pairs: Path | None = None
@@ -56,6 +56,7 @@ class Settings:
     seed: int = 0
     licence: str = ""
     compared: bool = True
+    pictured: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
     comparison = None
     if settings.compared:
         template = None if settings.template is None else load_rig(settings.template)
-        comparison = compare(people, lambda rest: fit(rest, settings), template, _PICTURED, say)
+        comparison = compare(people, lambda rest: fit(rest, settings), template, settings.pictured, say)
     model = fit(people, settings)
     save(model, people, comparison, settings)
     return Trained(model, comparison)

@@ -78,7 +78,8 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Marke
         recipe=f"python -m train.marker_solver {flags} --out models/{settings.out.name}",
         card=(
             "Weights of blendshapes from 3D markers in millimetres, NaN for not seen; every frame on its own, the "
-            "exact minimum. Good for takes of this rig with this layout, in its space; another actor needs another one. "
+            "exact minimum. Good for takes of this rig with this layout, in its space; another actor needs another "
+            "one. "
             f"Measured on a made-up take of {settings.frames} frames with {settings.noise} mm of noise a coordinate. "
             "Shapes that no marker sees, such as where the eyes look, stay at rest."
         ),

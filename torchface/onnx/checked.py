@@ -72,10 +72,10 @@ def write_checked(
         for name, values in zip(allowed, found, strict=True):
             gap = torch.from_numpy(np.asarray(values)) - expected[name].detach()
             parity[name] = max(parity[name], float(gap.abs().max()))
-    for name, gap in parity.items():
-        if not gap <= allowed[name]:
+    for name, found_gap in parity.items():
+        if not found_gap <= allowed[name]:
             raise ValueRangeError(
-                f"{path}: ONNX Runtime's {name} differ from PyTorch's by {gap:.2g} {units[name]}, expected "
+                f"{path}: ONNX Runtime's {name} differ from PyTorch's by {found_gap:.2g} {units[name]}, expected "
                 f"{allowed[name]:.2g} at most"
             )
     write_file(path, content)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import onnx
@@ -53,8 +53,8 @@ def head_decoder_model(model: HeadModel, facts: Mapping[str, object] | None = No
     vertices = len(model.shape.mean)
     build.constant("table", (-1, vertices, 3))
     _decode(build, model.shape, "shape", "vertices")
-    inputs: dict[str, tuple[int | str, ...]] = {"shape": ("batch", model.shape.count)}
-    outputs: dict[str, tuple[int | str, ...]] = {"vertices": ("batch", vertices, 3)}
+    inputs: dict[str, Sequence[int | str]] = {"shape": ("batch", model.shape.count)}
+    outputs: dict[str, Sequence[int | str]] = {"vertices": ("batch", vertices, 3)}
     if model.color is not None:
         build.constant("zero", 0.0)
         build.constant("one", 1.0)
