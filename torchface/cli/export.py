@@ -74,8 +74,8 @@ def _write_solver(
 def action_units(model: str, out: Path, quiet: bool = False) -> None:
     """Write an action unit classifier as an ONNX file, and check it.
 
-    Input of the graph: `regions` (B,R,h,w), painted patterns in [0,1]. Output: `intensities` (B,A). The names of both
-    are in the file's metadata.
+    Inputs of the graph: `regions` (B,R,h,w), painted patterns in [0,1], and `rest` (R,h,w), the same of the face at
+    rest. Output: `intensities` (B,A). The names of regions and units are in the file's metadata.
 
     Args:
         model: Its name in the zoo, or a folder that `python -m train.action_units` wrote.

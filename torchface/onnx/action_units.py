@@ -58,8 +58,9 @@ def export_action_units(
 ) -> ActionUnitReport:
     """Writes a classifier as ONNX, and checks it.
 
-    The graph takes ``regions`` (B,R,h,w), patterns in [0,1], and gives ``intensities`` (B,A). The metadata holds the
-    names of both (``regions``, ``units``, JSON) and the ``version``.
+    The graph takes ``regions`` (B,R,h,w), patterns in [0,1], and ``rest`` (R,h,w), the same of the performer's face at
+    rest, and gives ``intensities`` (B,A). The metadata holds the names of regions and ``units`` (JSON) and the
+    ``version``.
 
     Args:
         classifier: a trained one.
@@ -73,16 +74,17 @@ def export_action_units(
     model = action_unit_model(classifier)
     session = _session(model)
     frames = _test_frames(classifier) if regions is None else regions.float()
-    (found,) = session.run(None, {"regions": frames.numpy()})
+    rest = classifier.neutral
+    (found,) = session.run(None, {"regions": frames.numpy(), "rest": rest.numpy()})
     with torch.no_grad():
-        same = (torch.from_numpy(np.asarray(found)) - classifier(frames)).abs().amax(1) < 1e-6
+        same = (torch.from_numpy(np.asarray(found)) - classifier(frames, rest)).abs().amax(1) < 1e-6
         clear = _clear(classifier, frames)
     agreement = float(same.float().mean())
     if not bool(same[clear].all()) or agreement < 1 - _ALLOWED:
         raise ValueRangeError(f"{path}: ONNX Runtime agrees with PyTorch in {agreement:.1%} of frames, expected all")
     content = model.SerializeToString()
     write_file(path, content)
-    return ActionUnitReport(Path(path), len(content), agreement, _milliseconds(session, frames))
+    return ActionUnitReport(Path(path), len(content), agreement, _milliseconds(session, frames, rest))
 
 
 def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
@@ -102,13 +104,17 @@ def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
     build.constant("zero", 0.0)
     build.constant("one", 1.0)
     build.constant("three", 3.0)
-    padded = op("Pad", op("Reshape", "regions", "one_channel"), "margins", mode="edge")
-    waves = op("Conv", padded, "filters", strides=[gabor.stride] * 2)
     for name, value in (("begin", 0), ("middle", filters), ("end", 2 * filters), ("axis", 1)):
         build.constant(name, (value,))
-    even, odd = op("Slice", waves, "begin", "middle", "axis"), op("Slice", waves, "middle", "end", "axis")
-    energy = op("Add", op("Add", op("Mul", even, even), op("Mul", odd, odd)), "floor")
-    features = op("Reshape", op("Sqrt", energy), "merged")
+
+    def magnitudes(regions: str) -> str:
+        padded = op("Pad", op("Reshape", regions, "one_channel"), "margins", mode="edge")
+        waves = op("Conv", padded, "filters", strides=[gabor.stride] * 2)
+        even, odd = op("Slice", waves, "begin", "middle", "axis"), op("Slice", waves, "middle", "end", "axis")
+        energy = op("Add", op("Add", op("Mul", even, even), op("Mul", odd, odd)), "floor")
+        return op("Reshape", op("Sqrt", energy), "merged")
+
+    features = op("Sub", magnitudes("regions"), magnitudes("rest"))
     intensities = []
     for i, part in enumerate(parts):
         rows = tuple(classifier.regions.index(name) for name in part.group.regions)
@@ -117,7 +123,7 @@ def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
     op("Concat", *intensities, axis=1, output="intensities")
     return build.model(
         "action_units",
-        {"regions": ("batch", count, size, size)},
+        {"regions": ("batch", count, size, size), "rest": (count, size, size)},
         {"intensities": ("batch", len(classifier.units))},
         {
             "task": "action_units",
@@ -161,10 +167,11 @@ def _test_frames(classifier: ActionUnitClassifier) -> Tensor:
 def _clear(classifier: ActionUnitClassifier, frames: Tensor) -> Tensor:
     """Frames (T,) in which no plane passes so near that rounding decides."""
     clear = torch.ones(len(frames), dtype=torch.bool)
-    for part, own in zip(classifier.group_classifiers(), classifier.split(frames), strict=True):
-        reduced = (part.features(own) - part.mean) @ part.components.T / part.deviations
+    parts, still = classifier.group_classifiers(), classifier.split(classifier.neutral[None])
+    for part, own, rest in zip(parts, classifier.split(frames), still, strict=True):
+        reduced = (part.features(own, rest) - part.mean) @ part.components.T / part.deviations
         distance = reduced @ part.machine.weight.T + part.machine.bias
-        best = part.scores(own).topk(2, dim=1).values
+        best = part.scores(own, rest).topk(2, dim=1).values
         clear &= (distance.abs().amin(1) > _IN_THE_BALANCE) & (best[:, 0] - best[:, 1] > _IN_THE_BALANCE)
     return clear
 
@@ -175,10 +182,10 @@ def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
-def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor) -> float:
+def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor, rest: Tensor) -> float:
     times = []
     for frame in frames.numpy():
         begin = time.perf_counter()
-        session.run(None, {"regions": frame[None]})
+        session.run(None, {"regions": frame[None], "rest": rest.numpy()})
         times.append(time.perf_counter() - begin)
     return 1000 * float(np.median(times))

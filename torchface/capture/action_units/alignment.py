@@ -14,7 +14,7 @@ from torchface.errors import ShapeError
 Method = Literal["dis", "farneback"]
 
 
-def neutral_flow(own: Tensor, reference: Tensor, method: Method = "farneback") -> Tensor:
+def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tensor:
     r"""For each pixel of the reference's neutral pattern, how far off the same spot lies in one's own.
 
     .. math:: \text{own}(x + u(x)) \approx \text{reference}(x)
@@ -23,7 +23,7 @@ def neutral_flow(own: Tensor, reference: Tensor, method: Method = "farneback") -
 
     Args:
         own, reference: neutral patterns, (R,h,w) in [0,1].
-        method: OpenCV's dense flow: Farnebäck's polynomials or DIS.
+        method: OpenCV's dense flow: DIS, or Farnebäck's polynomials, which lose fine dashes more easily.
 
     Returns:
         u, (R,h,w,2), pixels of the region, x first.

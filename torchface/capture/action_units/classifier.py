@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ _LARGEST = 4096
 
 
 class GroupClassifier(nn.Module):
-    """Gabor features of merged regions, their principal components, a vote between classes, a table of intensities.
+    """Gabor features of merged regions against rest, principal components, a vote between classes, a table of levels.
 
     Args:
         group: regions and units.
@@ -49,20 +49,30 @@ class GroupClassifier(nn.Module):
         self.machine = OneVsOne(classes, components)
         self.register_buffer("intensities", torch.zeros(classes, len(group.units)))
 
-    def features(self, images: Tensor) -> Tensor:
-        """Gabor magnitudes (B,D) of the group's regions (B,G,h,w), merged."""
+    def features(self, images: Tensor, rest: Tensor) -> Tensor:
+        """By how much Gabor magnitudes differ from those at rest, (B,D).
+
+        Two faces are painted alike but not the same; what an expression changes is more alike.
+
+        Args:
+            images: the group's regions, (B,G,h,w).
+            rest: the same of this performer's face at rest, (G,h,w), or (B,G,h,w) a frame.
+        """
+        return self._magnitudes(images) - self._magnitudes(rest if rest.ndim == 4 else rest[None])
+
+    def _magnitudes(self, images: Tensor) -> Tensor:
         batch, regions = images.shape[:2]
         return self.gabor(images.flatten(0, 1)).reshape(batch, regions, -1).flatten(1)
 
-    def scores(self, images: Tensor) -> Tensor:
-        """Of every class, (B,C), for regions (B,G,h,w)."""
-        reduced = (self.features(images) - self.mean) @ self.components.T / self.deviations
+    def scores(self, images: Tensor, rest: Tensor) -> Tensor:
+        """Of every class, (B,C), for regions (B,G,h,w) and the regions at rest (G,h,w)."""
+        reduced = (self.features(images, rest) - self.mean) @ self.components.T / self.deviations
         scores: Tensor = self.machine(reduced)
         return scores
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Intensities (B,A) of the group's units, for its regions (B,G,h,w)."""
-        return self.intensities[self.scores(images).argmax(1)]
+    def forward(self, images: Tensor, rest: Tensor) -> Tensor:
+        """Intensities (B,A) of the group's units, for its regions (B,G,h,w) and those at rest (G,h,w)."""
+        return self.intensities[self.scores(images, rest).argmax(1)]
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,7 @@ class ActionUnitClassifier(nn.Module):
                     "name": part.group.name,
                     "regions": list(part.group.regions),
                     "units": list(part.group.units),
+                    "beside": list(part.group.beside),
                     "components": len(part.components),
                     "classes": len(part.intensities),
                 }
@@ -132,7 +143,8 @@ class ActionUnitClassifier(nn.Module):
         for entry in entries:
             if not isinstance(entry, Mapping):
                 raise FileFormatError(f"config: found the group {entry!r:.80}, expected a table")
-            groups.append(RegionGroup(str(entry.get("name")), _texts(entry, "regions"), _texts(entry, "units")))
+            names = [_texts(entry, name) for name in ("regions", "units", "beside")]
+            groups.append(RegionGroup(str(entry.get("name")), *names))
             sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2)))
         return cls(groups, sizes, _whole(config, "size", 8))
 
@@ -143,34 +155,31 @@ class ActionUnitClassifier(nn.Module):
         labels: Sequence[ActionLabels],
         groups: Sequence[RegionGroup] = GROUPS,
         settings: TrainingSettings | None = None,
+        say: Callable[[str], None] | None = None,
     ) -> ActionUnitClassifier:
         """Learns from performed action units; see :func:`torchface.capture.action_units.fit_classifier`."""
         from torchface.capture.action_units.training import TrainingSettings, fit_classifier  # it builds this class
 
-        return fit_classifier(videos, labels, groups, settings or TrainingSettings())
+        return fit_classifier(videos, labels, groups, settings or TrainingSettings(), say)
 
     def group_classifiers(self) -> list[GroupClassifier]:
         """One a group."""
         return [part for part in self.parts if isinstance(part, GroupClassifier)]
 
-    def forward(self, regions: Tensor) -> Tensor:
+    def forward(self, regions: Tensor, rest: Tensor) -> Tensor:
         """Intensities (B,A) in [0,1], in the order of ``units``.
 
         Args:
             regions: patterns (B,R,h,w) in [0,1], in the order of ``regions``, laid on ``neutral``; see
                 :func:`torchface.capture.action_units.read_regions`.
+            rest: the same of this performer's face at rest, (R,h,w).
 
         Raises:
             ShapeError: another shape.
         """
         parts = self.group_classifiers()
-        return torch.cat([part(own) for part, own in zip(parts, self.split(regions), strict=True)], dim=1)
-
-    def classes(self, regions: Tensor) -> Tensor:
-        """The class of every group, (B,groups) int64, for regions (B,R,h,w); 0 is rest."""
-        parts = self.group_classifiers()
-        found = [part.scores(own).argmax(1) for part, own in zip(parts, self.split(regions), strict=True)]
-        return torch.stack(found, dim=1)
+        own, still = self.split(regions), self.split(rest[None])
+        return torch.cat([part(a, b) for part, a, b in zip(parts, own, still, strict=True)], dim=1)
 
     def split(self, regions: Tensor) -> list[Tensor]:
         """Each group's regions (B,G,h,w)."""

@@ -92,4 +92,5 @@ def action_unit_curves(
 def classify(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
     """Levels of intensity (T,A), every frame on its own."""
     rows = [video.names.index(name) for name in classifier.regions]
-    return torch.cat([classifier(chunk[:, rows]) for chunk in video.patterns.split(_CHUNK)])
+    rest = video.rest[rows]
+    return torch.cat([classifier(chunk[:, rows], rest) for chunk in video.patterns.split(_CHUNK)])

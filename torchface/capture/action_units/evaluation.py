@@ -18,6 +18,7 @@ from torchface.capture.action_units.training import (
     check_training,
     group_features,
     label_group,
+    merged_videos,
     principal_components,
 )
 from torchface.errors import ShapeError
@@ -50,13 +51,14 @@ def cross_validation(
     """
     check_training(videos, labels, groups)
     names = group_regions(groups)
-    patterns = torch.cat([video.patterns[:, [video.names.index(name) for name in names]] for video in videos])
+    patterns, rest = merged_videos(videos, names)
     fold = _folds(labels, folds, split, settings.seed)
     found = {}
     for group in groups:
         own = patterns[:, [names.index(name) for name in group.regions]]
         known = label_group(own, labels, group, settings)
-        samples = group_features(GroupClassifier(group, own.shape[-1], 1, 2), own)
+        still = rest[:, [names.index(name) for name in group.regions]]
+        samples = group_features(GroupClassifier(group, own.shape[-1], 1, 2), own, still)
         right = torch.zeros(len(samples), dtype=torch.bool)
         for number in range(folds):
             out = fold == number
@@ -94,6 +96,21 @@ def _folds(labels: Sequence[ActionLabels], folds: int, split: Split, seed: int) 
             fold[start + first : start + stretch.last] = counts[stretch.units] % folds
         start += own.frames
     return fold
+
+
+def labelled_intensities(
+    video: RegionVideo,
+    labels: ActionLabels,
+    groups: Sequence[RegionGroup] = GROUPS,
+    settings: TrainingSettings = DEFAULTS,
+) -> Tensor:
+    """Intensities (T,A) as a video's own labels and the clustering of its frames give them, what a test is held to."""
+    found = []
+    for group in groups:
+        own = video.patterns[:, [video.names.index(name) for name in group.regions]]
+        known = label_group(own, [labels], group, settings)
+        found.append(known.table[known.classes])
+    return torch.cat(found, dim=1)
 
 
 def level_agreement(found: Tensor, truth: Tensor, levels: int = 4) -> dict[str, float]:

@@ -12,7 +12,9 @@ from torchface.errors import ValueRangeError
 
 _BINS = 128
 _LEAST_CONTRAST = 0.15
-_SHARES = (0.01, 0.7)
+_SHARES = (0.01, 0.45)
+_MOST_PAINT = 0.35  # of a region; what is brighter than Otsu's threshold and covers more is skin beside hair or eyes
+_FROM, _TO = 0.4, 0.9  # shares of the way from skin to paint at which a pixel begins and ceases to count in part
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +27,16 @@ class PatternLevels:
     def pattern(self, images: Tensor) -> Tensor:
         """How much of a pixel is paint, (...,R,h,w) in [0,1].
 
-        A threshold half way between skin and paint; within a quarter of their distance round it a pixel that is partly
-        covered counts in part, so that motion of less than a pixel is not lost.
+        A threshold between skin and paint, nearer to the paint because skin that shines is brighter than skin; round it
+        a pixel that is partly covered counts in part, so that motion of less than a pixel is not lost.
         """
         skin, paint = self.skin[:, None, None], self.paint[:, None, None]
         share = (images - skin) / (paint - skin)
-        return (2 * share - 0.5).clamp(0, 1)
+        return ((share - _FROM) / (_TO - _FROM)).clamp(0, 1)
 
 
 def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
-    """The greys of skin and paint, by Otsu's threshold in each region.
+    """The greys of skin and paint, by Otsu's threshold in each region, taken again where it found skin.
 
     Args:
         neutral: regions of a picture of the face at rest, (R,h,w) in [0,1].
@@ -49,6 +51,8 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
     for name, region in zip(names, neutral, strict=True):
         values = region.flatten()
         threshold = otsu_threshold(values)
+        if float((values > threshold).float().mean()) > _MOST_PAINT:
+            threshold = otsu_threshold(values[values > threshold])
         bright, dark = values[values > threshold], values[values <= threshold]
         share = len(bright) / len(values)
         contrast = float(bright.mean() - dark.mean()) if len(bright) and len(dark) else 0.0
@@ -57,8 +61,8 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
                 f"region {name!r} shows no painted pattern: {share:.0%} of it is brighter than the rest by "
                 f"{contrast:.2f}, expected {_SHARES[0]:.0%} to {_SHARES[1]:.0%} brighter by {_LEAST_CONTRAST} at least"
             )
-        skin.append(dark.mean())
-        paint.append(bright.mean())
+        skin.append(dark.median())
+        paint.append(bright.median())
     return PatternLevels(torch.stack(skin), torch.stack(paint))
 
 

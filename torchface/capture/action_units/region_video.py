@@ -29,13 +29,15 @@ class RegionVideo:
     Args:
         names: of the regions, R.
         patterns: (T,R,h,w) in [0,1], how much of a pixel is paint.
-        neutral: the regions at rest, (R,h,w), before they were laid on another performer's.
+        neutral: the regions at rest, (R,h,w), as they are: what others are laid on.
+        rest: the regions at rest, (R,h,w), laid on another performer's as all frames are.
         fps: frames a second.
     """
 
     names: tuple[str, ...]
     patterns: Tensor
     neutral: Tensor
+    rest: Tensor
     fps: float
 
 
@@ -45,7 +47,7 @@ def read_regions(
     names: Sequence[str],
     reference: Tensor | None = None,
     size: int = SIZE,
-    method: Method = "farneback",
+    method: Method = "dis",
     progress: Callable[[int, int], None] | None = None,
 ) -> RegionVideo:
     """Stabilises a video, cuts its regions out, thresholds the pattern and lays it on a reference's.
@@ -70,7 +72,6 @@ def read_regions(
     grid = region_grid(labels.regions, names, size, video.width, video.height)
     _check_length(video, labels, video.count)
     still = video.frame(labels.neutral)
-    # Neighbours of the neutral frame share its noise out; without a face that moves they show the same.
     levels = pattern_levels(sample_regions(still[None].float() / 255, grid, _identity())[0], names)
     neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
     if reference is not None:
@@ -89,7 +90,8 @@ def read_regions(
         done += len(chunk)
         if progress is not None:
             progress(done, labels.frames)
-    return RegionVideo(tuple(names), torch.cat(patterns).float(), neutral, video.fps)
+    whole = torch.cat(patterns).float()
+    return RegionVideo(tuple(names), whole, neutral, whole[labels.neutral].clone(), video.fps)
 
 
 def _identity() -> Tensor:

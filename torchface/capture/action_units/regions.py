@@ -21,20 +21,26 @@ class RegionGroup:
         name: of the group.
         regions: names of its regions.
         units: names of its action units.
+        beside: units that move the regions too but are told from others: they are learned as classes of their own, so
+            that they are not taken for one of ``units``.
     """
 
     name: str
     regions: tuple[str, ...]
     units: tuple[str, ...]
+    beside: tuple[str, ...] = ()
 
 
 GROUPS: tuple[RegionGroup, ...] = (
-    RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2",)),
-    RegionGroup("between_brows", ("between_brows",), ("4", "9")),
-    RegionGroup("eyes", ("eye_left", "eye_right"), ("7", "45", "6+43")),
-    RegionGroup("mouth", ("mouth",), ("18L",)),
+    RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4")),
+    RegionGroup("between_brows", ("between_brows",), ("9",), ("1+2", "4")),
+    RegionGroup("eyes", ("eye_left", "eye_right"), ("7", "45", "6+43"), ("4",)),
+    RegionGroup("mouth", ("mouth",), ("18L",), ("9",)),
 )
-"""The forehead's two regions and the two eyes merge their features; ``18L`` is the lip pucker to the left."""
+"""The forehead's two regions and the two eyes merge their features; ``18L`` is the lip pucker to the left.
+
+Between the brows AU 4 shows too, but other performers' lowered brows are told better by the strokes over them.
+"""
 
 
 def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:

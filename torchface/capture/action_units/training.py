@@ -93,13 +93,14 @@ def fit_classifier(
     check_training(videos, labels, groups)
     size = videos[0].patterns.shape[-1]
     names = group_regions(groups)
-    patterns = torch.cat([video.patterns[:, [video.names.index(name) for name in names]] for video in videos])
+    patterns, rest = merged_videos(videos, names)
     sizes, parts = [], []
     for group in groups:
         say(f"{group.name}: labelling {len(patterns)} frames")
         own = patterns[:, [names.index(name) for name in group.regions]]
         known = label_group(own, labels, group, settings)
-        part = _fit_group(group, own, known, size, settings, say)
+        still = rest[:, [names.index(name) for name in group.regions]]
+        part = _fit_group(group, own, still, known, size, settings, say)
         sizes.append(GroupSize(len(part.components), len(part.intensities)))
         parts.append(part)
     model = ActionUnitClassifier(groups, sizes, size)
@@ -107,6 +108,19 @@ def fit_classifier(
         target.load_state_dict(part.state_dict())
     model.neutral.copy_(videos[0].neutral[[videos[0].names.index(name) for name in names]])
     return model.eval()
+
+
+def merged_videos(videos: Sequence[RegionVideo], names: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Regions of all videos one after the other, and each frame's performer at rest, (T,R,h,w) twice.
+
+    The second is expanded, not copied, for a single video.
+    """
+    patterns, rest = [], []
+    for video in videos:
+        rows = [video.names.index(name) for name in names]
+        patterns.append(video.patterns[:, rows])
+        rest.append(video.rest[rows].expand(len(video.patterns), -1, -1, -1))
+    return torch.cat(patterns), rest[0] if len(rest) == 1 else torch.cat(rest)
 
 
 def label_group(
@@ -129,7 +143,7 @@ def label_group(
     start = 0
     for own in labels:
         for together in sorted({stretch.units for stretch in own.performed}):
-            units = tuple(unit for unit in group.units if unit in together)
+            units = tuple(unit for unit in (*group.units, *group.beside) if unit in together)
             if not units:
                 continue
             frames, at_rest = _frames(own, together, start)
@@ -159,6 +173,7 @@ def _frames(labels: ActionLabels, together: tuple[str, ...], start: int) -> tupl
 def _fit_group(
     group: RegionGroup,
     patterns: Tensor,
+    rest: Tensor,
     known: GroupClasses,
     size: int,
     settings: TrainingSettings,
@@ -166,9 +181,9 @@ def _fit_group(
 ) -> GroupClassifier:
     probe = GroupClassifier(group, size, 1, 2)
     generator = torch.Generator().manual_seed(settings.seed)
-    features, classes = [group_features(probe, patterns)], [known.classes]
+    features, classes = [group_features(probe, patterns, rest)], [known.classes]
     for _ in range(settings.warps):
-        features.append(group_features(probe, patterns, settings.warp_amplitude, generator))
+        features.append(group_features(probe, patterns, rest, settings.warp_amplitude, generator))
         classes.append(known.classes)
     samples, truth = torch.cat(features), torch.cat(classes)
     say(f"{group.name}: principal components of {samples.shape[1]} features")
@@ -186,12 +201,19 @@ def _fit_group(
 
 
 def group_features(
-    part: GroupClassifier, patterns: Tensor, amplitude: float = 0.0, generator: torch.Generator | None = None
+    part: GroupClassifier,
+    patterns: Tensor,
+    rest: Tensor,
+    amplitude: float = 0.0,
+    generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Gabor features (T,D) of a group's regions (T,G,h,w), warped at random where a generator is given."""
+    """Features (T,D) of a group's regions and those at rest, (T,G,h,w) twice, warped alike if a generator is given."""
     found = []
-    for chunk in patterns.split(_CHUNK):
-        found.append(part.features(chunk if generator is None else local_warps(chunk, amplitude, generator)))
+    for chunk, still in zip(patterns.split(_CHUNK), rest.split(_CHUNK), strict=True):
+        if generator is not None:
+            both = local_warps(torch.cat([chunk, still], dim=1), amplitude, generator, alike=2)
+            chunk, still = both.chunk(2, dim=1)
+        found.append(part.features(chunk, still))
     return torch.cat(found)
 
 
@@ -227,6 +249,7 @@ def check_training(
             f"training: {', '.join(never)} is never performed alone; expected at least one repetition of every unit of "
             f"the groups ({', '.join(wanted)}), or groups without it"
         )
+    wanted += [unit for group in groups for unit in group.beside]
     unknown = sorted({unit for own in labels for unit in own.units} - set(wanted))
     if unknown:
         raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group tells it from its regions")

@@ -1,0 +1,93 @@
+"""What the camera's shake did to the picture is found again from a helmet point and two markers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchface.capture.action_units import RegionVideo, read_regions
+from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
+from torchface.errors import AlignmentError, ShapeError
+from torchface.synthetic.camera_stage import SIDE_MARKERS, FilmedSession
+from torchface.synthetic.filmed_head import MARKER_RADIUS
+from torchface.synthetic.helmet_camera import HELMET_POINT, helmet_camera
+
+
+def test_points_are_followed_through_the_shake(session: FilmedSession) -> None:
+    frames = torch.cat(list(session.video.chunks()))
+    labels = session.labels
+    points = torch.tensor([labels.helmet, *labels.markers])
+    tracker = PointTracker(frames[labels.neutral], points, torch.tensor([False, True, True]))
+    found = tracker(frames)
+    camera = helmet_camera(session.video.width, session.video.height)
+    helmet = torch.tensor([HELMET_POINT], dtype=torch.float64)
+    truth = torch.stack([
+        replace(camera, rotation=r, translation=t).project(helmet)[0]
+        for r, t in zip(session.rotation, session.translation, strict=True)
+    ])  # fmt: skip
+    assert (truth - truth[0]).norm(dim=1).max() > 0.6
+    assert not found.isnan().any()
+    error = (found[:, 0] - found[labels.neutral, 0]) - (truth - truth[labels.neutral])
+    assert error.norm(dim=1).quantile(0.95) < 0.45
+    # The markers themselves, where the true markers were.
+    rows = [session.recording.take.markers.names.index(name) for name in SIDE_MARKERS]  # type: ignore[union-attr]
+    centres = session.recording.markers[:, rows].double()
+    seen = torch.stack([
+        replace(camera, rotation=r, translation=t).project(c)
+        for r, t, c in zip(session.rotation, session.translation, centres, strict=True)
+    ])  # fmt: skip
+    assert MARKER_RADIUS > 0
+    off = found[:, 1:] - seen
+    assert (off - off.mean(0)).norm(dim=-1).quantile(0.95) < 0.5
+
+
+def test_the_similarity_of_three_points_is_recovered() -> None:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.tensor([[60.0, 5.0], [110.0, 70.0], [12.0, 72.0]])
+    angle = 0.1 * torch.randn(20, generator=generator)
+    scale = 1 + 0.05 * torch.randn(20, generator=generator)
+    shift = 3 * torch.randn(20, 2, generator=generator)
+    turn = torch.stack([torch.stack([angle.cos(), -angle.sin()], 1), torch.stack([angle.sin(), angle.cos()], 1)], 1)
+    matrix = scale[:, None, None] * turn
+    tracked = reference @ matrix.transpose(1, 2) + shift[:, None]
+    expected = torch.cat([matrix, shift[:, :, None]], dim=2)
+    torch.testing.assert_close(steady_transforms(reference, tracked), expected, atol=1e-4, rtol=0)
+    gap = tracked.clone()
+    gap[7, 1] = torch.nan  # its neighbours stand in
+    filled = steady_transforms(reference, gap)
+    assert not filled.isnan().any()
+    torch.testing.assert_close(filled[8], expected[8], atol=1e-4, rtol=0)
+    gap[::3, 2] = torch.nan
+    with pytest.raises(AlignmentError, match=r"point 2 was lost in 3.%"):
+        steady_transforms(reference, gap)
+
+
+def test_a_steady_picture_changes_less_at_rest(session: FilmedSession, regions: RegionVideo) -> None:
+    from torchface.capture.action_units.pattern import pattern_levels
+    from torchface.capture.action_units.regions import region_grid, sample_regions
+
+    video, labels = session.video, session.labels
+    frames = torch.cat(list(video.chunks())).float() / 255
+    grid = region_grid(labels.regions, regions.names, regions.patterns.shape[-1], video.width, video.height)
+    still = torch.eye(2, 3).expand(len(frames), 2, 3)
+    loose = sample_regions(frames, grid, still)
+    loose = pattern_levels(loose[labels.neutral], regions.names).pattern(loose)
+    rest = session.performance.intensities.sum(1) == 0
+    wobble = [patterns[rest].std(0).mean() for patterns in (regions.patterns, loose)]
+    assert wobble[0] < 0.75 * wobble[1]
+
+
+def test_nothing_to_follow_is_said(session: FilmedSession) -> None:
+    frame = session.video.frame(0)
+    blob = torch.tensor([False])
+    with pytest.raises(AlignmentError, match="inside the picture"):
+        PointTracker(frame, torch.tensor([[500.0, 3.0]]), blob)
+    with pytest.raises(AlignmentError, match="nothing to follow"):
+        PointTracker(torch.full_like(frame, 90), torch.tensor([[50.0, 50.0]]), blob)
+    with pytest.raises(ShapeError, match="frames"):
+        PointTracker(frame, torch.tensor([session.labels.helmet]), blob)(frame[None, :50])
+    labels = replace(session.labels, helmet=(20.0, 60.0), markers=((21.0, 60.0), (22.0, 61.0)))
+    with pytest.raises(AlignmentError):
+        read_regions(session.video, labels, ["mouth"])

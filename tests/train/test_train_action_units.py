@@ -1,0 +1,65 @@
+"""The recipe end to end on a filmed performer."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface import zoo
+from torchface.capture import ActionUnitClassifier
+from torchface.errors import NameMismatchError, TorchfaceError
+from torchface.io.action_labels import Performed, save_action_labels
+from torchface.synthetic.action_performance import ACTION_UNITS, PerformanceSettings
+from torchface.synthetic.camera_stage import FilmedSession, StageSettings, film_session
+from train.action_units import Settings, performed_groups, train
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> FilmedSession:
+    performance = PerformanceSettings(2, 0, (), fps=15.0, pace=1.2)
+    settings = StageSettings(112, 150, markers=10, performance=performance)
+    return film_session(tmp_path_factory.mktemp("film"), "one", None, torch.Generator().manual_seed(4), settings)
+
+
+def test_a_video_and_its_labels_become_a_model(session: FilmedSession, tmp_path: Path) -> None:
+    video, labels = (session.video.path,), (session.labels_path,)
+    out = tmp_path / "units"
+    trained = train(Settings(video, labels, video, labels, out, size=32, folds=2))
+    assert {path.name for path in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "levels.png"}
+    again = zoo.get_model(out)
+    assert isinstance(again, ActionUnitClassifier)
+    assert set(again.units) == set(ACTION_UNITS)
+    assert trained.metrics["one, within_one"] > 0.95
+    assert trained.metrics["cross-validated accuracy"] > 0.85
+    assert "cross-validated accuracy" in (out / "CARD.md").read_text()
+    same = zip(again.state_dict().values(), trained.classifier.state_dict().values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in same)
+
+
+def test_what_is_not_performed_is_left_out_what_is_unknown_is_named(session: FilmedSession, tmp_path: Path) -> None:
+    some = tuple(stretch for stretch in session.labels.performed if stretch.units in (("9",), ("4",), ("45",)))
+    groups = performed_groups([replace(session.labels, performed=some)])
+    assert {unit for group in groups for unit in group.units} == {"4", "9", "45"}
+    assert "mouth" not in {group.name for group in groups}
+    odd = replace(session.labels, performed=(Performed(("99",), 3, 9),))
+    with pytest.raises(TorchfaceError, match="found the units 99"):
+        performed_groups([odd])
+    with pytest.raises(TorchfaceError, match="found 1 videos and 0 files of labels"):
+        train(Settings((session.video.path,), (), out=tmp_path / "x"))
+    together = replace(session.labels, performed=(Performed(("4", "9"), 5, 20), Performed(("9",), 25, 40)))
+    save_action_labels(together, tmp_path / "together.toml")
+    with pytest.raises(NameMismatchError, match="4 is never performed alone"):
+        train(Settings((session.video.path,), (tmp_path / "together.toml",), out=tmp_path / "x", size=32))
+
+
+def test_the_command_says_what_it_wants() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "train.action_units", "--help"], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "--video" in shown.stdout
+    assert "--labels" in shown.stdout

@@ -1,0 +1,175 @@
+"""``python -m train.action_units --video FILE --labels FILE``: a classifier of action units, of one or more performers.
+
+The labels say where helmet, markers and regions are in the video, and which units are performed when; levels of
+intensity are found without labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from torchface import TorchfaceError, zoo
+from torchface.capture import ActionUnitClassifier
+from torchface.capture.action_units import GROUPS, RegionGroup, RegionVideo, TrainingSettings, classify, read_regions
+from torchface.capture.action_units.classifier import group_regions
+from torchface.capture.action_units.evaluation import cross_validation, labelled_intensities, level_agreement
+from torchface.io.action_labels import ActionLabels, load_action_labels
+from torchface.io.video import open_video
+from torchface.rendering.compositing import headed, save_picture, sheet
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        video: Head-camera videos, one a performer; the first performer's face is what the others are laid on.
+        labels: What is in each of them, as TOML.
+        test_video: Videos of performers to test on.
+        test_labels: What is in each of those.
+        out: Folder for the model, its card and its picture.
+        size: Pixels a side that every region is brought to.
+        folds: Into how many parts the frames are split for the cross-validation; 0 leaves it out.
+        licence: Under which the model may be used.
+        training: How it is trained.
+    """
+
+    video: tuple[Path, ...]
+    labels: tuple[Path, ...]
+    test_video: tuple[Path, ...] = ()
+    test_labels: tuple[Path, ...] = ()
+    out: Path = Path("models/action_units")
+    size: int = 48
+    folds: int = 5
+    licence: str = "that of the videos"
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A classifier and what was measured."""
+
+    classifier: ActionUnitClassifier
+    metrics: dict[str, float]
+
+
+def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+    """Reads, stabilises, aligns, labels, fits, evaluates and saves.
+
+    Raises:
+        TorchfaceError: there are not as many labels as videos, or a video or its labels cannot be used.
+    """
+    say = say or (lambda line: None)
+    labels = _labels(settings.video, settings.labels)
+    test_labels = _labels(settings.test_video, settings.test_labels) if settings.test_video else []
+    groups = performed_groups(labels)
+    names = group_regions(groups)
+    videos: list[RegionVideo] = []
+    for path, own in zip(settings.video, labels, strict=True):
+        reference = videos[0].neutral if videos else None
+        videos.append(read_regions(open_video(path), own, names, reference, settings.size))
+        say(f"{path.name}: {own.frames} frames, {len(own.performed)} repetitions")
+    classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, say)
+    metrics: dict[str, float] = {}
+    if settings.folds:
+        accuracy = cross_validation(videos, labels, groups, settings.training, settings.folds, "repetitions")
+        metrics = {f"cross-validated accuracy, {name}": value for name, value in accuracy.items()}
+        metrics["cross-validated accuracy"] = sum(accuracy.values()) / len(accuracy)
+    for path, own in zip(settings.test_video, test_labels, strict=True):
+        video = read_regions(open_video(path), own, names, classifier.neutral, settings.size)
+        truth = labelled_intensities(video, own, groups, settings.training)
+        found = level_agreement(classify(classifier, video), truth, settings.training.levels)
+        metrics |= {f"{path.stem}, {name}": value for name, value in found.items()}
+        say(f"{path.name}: {found['within_one']:.1%} within one level")
+    save(classifier, settings, metrics, labels)
+    picture = levels_picture(videos[0], labelled_intensities(videos[0], labels[0], groups, settings.training), groups)
+    save_picture(picture, settings.out / "levels.png")
+    return Trained(classifier, metrics)
+
+
+def performed_groups(labels: list[ActionLabels]) -> tuple[RegionGroup, ...]:
+    """The usual groups, of those units that are performed.
+
+    Raises:
+        TorchfaceError: a unit is performed that no group knows, or none is.
+    """
+    performed = {unit for own in labels for unit in own.units}
+    known = {unit for group in GROUPS for unit in group.units}
+    if not performed or performed - known:
+        found = ", ".join(sorted(performed)) or "none"
+        raise TorchfaceError(f"labels: found the units {found}, expected some of {', '.join(sorted(known))}")
+    groups = []
+    for group in GROUPS:
+        units = tuple(unit for unit in group.units if unit in performed)
+        beside = tuple(unit for unit in group.beside if unit in performed)
+        if units:
+            groups.append(RegionGroup(group.name, group.regions, units, beside))
+    return tuple(groups)
+
+
+def levels_picture(video: RegionVideo, truth: Tensor, groups: tuple[RegionGroup, ...]) -> Tensor:
+    """A row a unit: its regions' mean pattern at every level of intensity."""
+    units = [(unit, group) for group in groups for unit in group.units]
+    rows = []
+    for a, (unit, group) in enumerate(units):
+        alone = truth.sum(1) == truth[:, a]
+        regions = video.patterns[:, [video.names.index(name) for name in group.regions]]
+        side = torch.cat(list(regions.unbind(1)), dim=2)
+        for level in truth[:, a].unique():
+            mean = side[(truth[:, a] == level) & alone].mean(0)
+            big = mean.repeat_interleave(2, 0).repeat_interleave(2, 1)
+            rows.append(headed(big.expand(3, -1, -1), f"{unit}: {float(level):.2f}"))
+    return sheet(rows, max(1, len(rows) // len(units)))
+
+
+def save(
+    classifier: ActionUnitClassifier, settings: Settings, metrics: dict[str, float], labels: list[ActionLabels]
+) -> None:
+    """Writes the model with its effective settings, measured accuracy and card."""
+    effective = {
+        "video": [path.name for path in settings.video],
+        "labels": [path.name for path in settings.labels],
+        "size": settings.size,
+        "folds": settings.folds,
+        **{f"training.{name}": value for name, value in asdict(settings.training).items()},
+    }
+    frames = sum(own.frames for own in labels)
+    flags = f"--video {' '.join(effective['video'])} --labels {' '.join(effective['labels'])}"
+    zoo.save_model(
+        classifier,
+        settings.out,
+        licence=settings.licence,
+        data=f"{frames} frames of {len(labels)} head-camera videos.",
+        metrics=metrics,
+        recipe=f"python -m train.action_units {flags} --out models/{settings.out.name}",
+        card=(
+            f"Action units {', '.join(classifier.units)} told from strokes of reflective paint in a head-camera video, "
+            "frame by frame, each at one of a few levels of intensity. It knows no other units, and combinations only "
+            "as far as they were performed. Accuracy is of unit and level together, whole repetitions left out; other "
+            "performers' is the share of frames in which every unit is within a level of their own labels."
+        ),
+        settings=effective,
+    )
+
+
+def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLabels]:
+    if not videos or len(videos) != len(paths):
+        raise TorchfaceError(f"found {len(videos)} videos and {len(paths)} files of labels, expected one for each")
+    return [load_action_labels(path) for path in paths]
+
+
+def main() -> None:
+    """Parses flags, trains, prints."""
+    trained = train(tyro.cli(Settings, description=__doc__), print)
+    for name, value in trained.metrics.items():
+        print(f"{name:44} {value:8.2%}")
+
+
+if __name__ == "__main__":
+    main()
