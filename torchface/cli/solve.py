@@ -23,6 +23,7 @@ def solve(
     clean: bool = False,
     whole: bool = False,
     report: Path | None = None,
+    stream: str | None = None,
     sparsity: float | None = None,
     ridge: float | None = None,
     part: str | None = None,
@@ -43,6 +44,8 @@ def solve(
         clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
         whole: Solve the whole take at once: smooth curves, gaps bridged; fast motion keeps its height.
         report: A folder for a page with every curve and a table of what was wrong with the take.
+        stream: Then send the frames in their own time, as Live Link Face does: udp://127.0.0.1:11111 for Unreal on
+            this machine.
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
@@ -53,7 +56,7 @@ def solve(
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, whole, **terms)
     with steps(quiet) as step:
-        done = solve_take(rig, take, attachment, out, animation, settings, part, report, step)
+        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, step)
     for line in done.lines():
         console.print(line)
     print(out)

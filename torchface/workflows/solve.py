@@ -26,8 +26,11 @@ from torchface.evaluation import marker_rmse
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, load_take, save_animation
 from torchface.io.live_link import save_live_link
+from torchface.io.live_link_stream import parse_address
+from torchface.onnx.live import LiveMarkerSolver
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, require_seen
+from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
 
 _SHOWN_DEFECTS = 12
 
@@ -89,6 +92,7 @@ class SolveReport:
         seconds: what the solve itself took.
         motion: the helmet's, where it was asked for.
         cleanup: what was wrong with the take, where that was asked for.
+        sent: what was streamed, where that was asked for.
     """
 
     take: Take
@@ -98,6 +102,7 @@ class SolveReport:
     seconds: float
     motion: HelmetMotion | None = None
     cleanup: Cleanup | None = None
+    sent: StreamReport | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -125,6 +130,8 @@ class SolveReport:
             lines.extend(f"  {' '.join(cell for cell in row if cell)}" for row in rows[:_SHOWN_DEFECTS])
             if len(rows) > _SHOWN_DEFECTS:
                 lines.append(f"  and {len(rows) - _SHOWN_DEFECTS} more; the report (--report DIR) lists all")
+        if self.sent is not None:
+            lines.extend(self.sent.lines())
         return lines
 
 
@@ -205,6 +212,7 @@ def solve_take(
     settings: SolveSettings = SolveSettings(),
     part: str | None = None,
     report: Path | None = None,
+    stream: str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
@@ -214,6 +222,8 @@ def solve_take(
         TorchfaceError: any file is broken or does not fit the others.
     """
     say = progress or (lambda line: None)
+    if stream is not None:
+        parse_address(stream)
     say("reading the rig")
     loaded = load_rig(rig, part=part)
     where = Attachment.load(attachment)
@@ -250,4 +260,17 @@ def solve_take(
         from torchface.workflows.solve_page import write_solve_page
 
         write_solve_page(report, take.name, done)
+    if stream is not None:
+        say(f"sending to {stream}")
+        done = replace(done, sent=_sent(loaded, solution, settings, stream))
     return done
+
+
+def _sent(rig: BlendshapeRig, solution: Solution, settings: SolveSettings, address: str) -> StreamReport:
+    """Frames in their own time: solved one by one as they are due, or, of a take solved whole, as they were solved."""
+    take = solution.take
+    assert take.weights is not None
+    if settings.whole:
+        return stream_weights(take.weights.values[..., 0], take.weights.names, take.fps, address)
+    solver = MarkerSolver(rig, solution.attachment, None, settings.sparsity, settings.ridge)
+    return stream_markers(LiveMarkerSolver(solver), solution.markers.float(), take.fps, address)

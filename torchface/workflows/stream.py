@@ -1,9 +1,9 @@
-"""A marker take solved frame by frame, in its own time, and sent on as it is solved."""
+"""Frames of weights sent in their own time, solved as they come."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +20,7 @@ class StreamReport:
 
     Args:
         weights: of each frame, (T,N).
-        latency: from the frame's markers to its packet on the way, (T,), milliseconds.
+        latency: from when the frame was due to its packet on the way, what solves it included, (T,), milliseconds.
     """
 
     weights: Tensor
@@ -30,7 +30,7 @@ class StreamReport:
         """For people to read."""
         worst = float(self.latency.quantile(0.99))
         return [
-            f"{len(self.weights)} frames sent, {float(self.latency.median()):.2f} ms from markers to packet "
+            f"{len(self.weights)} frames sent, {float(self.latency.median()):.2f} ms from frame to packet "
             f"(99th percentile {worst:.2f} ms)"
         ]
 
@@ -48,6 +48,27 @@ def stream_markers(
     Args:
         solver: for these markers.
         frames: (M,3) each, millimetres, NaN for not seen; from a take or as they come in.
+        fps, address, clock, wait: see :func:`stream_weights`.
+
+    Raises:
+        ValueRangeError: the address is none, or there was no frame.
+    """
+    return stream_weights((solver.step(markers) for markers in frames), solver.names, fps, address, clock, wait)
+
+
+def stream_weights(
+    frames: Iterable[Tensor],
+    names: Sequence[str],
+    fps: float,
+    address: str,
+    clock: Callable[[], float] = time.perf_counter,
+    wait: Callable[[float], None] = time.sleep,
+) -> StreamReport:
+    """Sends frames of weights, each at its time.
+
+    Args:
+        frames: (N,) each; each is asked for when it is due.
+        names: of the weights.
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
         address: ``udp://HOST:PORT``, in Live Link Face's packets.
         clock, wait: what time it is, and to let it pass, in seconds.
@@ -55,18 +76,22 @@ def stream_markers(
     Raises:
         ValueRangeError: the address is none, or there was no frame.
     """
-    solved, latency = [], []
-    with LiveLinkSender(address, solver.names, fps) as sender:
+    sent: list[Tensor] = []
+    latency: list[float] = []
+    coming = iter(frames)
+    with LiveLinkSender(address, names, fps) as sender:
         begin = clock()
-        for number, markers in enumerate(frames):
-            early = begin + number / fps - clock()
+        while True:
+            early = begin + len(sent) / fps - clock()
             if early > 0:
                 wait(early)
             came = clock()
-            weights = solver.step(markers)
+            weights = next(coming, None)
+            if weights is None:
+                break
             sender.send(weights)
             latency.append(1000 * (clock() - came))
-            solved.append(weights)
-    if not solved:
+            sent.append(weights)
+    if not sent:
         raise ValueRangeError("stream: found no frame, expected at least one")
-    return StreamReport(torch.stack(solved), torch.tensor(latency))
+    return StreamReport(torch.stack(sent), torch.tensor(latency))
