@@ -20,7 +20,8 @@ from torchface.rendering.compositing import save_picture
 from torchface.synthetic import draw_identities, performer
 from train.expression_table import Comparison, People, compare, picture
 
-_SETTLED, _ROUNDS, _NOTHING = 1.0, 20, 0.01  # millimetres, of the robust alignment
+# Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
+_HALF, _NOTHING = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
 
 
 @dataclass(frozen=True)
@@ -159,9 +160,9 @@ def selected(rig: BlendshapeRig, expressions: tuple[str, ...]) -> BlendshapeRig:
 def settle(neutral: Tensor, expression: Tensor) -> Tensor:
     """An expression (V,3) moved onto its neutral by what stays: far-off vertices lose their say, round by round."""
     moved = expression
-    for _ in range(_ROUNDS):
+    for half in _HALF:
         away = (moved - neutral).norm(dim=-1)
-        weights = 1 / (1 + (away / _SETTLED) ** 2) ** 2
+        weights = 1 / (1 + (away / half) ** 2) ** 2
         pose = similarity_transform(expression[None], neutral[None], weights[None], scale=False)
         moved = pose.apply(expression[None])[0]
     return expression if float((moved - expression).norm(dim=-1).max()) < _NOTHING else moved

@@ -1,0 +1,102 @@
+"""The recipe for expressions on a handful of domes: a folder of pairs in, a table and a model out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface import BlendshapeRig, TorchfaceError, save_mesh, save_rig, zoo
+from torchface.errors import NameMismatchError
+from train.expression import Settings, Trained, fit, gather, settle, train
+from train.expression_table import METHODS
+
+
+def turned(points: torch.Tensor, seed: int) -> torch.Tensor:
+    angles = 0.05 * torch.randn(3, generator=torch.Generator().manual_seed(seed))
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]]) * angles[0]
+                                   + torch.tensor([[0, 0, 1.0], [0, 0, 0], [-1, 0, 0]]) * angles[1])  # fmt: skip
+    return points @ turn.T + 2.0
+
+
+@pytest.fixture(scope="module")
+def pairs(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven people whose bulges grow with how high the dome is: folders of OBJ files, expressions in poses of their
+    own; and one as .glb."""
+    folder = tmp_path_factory.mktemp("pairs")
+    heights = torch.linspace(0.8, 1.25, 8)
+    for i, height in enumerate(heights.tolist()):
+        neutral = dome_rig.neutral.with_vertices(dome_rig.vertices * torch.tensor([1.0, 1.0, height]))
+        deltas = dome_rig.deltas * (0.4 + 2 * (height - 0.7))
+        if i == 7:
+            save_rig(BlendshapeRig(neutral, deltas, dome_rig.names), folder / "person7.glb")
+            continue
+        person = folder / f"person{i}"
+        person.mkdir()
+        save_mesh(neutral, person / "neutral.obj")
+        for row, (name, delta) in enumerate(zip(dome_rig.names, deltas, strict=True)):
+            moved = turned(neutral.vertices + delta, 10 * i + row)
+            save_mesh(neutral.with_vertices(moved), person / f"{name}.obj")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(pairs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Path]:
+    out = tmp_path_factory.mktemp("models") / "domes"
+    asked = ("jawOpen", "mouthSmileLeft+mouthSmileRight")
+    return train(Settings(pairs, expressions=asked, out=out, pictured=1)), out
+
+
+def test_the_law_is_found(trained: tuple[Trained, Path]) -> None:
+    comparison = trained[0].comparison
+    assert comparison is not None
+    assert comparison.squared.shape == (8, 2, 3)
+    assert comparison.counts[2] >= 14
+    assert comparison.sums[2] < 0.1 * comparison.sums[1]
+    assert all(method in str(comparison) for method in METHODS)
+
+
+def test_the_model_lies_in_its_folder(trained: tuple[Trained, Path], dome_rig: BlendshapeRig) -> None:
+    model, out = trained[0].model, trained[1]
+    again = zoo.get_model(out)
+    assert again.names == ("jawOpen", "mouthSmileLeft+mouthSmileRight")
+    neutral = dome_rig.vertices[None]
+    torch.testing.assert_close(again(neutral), model(neutral), rtol=0, atol=0.02)
+    record = zoo.describe(out)
+    assert record.metrics["lowest error of 16 cases, share: regression"] >= 14 / 16
+    assert "--expressions jawOpen mouthSmileLeft+mouthSmileRight" in record.recipe
+    assert (out / "pictures" / "jawOpen.png").stat().st_size > 1000
+
+
+def test_expressions_are_laid_onto_neutrals(dome_rig: BlendshapeRig) -> None:
+    moved = dome_rig.vertices + dome_rig.deltas[2]
+    back = settle(dome_rig.vertices, turned(moved, 3))
+    assert (back - moved).norm(dim=-1).max() < 0.1
+    assert (settle(dome_rig.vertices, moved) - moved).norm(dim=-1).max() < 0.1
+    assert torch.equal(settle(dome_rig.vertices, dome_rig.vertices), dome_rig.vertices)
+
+
+def test_more_components_than_people_are_cut(pairs: Path) -> None:
+    people = gather(Settings(pairs), lambda line: None)
+    model = fit(people, Settings(pairs, neutral_components=50))
+    assert len(model.neutral_components) <= 7
+    chosen = fit(people, Settings(pairs, neutral_components=None, offset_components=None, ridge=None))
+    assert len(chosen.neutral_components) <= 6
+
+
+def test_people_who_do_not_fit_are_named(pairs: Path, dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    with pytest.raises(TorchfaceError, match="either --pairs DIR or --performers"):
+        train(Settings())
+    with pytest.raises(TorchfaceError, match="found 0 people, expected at least three"):
+        train(Settings(tmp_path))
+    with pytest.raises(NameMismatchError, match="tongueOut"):
+        train(Settings(pairs, expressions=("tongueOut",)))
+    for i in range(3):
+        neutral = dome_rig.neutral
+        if i == 2:
+            neutral = replace(neutral, faces=neutral.faces[:-2], polygons=None)
+        save_rig(BlendshapeRig(neutral, dome_rig.deltas, dome_rig.names), tmp_path / f"{i}.glb")
+    with pytest.raises(TorchfaceError, match=r"found 2\.glb of topology"):
+        train(Settings(tmp_path))
