@@ -1,0 +1,83 @@
+"""A classifier from the zoo's folder becomes an ONNX file that gives the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from torchface import zoo
+from torchface.capture import ActionUnitClassifier
+from torchface.capture.action_units.classifier import GroupSize
+from torchface.capture.action_units.regions import GROUPS, RegionGroup
+from torchface.cli.export import action_units as command
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.modeling import MorphableModel
+from torchface.onnx import action_units as graph
+from torchface.onnx import export_action_units
+
+
+@pytest.fixture
+def classifier() -> ActionUnitClassifier:
+    """Whose numbers are drawn at random."""
+    generator = torch.Generator().manual_seed(0)
+    groups: list[RegionGroup] = [GROUPS[0], GROUPS[3]]
+    model = ActionUnitClassifier(groups, [GroupSize(5, 7), GroupSize(3, 2)], 24)
+    for name, buffer in model.named_buffers():
+        if not any(part in name for part in ("gabor", "for_", "deviations", "intensities")):
+            buffer.copy_(torch.randn(buffer.shape, generator=generator))
+        elif "intensities" in name:
+            buffer.copy_(torch.rand(buffer.shape, generator=generator))
+    model.neutral.copy_(torch.rand(model.neutral.shape, generator=generator))
+    return model
+
+
+@pytest.fixture
+def folder(classifier: ActionUnitClassifier, tmp_path: Path) -> Path:
+    zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="made", metrics={}, recipe="none")
+    return tmp_path / "units"
+
+
+def test_the_command_and_the_module_write_the_same_file(
+    classifier: ActionUnitClassifier, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from export.action_units import action_units as module
+
+    command(str(folder), tmp_path / "one.onnx", quiet=True)
+    module(str(folder), str(tmp_path / "two.onnx"))
+    assert "ms" in capsys.readouterr().out
+    assert (tmp_path / "one.onnx").read_bytes() == (tmp_path / "two.onnx").read_bytes()
+    frames = torch.rand(9, 3, 24, 24, generator=torch.Generator().manual_seed(1))
+    session = onnxruntime.InferenceSession(tmp_path / "one.onnx")
+    (found,) = session.run(None, {"regions": frames.numpy(), "rest": classifier.neutral.numpy()})
+    assert np.abs(found - classifier(frames, classifier.neutral).numpy()).max() < 1e-6
+    assert len(np.unique(found, axis=0)) > 3
+
+
+def test_another_model_is_refused(tmp_path: Path) -> None:
+    heads = MorphableModel.fit(torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0)))
+    zoo.save_model(heads, tmp_path / "heads", licence="MIT", data="made", metrics={}, recipe="none")
+    with pytest.raises(FileFormatError, match="found a MorphableModel"):
+        command(str(tmp_path / "heads"), tmp_path / "x.onnx", quiet=True)
+
+
+def test_a_graph_that_computes_something_else_is_not_written(
+    classifier: ActionUnitClassifier, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = graph.action_unit_model
+
+    def wrong(model: ActionUnitClassifier) -> object:
+        part = model.group_classifiers()[0]
+        kept = part.intensities.clone()
+        part.intensities.add_(0.1)
+        made = right(model)
+        part.intensities.copy_(kept)
+        return made
+
+    monkeypatch.setattr(graph, "action_unit_model", wrong)
+    with pytest.raises(ValueRangeError, match="agrees with PyTorch in 0"):
+        export_action_units(classifier, tmp_path / "wrong.onnx")
+    assert not (tmp_path / "wrong.onnx").exists()
