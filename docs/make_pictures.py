@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import torch
 
+from torchface.geometry.camera import look_at
+from torchface.io import load_image, load_rig, save_image
 from torchface.registration import register
 from torchface.rendering.compositing import caption, from_pillow, save_picture, sheet
+from torchface.rendering.shading import render
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.scanner import eyes_closed, scan_head
 from torchface.viz.faces import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
 from torchface.viz.registration import registration_sheet
+from torchface.workflows.fit import fit_photographs
 
 HERE = Path(__file__).resolve().parent
 SIZE = {"width": 232, "height": 290}
@@ -55,11 +60,48 @@ def registration_picture() -> torch.Tensor:
     return registration_sheet(scan.mesh, found, maximum=0.5)
 
 
+def fit_picture() -> torch.Tensor:
+    """Three photographs of another head, the head fitted to them, and its rig in views no photograph shows."""
+    actor = performer(draw_identities(1, torch.Generator().manual_seed(21))[0])
+    weights = torch.zeros(1, len(actor.names))
+    weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
+    smiling = actor.neutral.with_vertices(actor(weights)[0])
+    ids = smiling.landmarks
+    marks, cells = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        photographs = [Path(folder) / f"{yaw:+.0f}.png" for yaw in (-35.0, 0.0, 35.0)]
+        for path in photographs:
+            camera = look_at(smiling.vertices[ids].mean(0), float(path.stem), span=300.0, width=464, height=580)
+            save_image(render(smiling, camera, background=(0.35, 0.4, 0.45)), path)
+            marks.append(camera.project(smiling.vertices[ids].double()))
+            points = path.with_suffix(".pts")
+            rows = "\n".join(f"{x:.3f} {y:.3f}" for x, y in (marks[-1] + 1).tolist())
+            points.write_text(f"version: 1\nn_points: {len(ids)}\n{{\n{rows}\n}}\n")
+            cells.append(caption(_half(load_image(path)), "photograph"))
+        files = [path.with_suffix(".pts") for path in photographs]
+        fit_photographs(photographs, files, "head", Path(folder) / "rig.glb")
+        rig = load_rig(Path(folder) / "rig.glb")
+    jaw = torch.zeros(1, len(rig.names))
+    jaw[0, rig.names.index("jawOpen")] = 0.7
+    for title, yaw, mesh in (
+        ("rig at rest", -20.0, rig.neutral),
+        ("rig at rest", 70.0, rig.neutral),
+        ("rig, jawOpen", 20.0, rig.neutral.with_vertices(rig(jaw)[0])),
+    ):
+        cells.append(caption(face_views(mesh, (yaw,), framed_by=rig.neutral, **SIZE), title))
+    return sheet(cells, 6)
+
+
+def _half(image: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.avg_pool2d(image[None, :3], 2)[0]
+
+
 def main() -> None:
     from PIL import Image
 
     save_picture(performer_sheet(), HERE / "images" / "performer.jpg")
     save_picture(registration_picture(), HERE / "images" / "registration.jpg")
+    save_picture(fit_picture(), HERE / "images" / "fit.jpg")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_picture(from_pillow(image), HERE / "images" / "demo.jpg")
 
