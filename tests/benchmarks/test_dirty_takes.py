@@ -57,10 +57,12 @@ def test_cleanup_and_whole_takes(real_capture: Capture) -> None:
     rig, attachment, takes = real_capture
     solver = MarkerSolver(rig, attachment)
     whole = WholeTakeSolver(solver)
-    print("\nweight error as a share of the clean take's, frame by frame; whole takes as a share of frame by frame")
     print(
-        "take  frames | uncleaned  cleaned  swaps named  good dropped  CPU s | "
-        "whole: clean  dirty  CPU s | fast peaks  lost"
+        "\nweight error of dirty takes as a share of the clean take's, in both modes; whole takes against single frames"
+    )
+    print(
+        "take  frames | single frames: dirty  cleaned | whole take: cleaned | swaps named  good dropped  CPU s | "
+        "whole / single: clean  dirty  CPU s | fast peaks  lost"
     )
     for which, true in enumerate(takes):
         clean = markers_of(record(rig, attachment, true, torch.Generator().manual_seed(which)).take)
@@ -84,12 +86,15 @@ def test_cleanup_and_whole_takes(real_capture: Capture) -> None:
         dropped = float((cleanup.masked & good).sum() / good.sum())
         every = error(solver(clean), true)
         count, lost = lost_height(smooth, true)
+        relative = error(smooth_dirty, true) / error(smooth, true)
         print(
-            f"{which + 1:4} {len(true):7} | {uncleaned / least:9.2f} {cleaned / least:8.2f} {named:8}/{shown} "
-            f"{100 * dropped:11.3f} % {seconds:6.1f} | {error(smooth, true) / every:12.2f} "
+            f"{which + 1:4} {len(true):7} | {uncleaned / least:20.2f} {cleaned / least:8.2f} | {relative:19.2f} | "
+            f"{named:8}/{shown} {100 * dropped:11.3f} % {seconds:6.1f} | {error(smooth, true) / every:21.2f} "
             f"{error(smooth_dirty, true) / cleaned:6.2f} {passed:6.1f} | {count:10} {100 * lost:5.1f} %"
         )
-        assert cleaned <= 1.25 * least
+        assert relative <= 1.25
+        # Three markers in ten missing alone is 1 / sqrt(0.7) = 1.2 for single frames.
+        assert cleaned <= 1.3 * least
         assert named >= 0.9 * shown
         assert dropped < 0.01
         assert error(smooth, true) <= 0.65 * every
@@ -120,7 +125,6 @@ def test_slip(real_capture: Capture) -> None:
     print("\nweight error as a share of the error without slip; slip of 10 mm and 4 degrees")
     print("take | ignored  linear   exact | no slip: linear   exact | motion off by     ms a frame")
     for which, true in enumerate(takes):
-        true = true[::2]
         steady, slipping = (
             record(rig, attachment, true, torch.Generator().manual_seed(which), flaws)
             for flaws in (StageFlaws(), StageFlaws(slip_translation=10, slip_rotation=4))

@@ -43,8 +43,9 @@ def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) 
     return float((solved.weights.values[..., 0] - true).abs().mean())
 
 
-def check_fit(performance: Performance, space: Similarity, frames: int | None = None) -> None:
+def check_fit(performance: Performance, space: Similarity) -> None:
     rig, attachment, takes = performance
+    performance = (rig, attachment, [takes[0], takes[1][::4]])
     start = misplaced(rig, attachment, torch.Generator().manual_seed(1))
     assert float(site_distances(rig, start, attachment).min()) > 1.9
     fit = fit_attachment(rig, filmed(performance, 0, space), start)
@@ -55,9 +56,9 @@ def check_fit(performance: Performance, space: Similarity, frames: int | None = 
     assert abs(float(fit.alignment.scale * space.scale) - 1) < 0.01
     # Another take, the helmet put on anew.
     again = Similarity(space.scale, space.rotation.transpose(1, 2), -space.translation)
-    take = filmed(performance, 1, again, 2)
-    ours = error_with(rig, fit.attachment, take, takes[1])
-    assert ours <= 0.6 * error_with(rig, by_nearest_vertex(rig, start), take, takes[1])
+    take, true = filmed(performance, 1, again, 2), takes[1][::4]
+    ours = error_with(rig, fit.attachment, take, true)
+    assert ours <= 0.6 * error_with(rig, by_nearest_vertex(rig, start), take, true)
 
 
 def test_sites_on_the_performer_come_back(performance: Performance, stage_space: Similarity) -> None:
@@ -70,8 +71,9 @@ def test_sites_on_a_real_rig_come_back(real_capture: Performance, stage_space: S
 
 
 def test_markers_that_stand_off_the_skin(performance: Performance, stage_space: Similarity) -> None:
-    rig, attachment, _ = performance
-    take = filmed(performance, 0, stage_space, flaws=StageFlaws(standoff=2.0))
+    rig, attachment, takes = performance
+    short = (rig, attachment, [takes[0][::3]])
+    take = filmed(short, 0, stage_space, flaws=StageFlaws(standoff=2.0))
     fit = fit_attachment(rig, take, misplaced(rig, attachment, torch.Generator().manual_seed(1)), standoff=True)
     assert (site_distances(rig, fit.attachment, attachment) < 1.0).float().mean() >= 0.85
     assert 1.4 < fit.standoff < 2.2

@@ -16,7 +16,7 @@ from torchface.geometry.alignment import Similarity
 from torchface.synthetic.marker_stage import Recording, StageFlaws, record
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
-# Half of the markers missing some time or other, whole regions for ten frames, one sample in a hundred mislabelled.
+# Three samples in ten missing, one in a hundred mislabelled; ten-frame holes come on top.
 DIRT = StageFlaws(missing=0.3, swaps=60, swap_seconds=1.0)
 
 
@@ -51,9 +51,9 @@ def named(recording: Recording, take: Take, cleanup: Cleanup) -> tuple[int, int]
     return count, shown
 
 
-def check_dirty_take(performance: Performance, which: int) -> None:
+def check_dirty_take(performance: Performance, which: int, frames: int) -> None:
     rig, attachment, takes = performance
-    solver, true = MarkerSolver(rig, attachment), takes[which]
+    solver, true = MarkerSolver(rig, attachment), takes[which][:frames]
     generator = torch.Generator().manual_seed(0)
     recording = record(rig, attachment, true, generator, DIRT)
     dirty = with_holes(recording, attachment, rig, generator)
@@ -72,7 +72,7 @@ def check_dirty_take(performance: Performance, which: int) -> None:
     assert error(cleanup.take.markers.values) <= 1.25 * error(clean.values)
     assert error(before) > 1.5 * error(clean.values)
     count, shown = named(recording, dirty, cleanup)
-    assert shown > 20
+    assert shown > 15
     assert count >= 0.9 * shown
     swapped = torch.zeros(before.shape[:2], dtype=torch.bool)
     for swap in recording.swaps:
@@ -84,12 +84,12 @@ def check_dirty_take(performance: Performance, which: int) -> None:
 
 
 def test_a_dirty_take_of_the_performer(performance: Performance) -> None:
-    check_dirty_take(performance, 0)
+    check_dirty_take(performance, 0, 1200)
 
 
 @pytest.mark.real
 def test_a_dirty_real_take(real_capture: Performance) -> None:
-    check_dirty_take(real_capture, 2)
+    check_dirty_take(real_capture, 2, 1900)
 
 
 def spoiled(take: Take) -> Take:
