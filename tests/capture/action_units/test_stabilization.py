@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.capture.action_units import RegionVideo, read_regions
+from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import AlignmentError, ShapeError
 from torchface.synthetic.camera_stage import SIDE_MARKERS, FilmedSession
@@ -18,8 +18,7 @@ from torchface.synthetic.helmet_camera import HELMET_POINT, helmet_camera
 def test_points_are_followed_through_the_shake(session: FilmedSession) -> None:
     frames = torch.cat(list(session.video.chunks()))
     labels = session.labels
-    points = torch.tensor([labels.helmet, *labels.markers])
-    tracker = PointTracker(frames[labels.neutral], points, torch.tensor([False, True, True]))
+    tracker = PointTracker(frames[labels.neutral], torch.tensor(labels.helmet), torch.tensor(labels.markers))
     found = tracker(frames)
     camera = helmet_camera(session.video.width, session.video.height)
     helmet = torch.tensor([HELMET_POINT], dtype=torch.float64)
@@ -81,13 +80,37 @@ def test_a_steady_picture_changes_less_at_rest(session: FilmedSession, regions: 
 
 def test_nothing_to_follow_is_said(session: FilmedSession) -> None:
     frame = session.video.frame(0)
-    blob = torch.tensor([False])
+    helmet, markers = torch.tensor(session.labels.helmet), torch.tensor(session.labels.markers)
     with pytest.raises(AlignmentError, match="inside the picture"):
-        PointTracker(frame, torch.tensor([[500.0, 3.0]]), blob)
+        PointTracker(frame, torch.tensor([500.0, 3.0]), markers)
     with pytest.raises(AlignmentError, match="nothing to follow"):
-        PointTracker(torch.full_like(frame, 90), torch.tensor([[50.0, 50.0]]), blob)
+        PointTracker(torch.full_like(frame, 90), helmet, markers)
     with pytest.raises(ShapeError, match="frames"):
-        PointTracker(frame, torch.tensor([session.labels.helmet]), blob)(frame[None, :50])
-    labels = replace(session.labels, helmet=(20.0, 60.0), markers=((21.0, 60.0), (22.0, 61.0)))
-    with pytest.raises(AlignmentError):
-        read_regions(session.video, labels, ["mouth"])
+        PointTracker(frame, helmet, markers)(frame[None, :50])
+
+
+def test_a_marker_that_is_hidden_counts_as_lost_and_is_found_again() -> None:
+    """A picture that shifts; a second blob comes near while the first is covered."""
+    step = torch.arange(60.0)
+    y, x = torch.meshgrid(step, step, indexing="ij")
+
+    def blob(cx: float, cy: float) -> torch.Tensor:
+        return torch.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 3)
+
+    corner = 0.5 * ((x - 30).abs() < 5) * ((y - 8).abs() < 4)
+    frames = []
+    for t in range(30):
+        shift = 2 * torch.sin(torch.tensor(t / 4.0)).item()
+        picture = 0.1 + torch.roll(corner, round(shift), 1) + blob(50 + round(shift), 40)
+        hidden = 10 <= t < 14
+        picture = picture + (0 if hidden else blob(10 + round(shift), 40)) + blob(10 + round(shift), 50)
+        frames.append((255 * picture.clamp(0, 1)).byte())
+    tracker = PointTracker(frames[0], torch.tensor([30.0, 8.0]), torch.tensor([[10.0, 40.0], [50.0, 40.0]]))
+    found = tracker(torch.stack(frames))
+    assert found[10:14, 1].isnan().all()
+    shift = torch.tensor([round(2 * torch.sin(torch.tensor(t / 4.0)).item()) for t in range(30)])
+    seen = torch.ones(30, dtype=torch.bool)
+    seen[10:14] = False
+    assert (found[seen, 1, 0] - 10 - shift[seen]).abs().max() < 0.2
+    assert (found[:, 2, 0] - 50 - shift).abs().max() < 0.2
+    assert (found[:, 0, 0] - 30 - shift).abs().max() < 0.2

@@ -76,8 +76,7 @@ def read_regions(
     neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
     if reference is not None:
         grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
-    points = torch.tensor([labels.helmet, *labels.markers])
-    tracker = PointTracker(still, points, torch.tensor([False, True, True]))
+    tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
     tracked = []
     for chunk in video.chunks(_CHUNK):  # once to follow the points, once to read: no whole video is in memory
         tracked.append(tracker(chunk))

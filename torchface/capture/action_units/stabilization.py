@@ -10,21 +10,22 @@ from torchface.errors import AlignmentError, ShapeError
 
 _WINDOW = 15
 _LEVELS = 3
-_REACH = 4  # pixels round a marker in which its blob is weighed
+_REACH = 4  # pixels round where a marker should be in which its blob is weighed
 _LARGEST_RESIDUAL = 0.2  # of a grey value of 1, mean over the window
-_LARGEST_STEP = 0.35  # of the distance to the other points: further than that nothing has moved between two frames
+_LARGEST_STEP = 20.0  # pixels from one frame to the next
 
 
 class PointTracker:
-    """Follows points from a reference picture by pyramidal Lucas-Kanade optical flow.
+    """Follows a point of the helmet and bright markers through a video.
 
-    Every frame is compared with the reference, not with the frame before, so that nothing drifts; the last place found
-    is where the search begins. A marker's place is then its blob's centre of brightness.
+    The helmet's point is found by pyramidal Lucas-Kanade optical flow, every frame against the reference, so that
+    nothing drifts. Most of what moves the picture moves the helmet in it: a marker is looked for where it was last,
+    moved along with the helmet, and is its blob's centre of brightness.
 
     Args:
         reference: grey picture, (H,W) uint8.
-        points: (P,2), pixels.
-        blobs: which of them are bright markers, (P,) bool.
+        helmet: a point of the helmet, (2,), pixels.
+        markers: (M,2), pixels.
 
     Raises:
         AlignmentError: a point lies outside the picture, or there is nothing to follow there.
@@ -32,68 +33,77 @@ class PointTracker:
     Source: Lucas and Kanade 1981, Bouguet 2001; thesis 4.1.10.
     """
 
-    def __init__(self, reference: Tensor, points: Tensor, blobs: Tensor) -> None:
+    def __init__(self, reference: Tensor, helmet: Tensor, markers: Tensor) -> None:
         height, width = reference.shape
-        for i, (x, y) in enumerate(points.tolist()):
+        for i, (x, y) in enumerate(torch.cat([helmet[None], markers]).tolist()):
             if not (2 <= x < width - 2 and 2 <= y < height - 2):
                 raise AlignmentError(
                     f"stabilisation: point {i} is at ({x:.1f}, {y:.1f}), expected it inside the picture of "
                     f"{width} x {height} pixels"
                 )
-            around = reference[int(y) - 2 : int(y) + 4, int(x) - 2 : int(x) + 4].float()
+            top, left = max(int(y) - 5, 0), max(int(x) - 5, 0)
+            around = reference[top : int(y) + 7, left : int(x) + 7].float()
             if float(around.max() - around.min()) < 20:
                 raise AlignmentError(
                     f"stabilisation: nothing to follow at point {i}, ({x:.1f}, {y:.1f}); expected a corner or a marker"
                 )
-        self.reference = np.ascontiguousarray(reference.numpy())
-        self.blobs = blobs
-        self.points = points.float().clone()
-        self.points[blobs] = _weighed(reference, self.points[blobs])
+        self._reference = np.ascontiguousarray(reference.numpy())
+        blobs, brightness = _blobs(reference, markers.float())
+        self._least_bright = 0.6 * brightness
+        self.points = torch.cat([helmet[None].float(), blobs])
         self._last = self.points.clone()
 
     def __call__(self, frames: Tensor) -> Tensor:
-        """Where the points are in the next frames (t,H,W) uint8: (t,P,2), NaN where one was lost."""
-        import cv2
-
-        if frames.ndim != 3 or frames.shape[1:] != self.reference.shape:
-            raise ShapeError(f"frames: found {tuple(frames.shape)}, expected (t,{self.reference.shape})")
+        """Where helmet and markers are in the next frames (t,H,W) uint8: (t,1+M,2), NaN where one was lost."""
+        if frames.ndim != 3 or frames.shape[1:] != self._reference.shape:
+            raise ShapeError(f"frames: found {tuple(frames.shape)}, expected (t, {self._reference.shape})")
         found = torch.full((len(frames), len(self.points), 2), torch.nan)
-        start = self.points.numpy()[:, None]
         for i, frame in enumerate(frames):  # where a point was last is where the next search begins
-            places, status, residual = cv2.calcOpticalFlowPyrLK(
-                self.reference,
-                np.ascontiguousarray(frame.numpy()),
-                start,
-                self._last.numpy()[:, None].copy(),
-                winSize=(_WINDOW, _WINDOW),
-                maxLevel=_LEVELS,
-                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-                criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-            )
-            now = torch.from_numpy(places[:, 0].copy())
-            good = torch.from_numpy((status[:, 0] > 0) & (residual[:, 0] < 255 * _LARGEST_RESIDUAL))
-            good &= (now - self._last).norm(dim=1) < _LARGEST_STEP * torch.pdist(self.points).min()
-            seen = good & self.blobs
-            now[seen] = _weighed(frame, now[seen])
-            found[i, good] = now[good]
-            self._last[good] = now[good]
+            helmet = self._flow(frame)
+            if helmet is not None:
+                found[i, 0] = helmet
+                self._last[1:] += helmet - self._last[0]
+                self._last[0] = helmet
+            blobs, brightness = _blobs(frame, self._last[1:])
+            seen = (brightness > self._least_bright) & ((blobs - self._last[1:]).norm(dim=1) < _REACH)
+            found[i, 1:][seen] = blobs[seen]
+            self._last[1:][seen] = blobs[seen]
         return found
 
+    def _flow(self, frame: Tensor) -> Tensor | None:
+        """Where the helmet's point is, (2,), or nothing where it cannot be found."""
+        import cv2
 
-def _weighed(frame: Tensor, points: Tensor) -> Tensor:
-    """The centre of brightness round points (P,2)."""
+        place, status, residual = cv2.calcOpticalFlowPyrLK(
+            self._reference,
+            np.ascontiguousarray(frame.numpy()),
+            self.points[:1].numpy()[:, None].copy(),
+            self._last[:1].numpy()[:, None].copy(),
+            winSize=(_WINDOW, _WINDOW),
+            maxLevel=_LEVELS,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
+        )
+        found = torch.from_numpy(place[0, 0].copy())
+        step = float((found - self._last[0]).norm())
+        good = status[0, 0] > 0 and residual[0, 0] < 255 * _LARGEST_RESIDUAL and step < _LARGEST_STEP
+        return found if good else None
+
+
+def _blobs(frame: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The centre of brightness (P,2) round points (P,2), and the brightest grey there, (P,)."""
     height, width = frame.shape
     offsets = torch.arange(-_REACH, _REACH + 1)
-    place = points.round().long()
-    rows = (place[:, 1, None, None] + offsets[:, None]).clamp(0, height - 1)
-    columns = (place[:, 0, None, None] + offsets[None, :]).clamp(0, width - 1)
-    grey = frame[rows, columns].float()
-    brightest = grey.flatten(1).amax(1)[:, None, None]
-    weight = (grey - 0.6 * brightest).clamp(min=0)
-    total = weight.sum((1, 2)).clamp(min=1e-6)
-    across = (weight * columns).sum((1, 2)) / total
-    down = (weight * rows).sum((1, 2)) / total
-    return torch.stack([across, down], dim=1)
+    for _ in range(2):  # a blob that was cut off at first is whole the second time
+        place = points.round().long()
+        rows = (place[:, 1, None, None] + offsets[:, None]).clamp(0, height - 1)
+        columns = (place[:, 0, None, None] + offsets[None, :]).clamp(0, width - 1)
+        grey = frame[rows, columns].float()
+        brightest = grey.flatten(1).amax(1)
+        weight = (grey - 0.6 * brightest[:, None, None]).clamp(min=0)
+        total = weight.sum((1, 2)).clamp(min=1e-6)
+        points = torch.stack([(weight * columns).sum((1, 2)) / total, (weight * rows).sum((1, 2)) / total], dim=1)
+    return points, brightest
 
 
 def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
