@@ -68,7 +68,8 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
 
     Annotated iBUG landmarks are taken where there are 68. Lines are taken from the pairs of vertices that touch when
     lids and lips close (both vertices of a pair lie on the line that a scan with closed eyes shows), where annotated.
-    What is not annotated is detected as on a scan.
+    What is not annotated is detected as on a scan; a template without colours, on which a detector that needs them
+    sees nothing, has its twelve landmarks from the 68 and no lines.
 
     Args:
         template: a face, millimetres.
@@ -76,17 +77,19 @@ def template_features(template: Mesh, detector: UVLandmarkDetector | None = None
         points: how many points a traced line gives.
 
     Raises:
-        ValueRangeError: something is neither annotated nor is there a detector.
+        ValueRangeError: something is neither annotated nor is there a detector that sees the template.
     """
     notes = template.annotations
     ibug = None if notes is None or notes.landmarks is None or len(notes.landmarks) != 68 else notes.landmarks
     pairs = None if notes is None or notes.contacts is None or not len(notes.contacts) else notes.contacts
+    sees = detector is not None and detector.sees(template)
+    if not sees and (ibug is None or (pairs is None and detector is None)):
+        raise ValueRangeError(
+            "template: found no 68 landmarks or no contact pairs among its annotations, expected both or a detector "
+            "that sees the template"
+        )
     found = None
-    if ibug is None or pairs is None:
-        if detector is None:
-            raise ValueRangeError(
-                "template: found no 68 landmarks or no contact pairs among its annotations, expected both or a detector"
-            )
+    if detector is not None and sees and (ibug is None or pairs is None):
         found = scan_landmarks(detector, template)
     landmarks = _annotated_landmarks(template, ibug) if ibug is not None else _nearest(template, found)
     lines = _lines_of_contacts(template, pairs, landmarks) if pairs is not None else {}

@@ -10,10 +10,11 @@ from torch.nn.functional import conv2d, pad
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
-    """Weights (2R+1,) that sum to 1, out to three standard deviations."""
+    """Weights (2R+1,) float64 that sum to 1, out to three standard deviations."""
     reach = max(1, math.ceil(3 * sigma))
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sigma) ** 2)
-    return kernel / kernel.sum()
+    # Numbers, not tensors: an exported graph holds the kernel and not how it came about.
+    kernel = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-reach, reach + 1)]
+    return torch.tensor([weight / sum(kernel) for weight in kernel], dtype=torch.float64)
 
 
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
