@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchface.io.action_labels import ActionLabels
 
 _LARGEST = 4096
+_MOST_CLASSES = 256  # there is a plane for every two
 
 
 class GroupClassifier(nn.Module):
@@ -58,9 +59,10 @@ class GroupClassifier(nn.Module):
             images: the group's regions, (B,G,h,w).
             rest: the same of this performer's face at rest, (G,h,w), or (B,G,h,w) a frame.
         """
-        return self._magnitudes(images) - self._magnitudes(rest if rest.ndim == 4 else rest[None])
+        return self.magnitudes(images) - self.magnitudes(rest if rest.ndim == 4 else rest[None])
 
-    def _magnitudes(self, images: Tensor) -> Tensor:
+    def magnitudes(self, images: Tensor) -> Tensor:
+        """Of the Gabor filters, (B,D), of the group's regions (B,G,h,w), merged."""
         batch, regions = images.shape[:2]
         return self.gabor(images.flatten(0, 1)).reshape(batch, regions, -1).flatten(1)
 
@@ -145,7 +147,7 @@ class ActionUnitClassifier(nn.Module):
                 raise FileFormatError(f"config: found the group {entry!r:.80}, expected a table")
             names = [_texts(entry, name) for name in ("regions", "units", "beside")]
             groups.append(RegionGroup(str(entry.get("name")), *names))
-            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2)))
+            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2, _MOST_CLASSES)))
         return cls(groups, sizes, _whole(config, "size", 8))
 
     @classmethod
@@ -212,8 +214,10 @@ def _texts(entry: Mapping[str, Any], name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1) -> int:
+def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1, largest: int = _LARGEST) -> int:
     found = entry.get(name)
-    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found <= _LARGEST:
-        raise FileFormatError(f"config: found {name} = {found!r:.80}, expected a whole number from {smallest}")
+    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found <= largest:
+        raise FileFormatError(
+            f"config: found {name} = {found!r:.80}, expected a whole number from {smallest} to {largest}"
+        )
     return found
