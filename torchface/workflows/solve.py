@@ -164,7 +164,7 @@ def solve_markers(
     if settings.clean:
         say("looking for what is wrong with the take")
         cleanup = clean_take(MarkerSolver(rig, attachment, alignment, **terms), take, settings.slip)
-        take = cleanup.take
+        take = cleanup.take if settings.whole else cleanup.filled
     if not settings.whole:
         require_seen(take)
     say("solving")
@@ -185,6 +185,8 @@ def solve_markers(
     markers = steady.markers.select(labels).values
     if space is not None:
         markers = space.apply(markers)
+    if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
+        markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
     return Solution(
         replace(take, weights=solved.weights), markers, attachment.select(labels), alignment, motion, cleanup
     )

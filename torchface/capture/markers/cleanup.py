@@ -12,6 +12,7 @@ from torch import Tensor
 from torchface.capture.markers.robust_prediction import Prediction, predict_markers
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.swaps import find_swaps, swapped_back
+from torchface.capture.markers.whole_take import WholeTakeSolver
 from torchface.errors import NameMismatchError
 from torchface.take import Take, Track
 
@@ -45,8 +46,8 @@ class Cleanup:
     """What was found and done.
 
     Args:
-        take: the repaired take for solving: labels swapped back, bad samples NaN, gaps left open.
-        filled: the same with short gaps closed by the rig's own prediction, for whoever needs whole curves.
+        take: the repaired take: labels swapped back, bad samples NaN, gaps left open.
+        filled: the same with short gaps closed by the rig's own prediction: for solving frame by frame.
         defects: in order of their first frame.
         masked: samples that were seen and are not used, (T,M) bool, in the order of the take's markers.
     """
@@ -82,8 +83,8 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     """Finds swapped labels, spikes, markers that drift or fell off, and gaps; repairs what is safe.
 
     The rig predicts every marker from those that agree. Labels that stand at each other's place are swapped back;
-    samples that still do not fit are masked; short gaps are filled, in ``filled`` only, by the prediction moved
-    evenly from what was seen before the gap to what was seen after it.
+    samples that still do not fit are masked; short gaps are filled, in ``filled`` only, by where the rig has the marker
+    when the whole take is solved at once (with slip: its own frame).
 
     Args:
         solver: rig, attachment, and the take's alignment.
@@ -127,7 +128,8 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     masked[bad] = torch.nan
     # A marker that the take lacks has no gaps.
     present = [i for i, label in enumerate(labels) if label in track.names]
-    filled, gaps = _fill(masked, bad, prediction.expected, labels, present, take.fps)
+    expected = prediction.expected if slip else _expected_over_time(solver, masked, take.fps)
+    filled, gaps = _fill(masked, bad, expected, labels, present, take.fps)
     defects += gaps
     back = alignment.inverse().apply if alignment is not None else (lambda points: points)
     column = [labels.index(name) for name in track.names]
@@ -190,13 +192,23 @@ def _fill(
             inside = first > 0 and last + 1 < len(seen)
             safe = inside and last - first < longest
             if safe:
-                before = seen[first - 1, m] - expected[first - 1, m]
-                after = seen[last + 1, m] - expected[last + 1, m]
-                share = torch.arange(1, last - first + 2, dtype=seen.dtype)[:, None] / (last - first + 2)
-                filled[first : last + 1, m] = expected[first : last + 1, m] + before + share * (after - before)
+                filled[first : last + 1, m] = expected[first : last + 1, m]
             if last - first + 1 >= _LISTED_GAP and not bool(bad[first : last + 1, m].all()):
                 defects.append(Defect("gap", (labels[m],), first, last, 0.0, "filled" if safe else "left"))
     return filled, defects
+
+
+def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tensor:
+    """Where the rig has each marker when the whole take is solved at once, (T,M,3), in rig space.
+
+    Frames before and after then tell of a gap what its own frame cannot.
+    """
+    if bool(torch.isnan(seen).any(-1).all()):
+        return solver.rest.double().expand_as(seen)
+    alignment = solver.alignment
+    weights = WholeTakeSolver(solver)(seen if alignment is None else alignment.inverse().apply(seen), fps)
+    on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), weights)
+    return on_rig + (seen - on_rig).nanmedian(0).values.nan_to_num(0.0)
 
 
 def _runs(mask: Tensor) -> list[tuple[int, int]]:
