@@ -23,7 +23,7 @@ def register(
     cluster: str | None = None,
     part: str | None = None,
     unit: str | None = None,
-    detector: Path | None = None,
+    detector: str | None = None,
     texture_size: int = 1024,
     model: str | None = None,
     quiet: bool = False,
@@ -45,7 +45,8 @@ def register(
             where all its machines see them. Needs the extra: pip install torchface[cluster].
         part: Keep this region of the template only, such as face.
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
-        detector: Folder of a landmark detector for scans without landmarks.
+        detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from
+            coloured scans with closed eyes. Without it the face is found by its shape.
         texture_size: Texels a side of each result's texture; 0 makes none.
         model: Name or folder of a head model in the template's topology: each registration starts from it, and what it
             knows of heads does not slide along the scan.

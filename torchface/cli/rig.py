@@ -19,7 +19,7 @@ def rig(
     pose: tuple[str, ...] = (),
     part: str | None = None,
     unit: str | None = None,
-    detector: Path | None = None,
+    detector: str | None = None,
     model: str | None = None,
     texture_size: int = 2048,
     detail_size: int = 2048,
@@ -47,7 +47,8 @@ def rig(
             eyes; the rig's neutral has them open.
         part: Keep this region of the template only, such as face.
         unit: Unit of all scans (mm, cm, m) where it is not the format's own.
-        detector: Folder of a landmark detector for scans without landmarks.
+        detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from
+            coloured scans with closed eyes. Without it the face is found by its shape.
         model: Model of heads in the template's topology, by name or folder, from which the neutral's registration
             starts; see `python -m train.morphable`.
         texture_size: Texels a side of the rig's texture; 0 makes none.

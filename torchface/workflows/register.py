@@ -53,7 +53,7 @@ def register_scans(
     cluster: str | None = None,
     part: str | None = None,
     unit: str | None = None,
-    detector: Path | None = None,
+    detector: str | Path | None = None,
     texture_size: int = 1024,
     model: str | Path | None = None,
     progress: Callable[[int, int, CorpusEntry], None] | None = None,
@@ -80,7 +80,7 @@ def register_scans(
         progress,
         landmarks=landmarks,
         unit=unit,
-        detector=detector,
+        detector=None if detector is None else zoo.find(detector),
         model=learned,
         texture_size=texture_size,
     )

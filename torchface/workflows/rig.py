@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface import zoo
 from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
 from torchface.geometry.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
@@ -49,7 +50,7 @@ class RigOptions:
         unit: of all scans, where it is not each format's own.
         pose: what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened
             again by deformation transfer.
-        detector: folder of a landmark detector, for scans without landmarks.
+        detector: of landmarks, by name or folder, for scans without landmarks.
         model: of heads in the template's topology, by name or folder; the neutral's registration starts from it.
         texture_size: of the actor's texture, texels a side.
         detail_size: of each normal map, texels a side.
@@ -58,7 +59,7 @@ class RigOptions:
     part: str | None = None
     unit: str | None = None
     pose: dict[str, float] = field(default_factory=dict)
-    detector: Path | None = None
+    detector: str | Path | None = None
     model: str | Path | None = None
     texture_size: int = 2048
     detail_size: int = 2048
@@ -202,7 +203,7 @@ class _Actor:
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
-            detector = AutomaticLandmarks(load_detector(options.detector), mesh)
+            detector = AutomaticLandmarks(load_detector(zoo.find(options.detector)), mesh)
         return register(mesh, read, marks, model=model, detector=detector, texture_size=texture_size)
 
     def learned(
