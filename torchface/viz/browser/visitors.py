@@ -44,7 +44,7 @@ def only_this_page(title: str) -> Iterator[None]:
 
     viser hands its server's handshake to ``websockets`` and has no setting for either.
     """
-    server = importlib.import_module("websockets.asyncio.server")
+    server: Any = importlib.import_module("websockets.asyncio.server")
     with _starting:
         before = server.serve
 
