@@ -103,4 +103,8 @@ def action_units(model: str, out: Path, quiet: bool = False) -> None:
     print(out)
 
 
-EXPORTS: dict[str, Callable[..., None]] = {"solver": solver, "hybrid-solver": hybrid_solver, "action-units": action_units}
+EXPORTS: dict[str, Callable[..., None]] = {
+    "solver": solver,
+    "hybrid-solver": hybrid_solver,
+    "action-units": action_units,
+}
