@@ -22,6 +22,10 @@ def solve(
     slip: bool = False,
     clean: bool = False,
     whole: bool = False,
+    video: Path | None = None,
+    action_units: str | None = None,
+    labels: Path | None = None,
+    table: Path | None = None,
     report: Path | None = None,
     stream: str | None = None,
     sparsity: float | None = None,
@@ -43,6 +47,10 @@ def solve(
         slip: The helmet moves on the head: find its motion, and keep it out of the weights.
         clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
         whole: Solve the whole take at once: smooth curves, gaps bridged; fast motion keeps its height.
+        video: What a head camera saw of painted patterns during the take; leads the shapes that markers hardly see.
+        action_units: The classifier for the video, by name or folder; see `python -m train.action_units`.
+        labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if absent.
+        table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
         report: A folder for a page with every curve and a table of what was wrong with the take.
         stream: Then send the frames in their own time, as Live Link Face does: udp://127.0.0.1:11111 for Unreal on
             this machine.
@@ -51,12 +59,18 @@ def solve(
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
+    from torchface.errors import ValueRangeError
+    from torchface.workflows.head_camera import HeadCamera
     from torchface.workflows.solve import SolveSettings, solve_take
+
+    if (video is None) != (action_units is None):
+        raise ValueRangeError("solve: found one of --video and --action-units, expected both or neither")
+    camera = None if video is None or action_units is None else HeadCamera(video, action_units, labels, table)
 
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, whole, **terms)
     with steps(quiet) as step:
-        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, step)
+        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step)
     for line in done.lines():
         console.print(line)
     print(out)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture import (
     HelmetSolver,
+    HybridSolver,
     MarkerSolver,
     WholeTakeSolver,
     align_take,
@@ -30,6 +31,7 @@ from torchface.io.live_link_stream import parse_address
 from torchface.onnx.live import LiveMarkerSolver
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, require_seen
+from torchface.workflows.head_camera import HeadCamera, Predicted, predicted_curves
 from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
 
 _SHOWN_DEFECTS = 12
@@ -92,6 +94,7 @@ class SolveReport:
         seconds: what the solve itself took.
         motion: the helmet's, where it was asked for.
         cleanup: what was wrong with the take, where that was asked for.
+        predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
     """
 
@@ -102,6 +105,7 @@ class SolveReport:
     seconds: float
     motion: HelmetMotion | None = None
     cleanup: Cleanup | None = None
+    predicted: Predicted | None = None
     sent: StreamReport | None = None
 
     def lines(self) -> list[str]:
@@ -130,6 +134,11 @@ class SolveReport:
             lines.extend(f"  {' '.join(cell for cell in row if cell)}" for row in rows[:_SHOWN_DEFECTS])
             if len(rows) > _SHOWN_DEFECTS:
                 lines.append(f"  and {len(rows) - _SHOWN_DEFECTS} more; the report (--report DIR) lists all")
+        if self.predicted is not None:
+            led = (self.predicted.gamma.values > 0).any(2)
+            shapes = ", ".join(self.predicted.gamma.names) or "no shape"
+            lines.append(f"video: leads {shapes} in {100 * float(led.any(1).float().mean()):.0f} % of the frames")
+            lines.extend(f"  {note}" for note in self.predicted.notes)
         if self.sent is not None:
             lines.extend(self.sent.lines())
         return lines
@@ -140,6 +149,7 @@ def solve_markers(
     attachment: Attachment,
     take: Take,
     settings: SolveSettings = SolveSettings(),
+    predicted: Predicted | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Solution:
     """A take's weights: laid on the rig, cleaned, freed of slip and of what is left at rest, solved.
@@ -149,12 +159,15 @@ def solve_markers(
         attachment: where the markers sit; markers match by label.
         take: markers, in any space.
         settings: which of these steps.
+        predicted: what a head camera saw, for the hybrid solve.
         progress: told what begins.
 
     Raises:
         TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
     say = progress or (lambda line: None)
+    if predicted is not None and settings.whole:
+        raise ValueRangeError("solve: found a whole take to solve at once beside a video, expected one of the two")
     alignment = None
     if settings.align or settings.neutral is not None:
         say("laying the take on the rig")
@@ -179,7 +192,10 @@ def solve_markers(
         if settings.slip:
             steady, motion = _without_slip(rig, attachment, alignment, settings, take)
     solver = MarkerSolver(rig, attachment, space, **terms)
-    solved = WholeTakeSolver(solver).solve_take(steady) if settings.whole else solver.solve_take(steady)
+    if predicted is not None:
+        solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
+    else:
+        solved = WholeTakeSolver(solver).solve_take(steady) if settings.whole else solver.solve_take(steady)
     labels = tuple(label for label in attachment.labels or () if label in take.markers.names)
     assert steady.markers is not None
     markers = steady.markers.select(labels).values
@@ -215,6 +231,7 @@ def solve_take(
     part: str | None = None,
     report: Path | None = None,
     stream: str | None = None,
+    camera: HeadCamera | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
@@ -234,8 +251,9 @@ def solve_take(
     played = load_take(take)
     if played.markers is None:
         raise ValueRangeError(f"{take}: found no markers, expected a marker take (.c3d, .trc, .csv)")
+    predicted = None if camera is None else predicted_curves(camera, played, loaded.names, say)
     started = time.perf_counter()
-    solution = solve_markers(loaded, where, played, settings, say)
+    solution = solve_markers(loaded, where, played, settings, predicted, say)
     seconds = time.perf_counter() - started
     solved = solution.take
     assert solved.weights is not None
@@ -256,6 +274,7 @@ def solve_take(
         seconds,
         solution.motion,
         solution.cleanup,
+        predicted,
     )
     if report is not None:
         say("writing the report")
@@ -264,15 +283,18 @@ def solve_take(
         write_solve_page(report, take.name, done)
     if stream is not None:
         say(f"sending to {stream}")
-        done = replace(done, sent=_sent(loaded, solution, settings, stream))
+        done = replace(done, sent=_sent(loaded, solution, settings, stream, predicted is not None))
     return done
 
 
-def _sent(rig: BlendshapeRig, solution: Solution, settings: SolveSettings, address: str) -> StreamReport:
-    """Frames in their own time: solved one by one as they are due, or, of a take solved whole, as they were solved."""
+def _sent(
+    rig: BlendshapeRig, solution: Solution, settings: SolveSettings, address: str, predicted: bool
+) -> StreamReport:
+    """Frames in their own time: solved one by one as they are due; those that need more than their own markers (of a
+    take solved whole or with a video) as they were solved."""
     take = solution.take
     assert take.weights is not None
-    if settings.whole:
+    if settings.whole or predicted:
         return stream_weights(take.weights.values[..., 0], take.weights.names, take.fps, address)
     solver = MarkerSolver(rig, solution.attachment, None, settings.sparsity, settings.ridge)
     return stream_markers(LiveMarkerSolver(solver), solution.markers.float(), take.fps, address)

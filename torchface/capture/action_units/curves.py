@@ -64,7 +64,7 @@ def action_unit_curves(
         table: units in the rig's shapes.
         names: of the rig's shapes, N.
         units: which of the classifier's may lead the solve; all if absent.
-        windows: frames over which each unit is smoothed.
+        windows: frames at 60 a second over which each unit is smoothed.
         progress: is told how many frames are done, and of how many.
 
     Raises:
@@ -82,7 +82,7 @@ def action_unit_curves(
     if not isinstance(video, RegionVideo):
         video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
     levels = classify(classifier, video)
-    intensities = smooth_intensities(levels, classifier.units, windows)
+    intensities = smooth_intensities(levels, classifier.units, windows, fps=video.fps)
     weights = (intensities[:, :, None] * matrix).amax(1)
     active = ((levels > 0)[:, :, None] & (matrix > 0)).any(1)
     return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)

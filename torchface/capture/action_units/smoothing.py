@@ -11,22 +11,30 @@ from torchface.errors import ShapeError
 from torchface.temporal import savitzky_golay
 
 WINDOW = 25
-"""Frames; a blink is over sooner than the others, so its window is the shortest."""
+"""Frames at 60 a second; a blink is over sooner than the others, so its window is the shortest."""
 
 WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29}
 """Windows of units that have their own."""
 
+_RATE = 60.0
+_SHORTEST = 5
+
 
 def smooth_intensities(
-    intensities: Tensor, units: Sequence[str], windows: Mapping[str, int] = WINDOWS, order: int = 2
+    intensities: Tensor,
+    units: Sequence[str],
+    windows: Mapping[str, int] = WINDOWS,
+    order: int = 2,
+    fps: float = _RATE,
 ) -> Tensor:
     """A classifier's levels as continuous curves in [0,1].
 
     Args:
         intensities: (T,A).
         units: their names, A.
-        windows: frames of the Savitzky-Golay filter by unit; ``WINDOW`` for the others.
+        windows: of the Savitzky-Golay filter by unit, frames at 60 a second; ``WINDOW`` for the others.
         order: of its polynomial.
+        fps: frames a second; a window lasts as long at any rate.
 
     Raises:
         ShapeError: ``intensities`` is not (T,A).
@@ -35,7 +43,6 @@ def smooth_intensities(
     """
     if intensities.ndim != 2 or intensities.shape[1] != len(units):
         raise ShapeError(f"intensities: found {tuple(intensities.shape)}, expected (T,{len(units)})")
-    curves = [
-        savitzky_golay(intensities[:, a].double(), windows.get(unit, WINDOW), order) for a, unit in enumerate(units)
-    ]
+    frames = [max(round(windows.get(unit, WINDOW) * fps / _RATE), _SHORTEST) for unit in units]
+    curves = [savitzky_golay(intensities[:, a].double(), window, order) for a, window in enumerate(frames)]
     return torch.stack(curves, dim=1).clamp(0, 1).float()

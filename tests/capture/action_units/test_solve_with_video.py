@@ -1,0 +1,44 @@
+"""The command solves markers with a video: what the markers hardly see comes from the painted patterns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from torchface import load_take, save_rig, zoo
+from torchface.capture.action_units import ActionUnitClassifier
+from torchface.cli import main
+from torchface.synthetic.camera_stage import FilmedSession
+
+
+def test_the_video_leads_what_markers_hardly_see(
+    other: FilmedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="filmed", metrics={}, recipe="none")
+    save_rig(other.rig, tmp_path / "rig.glb")
+    other.attachment.save(tmp_path / "attachment.json")
+    words = [
+        "solve",
+        str(tmp_path / "rig.glb"),
+        str(other.take_path),
+        "--attachment",
+        str(tmp_path / "attachment.json"),
+    ]
+    errors = []
+    for name, more in (
+        ("alone", []),
+        ("hybrid", ["--video", str(other.video.path), "--action-units", str(tmp_path / "units")]),
+    ):
+        main([*words, *more, "--out", str(tmp_path / f"{name}.csv"), "--quiet"])
+        solved = load_take(tmp_path / f"{name}.csv").weights
+        assert solved is not None
+        errors.append((other.rig.weights_from(solved) - other.performance.weights).abs().mean(0))
+    told = capsys.readouterr().err
+    assert "video: leads" in told
+    led = other.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
+    alone, hybrid = errors
+    assert float(hybrid[led].mean()) < 0.7 * float(alone[led].mean())
+    with pytest.raises(SystemExit):
+        main([*words, "--video", str(other.video.path), "--out", str(tmp_path / "w.csv"), "--quiet"])
+    assert "expected both or neither" in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,122 @@
+"""What a head camera saw between the markers, as curves beside a marker take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchface import zoo
+from torchface.capture import ActionUnitClassifier
+from torchface.capture.action_units import ActionUnitCurves, action_unit_curves, load_shape_table
+from torchface.capture.action_units.shape_table import built_in_tables
+from torchface.capture.markers import gamma_curves
+from torchface.errors import NameMismatchError
+from torchface.io.action_labels import load_action_labels
+from torchface.take import Take, Track
+
+_SAME_RATE = 1e-3
+_FADE, _SHORTEST_FADE = 15 / 60, 5  # seconds, as 15 frames at 60 a second are; frames at least
+
+
+@dataclass(frozen=True)
+class HeadCamera:
+    """A video of the face with painted patterns, and what reads it.
+
+    Args:
+        video: the file.
+        classifier: a trained ``ActionUnitClassifier``, by name or folder.
+        labels: where helmet, markers and regions are in the video; the video's name with ``.toml`` if absent.
+        table: what action units mean in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two knows
+            the rig's names if absent.
+    """
+
+    video: Path
+    classifier: str | Path
+    labels: Path | None = None
+    table: str | Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Curves for the hybrid solve, frame by frame of a take.
+
+    Args:
+        weights: what the classifier says, (T,K,1).
+        gamma: how much that counts, (T,K,1), mm² over all markers.
+        notes: what had to be assumed, for people to read.
+    """
+
+    weights: Track
+    gamma: Track
+    notes: tuple[str, ...]
+
+
+def predicted_curves(
+    camera: HeadCamera, take: Take, names: tuple[str, ...], progress: Callable[[str], None] | None = None
+) -> Predicted:
+    """Classifies the video and brings what it says to the take's frames.
+
+    Video and take begin together; a video of another rate is brought to the take's, and where it ends before the
+    take the markers are left alone.
+
+    Args:
+        camera: video, classifier, labels, table.
+        take: whose frames are meant.
+        names: of the rig's shapes.
+        progress: called with a line before each step.
+
+    Raises:
+        NameMismatchError: the model is no classifier, or no table fits the rig.
+        TorchfaceError: the video or a file beside it cannot be used.
+    """
+    say = progress or (lambda line: None)
+    classifier = zoo.get_model(camera.classifier)
+    if not isinstance(classifier, ActionUnitClassifier):
+        raise NameMismatchError(
+            f"{camera.classifier}: found a {type(classifier).__name__}, expected a classifier of action units"
+        )
+    labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
+    table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
+    say("reading the video")
+    return laid_beside(action_unit_curves(classifier, camera.video, labels, table, names), take)
+
+
+def laid_beside(curves: ActionUnitCurves, take: Take) -> Predicted:
+    """Curves of a video, frame by frame of a take that began when it did; shapes it never moves are left out."""
+    moved = curves.active.any(0)
+    names = tuple(name for name, moves in zip(curves.names, moved.tolist(), strict=True) if moves)
+    weights, active = curves.weights[:, moved], curves.active[:, moved]
+    notes = []
+    if abs(curves.fps - take.fps) > _SAME_RATE * take.fps:
+        notes.append(f"video of {curves.fps:g} frames a second brought to the take's {take.fps:g}")
+    at = torch.arange(len(take), dtype=torch.float64) * (curves.fps / take.fps)
+    before = at.floor().long().clamp(max=len(weights) - 1)
+    after = (before + 1).clamp(max=len(weights) - 1)
+    share = (at - before).clamp(0, 1).to(weights)[:, None]
+    there = torch.lerp(weights[before], weights[after], share)
+    within = (at <= len(weights) - 1 + 1e-6)[:, None]
+    led = (active[before] | active[after]) & within
+    if not bool(within.all()):
+        missing = int((~within).sum())
+        notes.append(f"the video ends {missing} frames before the take; there the markers are alone")
+    elif len(weights) - 1 - float(at[-1]) > 1.5:
+        notes.append(f"the video goes on for {len(weights) - 1 - float(at[-1]):.0f} frames after the take; left out")
+    notes.append("take and video are taken to begin together")
+    gamma = gamma_curves(led, window=max(round(_FADE * take.fps), _SHORTEST_FADE))
+    return Predicted(Track(names, there[..., None]), Track(names, gamma[..., None]), tuple(notes))
+
+
+def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:
+    for name in built_in_tables():
+        try:
+            load_shape_table(name).matrix(units, names)
+        except NameMismatchError:
+            continue
+        return name
+    raise NameMismatchError(
+        f"shape table: found no built-in one ({', '.join(built_in_tables())}) for a rig with {', '.join(names[:5])}, "
+        "...; expected one for this rig (--table FILE)"
+    )
