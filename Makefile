@@ -18,8 +18,9 @@ $(VENV)/.installed-%: $(STAMP)
 	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
 	touch $@
 
+# Two processes of one thread each; what costs minutes once (a filmed performer, a trained detector) stays in one of them.
 test: $(VENV)/.installed-test
-	$(RUN) -m pytest
+	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s

@@ -124,7 +124,7 @@ def test_a_missing_file_and_a_folder_are_told(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"none.obj: found no such file"):
         load_mesh(tmp_path / "none.obj")
     (tmp_path / "folder.obj").mkdir()
-    with pytest.raises(FileFormatError, match=r"folder.obj: found no plain file"):
+    with pytest.raises(FileFormatError, match=r"folder.obj: found a folder or a device"):
         load_mesh(tmp_path / "folder.obj")
 
 
