@@ -90,6 +90,7 @@ def film_session(
     generator: torch.Generator,
     settings: StageSettings = StageSettings(),
     progress: Callable[[int, int], None] | None = None,
+    attachment: Attachment | None = None,
 ) -> FilmedSession:
     """Paints a performer, sets markers, films a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
 
@@ -100,14 +101,18 @@ def film_session(
         generator: where all randomness comes from.
         settings: how.
         progress: is told how many frames are done, and of how many.
+        attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
 
     Raises:
         FileFormatError: the folder cannot be written to.
+        NameMismatchError: the attachment lacks a marker on a side of the face.
+        TopologyError: the attachment belongs to another mesh.
     """
     folder = Path(folder)
     rig = performer(identity, texture=True)
     performance = perform_action_units(rig.names, generator, settings.performance)
-    attachment = stage_markers(rig, settings.markers)
+    attachment = stage_markers(rig, settings.markers) if attachment is None else attachment
+    attachment.select(SIDE_MARKERS)  # without them there is no way to hold pictures still; said before hours of filming
     recording = record(rig, attachment, performance.weights, generator, settings.marker_flaws, settings.performance.fps)
     paint = reflective_paint(rig.neutral.texture.shape[-1], generator, settings.unsteadiness)  # type: ignore[union-attr]
     camera = helmet_camera(settings.width, settings.height)
