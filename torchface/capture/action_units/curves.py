@@ -27,7 +27,7 @@ class ActionUnitCurves:
     Args:
         names: of the shapes, N.
         weights: what the classifier predicts, smooth, (T,N) in [0,1].
-        active: the frames in which it saw a unit that moves the shape, (T,N) bool; where it shall lead the solve.
+        active: the frames in which it shall lead the solve, (T,N) bool; see ``action_unit_curves``.
         units: of the classifier, A.
         intensities: smooth, (T,A) in [0,1].
         levels: as they were told frame by frame, (T,A).
@@ -51,11 +51,14 @@ def action_unit_curves(
     names: Sequence[str],
     units: Sequence[str] | None = None,
     windows: Mapping[str, int] = WINDOWS,
+    at_rest: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> ActionUnitCurves:
     r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
 
-    A shape that several units move follows the one that moves it most.
+    A shape that several units move follows the one that moves it most. The classifier leads a shape where it sees a
+    unit that moves it, and where it sees that none does: shapes that markers hardly see take up the markers' noise
+    there. Where it sees only a unit that shall not lead, the markers have the shape to themselves.
 
     Args:
         classifier: a trained one.
@@ -65,27 +68,35 @@ def action_unit_curves(
         names: of the rig's shapes, N.
         units: which of the classifier's may lead the solve; all if absent.
         windows: frames at 60 a second over which each unit is smoothed.
+        at_rest: lead also where no unit is seen; otherwise the markers take over there, as in the source.
         progress: is told how many frames are done, and of how many.
 
     Raises:
         NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.
         FileFormatError, ShapeError, ValueRangeError, AlignmentError: the video cannot be used; see ``read_regions``.
 
-    Source: thesis 4.1.12.
+    Source: thesis 4.1.8 and 4.1.12.
     """
     unknown = sorted(set(units or ()) - set(classifier.units))
     if unknown:
         raise NameMismatchError(f"units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
-    matrix = table.matrix(classifier.units, names)
+    whole = matrix = table.matrix(classifier.units, names)
     if units is not None:
-        matrix = matrix * torch.tensor([[float(unit in units)] for unit in classifier.units])
+        matrix = whole * torch.tensor([[float(unit in units)] for unit in classifier.units])
     if not isinstance(video, RegionVideo):
         video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
     levels = classify(classifier, video)
     intensities = smooth_intensities(levels, classifier.units, windows, fps=video.fps)
     weights = (intensities[:, :, None] * matrix).amax(1)
-    active = ((levels > 0)[:, :, None] & (matrix > 0)).any(1)
+    active = _moved(levels, matrix)
+    if at_rest:
+        active |= (matrix > 0).any(0) & ~_moved(levels, whole)
     return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
+
+
+def _moved(levels: Tensor, matrix: Tensor) -> Tensor:
+    """Shapes that some unit of levels (T,A) moves, by the weights (A,N): (T,N) bool."""
+    return (levels > 0).to(matrix) @ (matrix > 0).to(matrix) > 0
 
 
 @torch.no_grad()
