@@ -76,8 +76,8 @@ def upper_layout(rig: BlendshapeRig, upper: int = 54, lower: int = 12) -> Attach
     """Many markers above the nose's tip, a few below."""
     spots = stage_markers(rig, 600)
     high = (spots.on(rig.neutral.faces, rig.vertices)[:, 1] > -25).tolist()
-    free = zip(spots.labels or (), high, away_from_sides(rig, spots).tolist(), strict=True)
-    free = [(label, up) for label, up, away in free if away]
+    away = away_from_sides(rig, spots).tolist()
+    free = [(label, up) for label, up, apart in zip(spots.labels or (), high, away, strict=True) if apart]
     above, below = [label for label, up in free if up], [label for label, up in free if not up]
     return spots.select([*above[:upper], *below[:lower], *SIDE_MARKERS])
 
