@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -211,7 +212,10 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
 
 def main() -> None:
     """Parses flags, trains, prints."""
-    trained = train(tyro.cli(Settings, description=__doc__), print)
+    try:
+        trained = train(tyro.cli(Settings, description=__doc__), print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
     if trained.comparison is not None:
         print(trained.comparison)
 

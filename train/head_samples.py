@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface import Mesh, load_mesh
-from torchface.errors import TopologyError
+from torchface.errors import FileFormatError, TopologyError
 from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.geometry.procrustes import aligned, generalised_procrustes
 from torchface.geometry.samples import MovedSamples, SampleRange, Samples, blocks
@@ -65,6 +65,8 @@ def performers(count: int, seed: int) -> Source:
 
 def registered(folder: Path) -> Source:
     """The meshes of a folder, by name."""
+    if not folder.is_dir():
+        raise FileFormatError(f"{folder}: found no such folder, expected one of registered meshes")
     paths = find_scans([folder])
     stamps = [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
     key = hashlib.sha256("\n".join(stamps).encode()).hexdigest()

@@ -16,6 +16,7 @@ import torch
 import tyro
 
 from torchface import TorchfaceError, load_mesh, zoo
+from torchface.errors import ValueRangeError
 from torchface.geometry.samples import SampleRange, Samples, blocks
 from torchface.modeling import HeadModel
 from torchface.modeling.model_quality import ModelQuality, model_quality
@@ -114,7 +115,11 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
         )
         learned = SampleRange(balanced, 0, count)
         test_colors = SampleRange(balanced, count, len(gathered.shapes))
-        color = fit_sequence(learned, settings.color_components, work / "color", _counting(say, "colours"))
+        try:
+            color = fit_sequence(learned, settings.color_components, work / "color", _counting(say, "colours"))
+        except ValueRangeError as error:
+            say(f"no model of colours: {error}")
+            test_colors = None
     model = HeadModel.on(gathered.template, shape, color)
     say("measuring")
     quality = None

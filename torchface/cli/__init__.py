@@ -50,6 +50,12 @@ COMMANDS: dict[str, Callable[..., None]] = {
 DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship them as ONNX and glTF."
 
 
+_EXPORT = (
+    "Write an ONNX graph: of your own solver, as below, or of a learned model by its name or folder, as in "
+    "`torchface export head --out head.onnx`."
+)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command; an error that the user can mend ends with its message and exit status 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -60,9 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(export_model, prog="torchface export", args=words[1:])
         elif words[:1] == ["export"]:
-            tyro.extras.subcommand_cli_from_dict(
-                EXPORTS, prog="torchface export", description="Write an ONNX graph.", args=words[1:]
-            )
+            tyro.extras.subcommand_cli_from_dict(EXPORTS, prog="torchface export", description=_EXPORT, args=words[1:])
         else:
             tyro.extras.subcommand_cli_from_dict(
                 COMMANDS | {"export": _export_help}, prog="torchface", description=DESCRIPTION, args=words

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError
+from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.alignment import Similarity
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
@@ -34,6 +34,7 @@ _RIGID_SAMPLES = 1500
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _NEAR = 3.0
 _FAR = 10.0
+_FEWEST_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
 Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
 """Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
@@ -103,7 +104,8 @@ def register(
         ShapeError: landmarks of the wrong shape, or fewer than three that can be used.
         TopologyError: an empty or tiny mesh, a landmark on no vertex of the template, or a model of another topology.
         ValueRangeError: another unit than millimetres, landmarks on a line, or a scan that does not show the face.
-        AlignmentError: the landmarks do not fit, or no pose is found without them.
+        AlignmentError: the landmarks do not fit, no pose is found without them, or hardly anything of the template
+            comes to lie on the scan.
 
     Source: Amberg, Romdhani, Vetter 2007; thesis 3.2.3, equation 7 and Algorithm 1.
     """
@@ -133,6 +135,12 @@ def register(
     say("measuring")
     nearest = _nearest(start.surface, deformer.current)
     matched = _matched(deformer, start.surface, nearest, schedule)
+    met = float(matched[deformer.exposed].double().mean())
+    if met < _FEWEST_MET:
+        raise AlignmentError(
+            f"scan: found only {met:.0%} of the bent template's surface on the scan, expected at least "
+            f"{_FEWEST_MET:.0%}; do the landmarks belong to this scan, and does it show what the template shows?"
+        )
     vertices = deformer.current.to(template.vertices)
     mesh = replace(template, vertices=vertices, colors=None, texture=None)
     notes = [*start.notes, *_model_notes(fit), *_final_notes(template, scan, deformer, texture_size)]
@@ -178,7 +186,7 @@ def _start(
     by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), []
     if landmarks is None:
         by = "shape"
-        pose = find_pose(samples, ScanPoints(prepared.vertices, prepared.faces)).pose
+        pose = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
         if detector is not None:
             laid = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
             landmarks = detector(laid, scan, pose)
@@ -194,6 +202,21 @@ def _start(
     targets = ScanPoints(prepared.vertices, prepared.faces)
     pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
     return _Start(by, pose, LandmarkPull(ids, points), prepared, surface, (*prepared.notes, *notes))
+
+
+def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> Similarity:
+    """By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan."""
+    try:
+        return find_pose(samples, scan).pose
+    except AlignmentError:
+        notes = template.annotations
+        if notes is None or "face" not in notes.regions:
+            raise
+        face = exposed[notes.regions["face"].cpu()[exposed]]
+        if len(face) < 3:
+            raise
+        vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
+        return find_pose(Samples.of(vertices, faces, evenly_spread(vertices, face, _RIGID_SAMPLES)), scan).pose
 
 
 def _model_fit(model: ShapeModel, template: Mesh, laid: Tensor, start: _Start, schedule: Schedule) -> ModelFit:

@@ -18,6 +18,8 @@ from torchface.take import Take
 
 Rows = list[tuple[str, str]]
 
+_LONGEST_VALUE = 240
+
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
     """Rows (what, value) about a mesh, rig, take, attachment or solver.
@@ -130,5 +132,9 @@ def _graph_rows(path: Path) -> Rows:
         ("outputs", ", ".join(map(shape, model.graph.output))),
         ("operators", f"{len(model.graph.node)}: {', '.join(sorted({node.op_type for node in model.graph.node}))}"),
         ("size", f"{len(data):,} bytes"),
-        *((entry.key, entry.value) for entry in model.metadata_props),
+        *((entry.key, _shortened(entry.value)) for entry in model.metadata_props),
     ]
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ... ({len(text):,} characters)"

@@ -169,6 +169,8 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
         FileFormatError: a broken file, or points that are no pixels.
         ShapeError: not 68 landmarks.
     """
+    if not photographs:
+        raise NameMismatchError("fit: found no photograph, expected one at least")
     if len(files) == 1 and files[0].suffix.lower() == ".xml":
         return [_face_in(files[0], path, face) for path in photographs]
     if len(files) != len(photographs):
@@ -182,7 +184,10 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
 
 
 def _pixels(file: Path) -> Tensor:
-    points = load_landmark_points(file).ibug()
+    try:
+        points = load_landmark_points(file).ibug()
+    except ShapeError as error:
+        raise ShapeError(f"{file}: {error}") from error
     if points.shape[1] != 2:
         raise FileFormatError(f"{file}: found points in space, three numbers each; expected pixels of a photograph")
     return points.double()

@@ -10,6 +10,7 @@ from torchface.viz.page import Section, Table, write_page
 from torchface.workflows.solve import SolveReport
 
 _CURVES_A_PICTURE = 13
+_MOST_ROWS = 400
 
 
 def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
@@ -29,7 +30,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
         sections.append(Section("Helmet", text, pictures=[("helmet.png", curves)]))
     if report.cleanup is not None:
         heading = ("what", "markers", "frames", "off by", "done")
-        rows = report.cleanup.table(gaps=False)
+        rows = report.cleanup.table()[:_MOST_ROWS]
         tables = [Table(heading, rows)] if rows else []
         sections.append(Section("What was wrong with the take", report.cleanup.summary(), tables))
     order = weights.amax(0).argsort(descending=True).tolist()

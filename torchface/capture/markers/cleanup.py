@@ -74,7 +74,7 @@ class Cleanup:
     def summary(self) -> str:
         """How many of each."""
         counts = Counter(defect.kind for defect in self.defects)
-        found = ", ".join(f"{counts[kind]} {kind}" for kind in ("swap", "spike", "displaced", "gap") if counts[kind])
+        found = ", ".join(f"{kind}: {counts[kind]}" for kind in ("swap", "spike", "displaced", "gap") if counts[kind])
         share = 100 * float(self.masked.double().mean()) if self.masked.numel() else 0.0
         return f"{found or 'nothing wrong'}; {share:.2f} % of the samples masked"
 
