@@ -221,9 +221,9 @@ def test_eight_examples_make_another_performers_rig(average: BlendshapeRig) -> N
     noise = 0.15 * torch.randn(weights.shape, generator=generator)
     guessed = (weights + noise * ((weights > 0) | (torch.rand(weights.shape, generator=generator) < 0.05))).clamp(0, 1)
     loose = replace(SHORT, gamma=(10.0, 10.0))
-    for given, schedule, most in ((weights, SHORT, 0.4), (guessed, loose, 0.5)):
+    for given, schedule in ((weights, SHORT), (guessed, loose)):
         made = rig_from_examples(average, actor.neutral, examples, given, schedule)
-        assert float(made.errors[-1].mean()) < most * error(made.transferred, weights, examples)
+        assert float(made.errors[-1].mean()) < 0.4 * error(made.transferred, weights, examples)
         before, after = (error(rig, best_weights(rig, goals), goals) for rig in (made.transferred, made.rig))
         assert after < 0.75 * before
         assert float(made.angles.max()) < 30
