@@ -13,7 +13,7 @@ import pytest
 from torchface import zoo
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LARGEST = 2 * 2**20
+LARGEST = 2_000_000
 
 
 @pytest.mark.parametrize("name", sorted(path.parent.name for path in (REPOSITORY / "models").glob("*/model.toml")))
