@@ -1,0 +1,1 @@
+"""Head pose and blendshape weights from one ordinary camera without markers."""
