@@ -1,5 +1,6 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
+from torchface.io.cameras import load_calibration, save_calibration
 from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save_rig
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.images import load_image, save_image, save_image16
@@ -25,6 +26,7 @@ __all__ = [
     "MeshSequence",
     "MeshSequenceWriter",
     "ShapeMatch",
+    "load_calibration",
     "load_correspondences",
     "load_detail_maps",
     "load_ict_facekit",
@@ -38,6 +40,7 @@ __all__ = [
     "load_rig",
     "load_take",
     "save_animation",
+    "save_calibration",
     "save_correspondences",
     "save_image",
     "save_image16",

@@ -59,10 +59,10 @@ def load_calibration(path: str | Path) -> CameraCalibration:
     if not isinstance(table, dict) or not set(table) <= set(_COEFFICIENTS):
         raise FileFormatError(f"{path}: found no table of {', '.join(_COEFFICIENTS)} under 'distortion', expected one")
     distortion = [_number(table.get(name, 0.0), name, path) for name in _COEFFICIENTS]
-    error = None if "error" not in document else _number(document["error"], "error", path)
+    measured = None if "error" not in document else _number(document["error"], "error", path)
     intrinsics = torch.tensor([[focal[0], skew, center[0]], [0, focal[1], center[1]], [0, 0, 1]], dtype=torch.float64)
     try:
-        return CameraCalibration(intrinsics, torch.tensor(distortion, dtype=torch.float64), width, height, error)
+        return CameraCalibration(intrinsics, torch.tensor(distortion, dtype=torch.float64), width, height, measured)
     except TorchfaceError as wrong:
         raise FileFormatError(f"{path}: {wrong}") from wrong
 
