@@ -9,7 +9,8 @@ import torch
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.modeling import MorphableModel
-from torchface.modeling.color_casts import color_casts, texture_areas, to_linear, to_srgb, without_cast
+from torchface.modeling.color_casts import color_casts, texture_areas, without_cast
+from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.synthetic import head
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torchface import Mesh, save_mesh, zoo
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
 from torchface.modeling import HeadModel, MorphableModel
-from torchface.modeling.color_casts import to_linear, to_srgb
+from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.synthetic import draw_identities, head
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.viz import model_pictures

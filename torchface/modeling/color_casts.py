@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.mesh import Mesh
+from torchface.rendering.color_space import to_linear, to_srgb
 
 _DARK, _BRIGHT = 0.02, 0.98
 _STEPS = 20
@@ -94,13 +95,3 @@ def texture_areas(mesh: Mesh) -> Tensor:
     shares = torch.zeros(len(mesh.vertices), dtype=torch.float64, device=area.device)
     shares.index_add_(0, mesh.faces.flatten(), area.repeat_interleave(3) / 3)
     return (shares / shares.sum().clamp(min=1e-12)).float()
-
-
-def to_linear(colors: Tensor) -> Tensor:
-    """sRGB in [0,1] to linear light. Source: IEC 61966-2-1."""
-    return torch.where(colors <= 0.04045, colors / 12.92, ((colors.clamp(min=0) + 0.055) / 1.055).pow(2.4))
-
-
-def to_srgb(light: Tensor) -> Tensor:
-    """Linear light to sRGB. Source: IEC 61966-2-1."""
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=0.0031308).pow(1 / 2.4) - 0.055)

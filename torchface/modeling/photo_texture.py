@@ -14,8 +14,8 @@ from torchface.geometry.operators import border_vertices, components, edges, ver
 from torchface.geometry.uv_margin import laid_out
 from torchface.geometry.uv_raster import rasterise_uvs
 from torchface.mesh import Mesh
-from torchface.modeling.visibility import Shown, shown_in
 from torchface.rendering.raycast import RayCaster
+from torchface.rendering.visibility import Shown, shown_in
 
 _SQUARELY = 0.2
 _SHARP = 3.0

@@ -13,9 +13,9 @@ from torchface.geometry.camera import Camera
 from torchface.geometry.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.modeling.morphable import MorphableModel
-from torchface.modeling.visibility import shown_in
 from torchface.optim import box_qp
 from torchface.rendering.raycast import RayCaster
+from torchface.rendering.visibility import shown_in
 
 _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with what stands behind
 _LEAST_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative

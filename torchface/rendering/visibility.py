@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
+from torchface.geometry.calibration import CameraCalibration
 from torchface.geometry.camera import Camera
+from torchface.geometry.distortion import distort
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import sample_texture
 
@@ -28,7 +30,14 @@ class Shown:
     colors: Tensor
 
 
-def shown_in(image: Tensor, camera: Camera, caster: RayCaster, points: Tensor, normals: Tensor) -> Shown:
+def shown_in(
+    image: Tensor,
+    camera: Camera,
+    caster: RayCaster,
+    points: Tensor,
+    normals: Tensor,
+    calibration: CameraCalibration | None = None,
+) -> Shown:
     """What a photograph (3,H,W) shows at points (Q,3) with normals (Q,3).
 
     Args:
@@ -37,6 +46,7 @@ def shown_in(image: Tensor, camera: Camera, caster: RayCaster, points: Tensor, n
         caster: the mesh that the points lie on, which hides some of them.
         points: millimetres.
         normals: unit.
+        calibration: of a lens that bends the picture; none if absent.
 
     Raises:
         ShapeError: the picture is not of the camera's size.
@@ -49,6 +59,8 @@ def shown_in(image: Tensor, camera: Camera, caster: RayCaster, points: Tensor, n
     depth = points @ camera.rotation.double()[2] + camera.translation.double()[2]
     pixels = camera.project(points)
     limit = torch.tensor([camera.width - 1, camera.height - 1], dtype=torch.float64)
+    if calibration is not None:
+        pixels = distort(pixels, calibration)
     within = ((pixels >= 0) & (pixels <= limit)).all(-1) & (depth > 0)
     asked = (within & (cosine > 0)).nonzero()[:, 0]
     starts = points[asked] + _OFF_THE_SKIN * (normals[asked] + toward[asked])
