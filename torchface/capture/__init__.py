@@ -11,12 +11,14 @@ from torchface.capture.markers import (
     fit_attachment,
     rest_residual,
 )
+from torchface.capture.video import VideoSolver
 
 __all__ = [
     "ActionUnitClassifier",
     "HelmetSolver",
     "HybridSolver",
     "MarkerSolver",
+    "VideoSolver",
     "WholeTakeSolver",
     "action_unit_curves",
     "align_take",

@@ -23,9 +23,8 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
         [0.0, 1.0, 0.0]
     """
     square = vectors.square().sum(-1)[..., None, None]
-    angle = square.sqrt()
     small = square < 1e-12
-    safe = torch.where(small, 1.0, angle)
+    safe = torch.where(small, 1.0, square).sqrt()  # in this order: the root's slope at 0 is infinite
     first = torch.where(small, 1 - square / 6, safe.sin() / safe)
     # 2 sin²(θ/2)/θ² keeps the digits that 1 - cos θ loses.
     second = torch.where(small, 0.5 - square / 24, 2 * (safe / 2).sin().square() / safe.square())

@@ -1,0 +1,116 @@
+"""The 68 landmarks as points of a rig: inner ones are vertices, those of the contour slide to where the face ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.silhouette import level_curves, outermost
+from torchface.rig import BlendshapeRig
+
+LANDMARKS = 68
+JAW = 17
+"""How many of the 68 landmarks trace the face's contour; they come first."""
+
+
+@dataclass(frozen=True, eq=False)
+class FacePoints:
+    """P points that follow N weights: the landmarks, and the curves that the contour's ones slide along.
+
+    Args:
+        rest: (P,3), millimetres; the first 68 rows are the landmarks' own vertices.
+        basis: what a unit of each weight adds, (P,3,N).
+        rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
+        valid: which of them count, (J,C) bool.
+        side: of the face, +1 toward positive x, (J,).
+    """
+
+    rest: Tensor
+    basis: Tensor
+    rows: Tensor
+    valid: Tensor
+    side: Tensor
+
+    @staticmethod
+    def of(rig: BlendshapeRig, landmark_vertices: Tensor, slides: bool = True) -> FacePoints:
+        """Those of a rig whose landmarks are the vertices (68,), float64.
+
+        Args:
+            rig: N shapes.
+            landmark_vertices: vertex ids in iBUG's order, (68,).
+            slides: contour landmarks slide; otherwise they stay at their vertices, visible or not.
+
+        Raises:
+            ShapeError: not 68 vertices.
+            ValueRangeError: a vertex that the rig lacks.
+        """
+        count = len(rig.vertices)
+        marks = landmark_vertices.detach().long().to(rig.vertices.device)
+        if marks.shape != (LANDMARKS,):
+            raise ShapeError(f"landmark_vertices: found {tuple(marks.shape)}, expected ({LANDMARKS},)")
+        if int(marks.min()) < 0 or int(marks.max()) >= count:
+            raise ValueRangeError(
+                f"landmark_vertices: found {int(marks.min())} to {int(marks.max())}, expected ids below {count}"
+            )
+        stacked = torch.cat([rig.vertices[None], rig.deltas]).detach()
+        if not slides:
+            values = stacked[:, marks].double()
+            own = torch.arange(JAW, device=marks.device)[:, None]
+            return FacePoints._made(values, own, torch.ones_like(own, dtype=torch.bool), marks.new_zeros(JAW).double())
+        x, y = rig.vertices[:, 0].abs(), rig.vertices[:, 1]
+        wing, top, bottom = float(x[marks[[31, 35]]].max()), float(y[marks[27]]), float(y[marks[33]])
+        nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
+        faces = rig.neutral.faces
+        curves = level_curves(rig.vertices, faces[~nose[faces].any(1)], marks[:JAW])
+        used, place = torch.cat([marks.cpu(), curves.vertices.flatten()]).unique(return_inverse=True)
+        values = stacked[:, used.to(marks.device)].double().cpu().transpose(0, 1)
+        local = replace(curves, vertices=place[LANDMARKS:].reshape(curves.vertices.shape))
+        on_curves = local.interpolate(values).flatten(0, 1)
+        points = torch.cat([values[place[:LANDMARKS]], on_curves]).transpose(0, 1).to(marks.device)
+        rows = LANDMARKS + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
+        # A point that is valid keeps its place; the others are never asked for.
+        kept = torch.cat([torch.arange(LANDMARKS), rows[curves.valid]])
+        compact = torch.zeros(LANDMARKS + curves.valid.numel(), dtype=torch.long)
+        compact[kept] = torch.arange(len(kept))
+        return FacePoints._made(
+            points[:, kept.to(marks.device)],
+            compact[rows].to(marks.device),
+            curves.valid.to(marks.device),
+            curves.side.to(marks.device),
+        )
+
+    @staticmethod
+    def _made(values: Tensor, rows: Tensor, valid: Tensor, side: Tensor) -> FacePoints:
+        return FacePoints(values[0].contiguous(), values[1:].permute(1, 2, 0).contiguous(), rows, valid, side)
+
+    def at(self, weights: Tensor) -> Tensor:
+        """Positions (B,P,3) at weights (B,N)."""
+        moved = weights @ self.basis.flatten(0, 1).T
+        return self.rest + moved.unflatten(1, self.rest.shape)
+
+    def chosen(self, weights: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Tensor) -> Tensor:
+        """Which point each landmark is in each frame, rows (B,68) into the points.
+
+        A contour landmark is the point of its curve that is seen furthest out, away from the face's own vertical; on
+        the near side of a turned face that is the landmark's own vertex.
+
+        Args:
+            weights: (B,N).
+            rotation, translation: rig to camera, (B,3,3) and (B,3).
+            intrinsics: (3,3).
+        """
+        rows = torch.arange(LANDMARKS, device=weights.device).expand(len(weights), -1)
+        if self.rows.shape[1] == 1:
+            return rows
+        seen = self.at(weights)[:, LANDMARKS:] @ (intrinsics @ rotation).transpose(-1, -2)
+        seen = seen + (translation @ intrinsics.T)[:, None]
+        pixels = (seen[..., :2] / seen[..., 2:])[:, (self.rows - LANDMARKS).clamp(min=0)]
+        up = rotation[:, :2, 1]
+        across = torch.nn.functional.normalize(torch.stack([-up[:, 1], up[:, 0]], dim=-1), dim=-1)
+        across = across * torch.where((across * rotation[:, :2, 0]).sum(-1) < 0, -1.0, 1.0)[:, None]
+        best = outermost(pixels, self.valid, across[:, None] * self.side[:, None])
+        slid = self.rows[torch.arange(JAW, device=weights.device), best]
+        return torch.cat([torch.where(best > 0, slid, rows[:, :JAW]), rows[:, JAW:]], dim=1)

@@ -1,0 +1,437 @@
+"""Blendshape weights from landmarks in the pictures of one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
+from torchface.capture.priors.shape_prior import ShapePrior
+from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.fixed_point import attach_gradients
+from torchface.capture.video.reprojection import HeadState, Linearised, linearise
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.pnp import solve_pnp
+from torchface.optim import box_qp
+from torchface.rig import BlendshapeRig
+
+SPARSITY = 0.0
+RIDGE = 1e-2
+CONTOUR_WEIGHT = 0.5
+CONTOUR_SLIDE = 0.3
+POSE_TRUST = 0.1
+
+_FEWEST = 6
+_ROUNDS = 30
+# What is known of a pose when no landmark tells: turns to half a radian, places to half a metre.
+_LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
+_COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
+
+
+class Dynamics(Protocol):
+    """What the solver asks of a prior of how weights go on; see ``torchface.capture.priors.DynamicsPrior``.
+
+    Args:
+        window: how many frames it looks back.
+    """
+
+    window: int
+
+    def energy(self, windows: Tensor) -> Quadratic:
+        """Of the weights that follow windows (B,J,N)."""
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raises ``NameMismatchError`` for other shapes than it was learned for."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoSolution:
+    """What a face did in T frames.
+
+    Args:
+        weights: in [0,1], (T,N).
+        rotation: rig to camera, refined with the weights, (T,3,3).
+        translation: rig to camera, (T,3), millimetres.
+        errors: root mean square distance of the seen landmarks to the rig's, (T,), pixels; NaN where none is seen.
+        solved: frames with at least six landmarks, (T,) bool; the others are bridged by what priors tell.
+    """
+
+    weights: Tensor
+    rotation: Tensor
+    translation: Tensor
+    errors: Tensor
+    solved: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class VideoState:
+    """What one frame hands on to the next.
+
+    Args:
+        head: weights (1,N) and pose of the frame; None before the first.
+        window: weights of the latest frames, the newest last, (1,J,N) with J growing up to the dynamics prior's window.
+        solved: whether the frame showed at least six landmarks.
+    """
+
+    head: HeadState | None
+    window: Tensor
+    solved: bool = False
+
+    @property
+    def weights(self) -> Tensor:
+        """(N,)."""
+        return self._known().weights[0]
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rig to camera, (3,3)."""
+        return self._known().rotation[0]
+
+    @property
+    def translation(self) -> Tensor:
+        """Rig to camera, (3,), millimetres."""
+        return self._known().translation[0]
+
+    def _known(self) -> HeadState:
+        if self.head is None:
+            raise ValueRangeError("video state: found no frame yet; expected one solved by step")
+        return self.head
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTerms:
+    """What the energies of B frames are made of.
+
+    Args:
+        landmarks: finite, (B,68,2).
+        precision: of each, one over its standard deviation, 0 where not seen, (B,68).
+        rotation, translation: the tracked pose, (B,3,3) and (B,3).
+        extra: energies of the weights that do not change from step to step.
+    """
+
+    landmarks: Tensor
+    precision: Tensor
+    rotation: Tensor
+    translation: Tensor
+    extra: Quadratic
+
+
+class VideoSolver(nn.Module):
+    r"""Solves 68 landmarks in one camera's frames for blendshape weights, and the head's pose with them.
+
+    .. math::
+        \min_{0 \le w \le 1,\, R,\, t} \; \tfrac12 \sum_l \frac{c_l}{\sigma^2}
+        \lVert \pi(K (R (b_l + B_l w) + t)) - q_l \rVert^2
+        - \lambda \log p(w) + \gamma \tfrac12 \frac{\lVert w - m(w_{-j..-1}) \rVert^2}{V}
+        + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2 + \kappa \, D(R, t; \hat R, \hat t)
+
+    Every term is a negative log likelihood, so each is in units of its own variance. Frames are solved one after the
+    other, each from the one before, by Gauss-Newton's steps: quadratic programs in a box. A pose tracked from stable
+    landmarks is noisy and biased by what the face does, so it is only where the search starts and a weak prior: D is
+    the distance from it in what the frame's own landmarks tell of a pose. Contour landmarks slide to where the face
+    is seen to end; their errors along the contour count less. Solved in float64.
+
+    Args:
+        rig: N shapes, of the person in the picture.
+        landmark_vertices: the 68 in iBUG's order, vertex ids; the rig's annotated ones if absent.
+        intrinsics: K, (3,3), pixels; of pictures without distortion.
+        prior: which weights faces have; its ``strength`` is :math:`\lambda`.
+        dynamics: how weights go on.
+        pixel_noise: :math:`\sigma` of an inner landmark, pixels.
+        sparsity: :math:`\beta`, for a weight of 1.
+        ridge: :math:`\varepsilon`, for a squared weight of 1.
+        landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
+        dynamics_strength: :math:`\gamma`; 1 is Bayes' rule.
+        pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks; 0 refines freely.
+        contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
+            are the vertices themselves.
+        tolerance: steps end when no weight moves further than this.
+
+    Raises:
+        NameMismatchError: a prior was learned for other shapes than the rig has.
+        ShapeError, ValueRangeError: an argument is not as above.
+
+    Source: thesis 4.2.6, 4.2.9, 4.2.10; equations 40, 44, 65.
+    """
+
+    intrinsics: Tensor
+    landmark_weights: Tensor
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        landmark_vertices: Tensor | None,
+        intrinsics: Tensor,
+        prior: ShapePrior | None = None,
+        dynamics: Dynamics | None = None,
+        pixel_noise: float = 1.0,
+        sparsity: float = SPARSITY,
+        ridge: float = RIDGE,
+        landmark_weights: Tensor | None = None,
+        dynamics_strength: float = 1.0,
+        pose_trust: float = POSE_TRUST,
+        contour_slide: float = CONTOUR_SLIDE,
+        tolerance: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        self.names = rig.names
+        marks = rig.neutral.landmarks if landmark_vertices is None else landmark_vertices
+        if intrinsics.shape != (3, 3):
+            raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
+        weights = _default_weights() if landmark_weights is None else landmark_weights.detach()
+        if weights.shape != (LANDMARKS,):
+            raise ShapeError(f"landmark_weights: found {tuple(weights.shape)}, expected ({LANDMARKS},)")
+        _check_not_negative("landmark_weights", weights)
+        for name, value in (("sparsity", sparsity), ("ridge", ridge), ("pose_trust", pose_trust)):
+            _check_not_negative(name, torch.tensor(value))
+        _check_not_negative("dynamics_strength", torch.tensor(dynamics_strength))
+        if not 0 < pixel_noise < float("inf") or not 0 <= contour_slide <= 1 or not tolerance > 0:
+            raise ValueRangeError(
+                f"video solver: found pixel_noise {pixel_noise}, contour_slide {contour_slide}, tolerance {tolerance}, "
+                "expected pixels above 0, a share, and a positive number"
+            )
+        for learned in (prior, dynamics):
+            if learned is not None:
+                learned.require(rig.names)
+        self.points = FacePoints.of(rig, marks, slides=contour_slide < 1)
+        self.prior, self.dynamics = prior, dynamics
+        self.pixel_noise, self.sparsity, self.ridge = float(pixel_noise), float(sparsity), float(ridge)
+        self.dynamics_strength, self.pose_trust = float(dynamics_strength), float(pose_trust)
+        self.contour_slide, self.tolerance = float(contour_slide), float(tolerance)
+        self.register_buffer("intrinsics", intrinsics.detach().double())
+        self.register_buffer("landmark_weights", weights.double())
+        shapes, like = len(rig.names), self.points.rest
+        self._constant = sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+        free = like.new_full((6,), torch.inf)
+        self._lower = torch.cat([like.new_zeros(shapes), -free])
+        self._upper = torch.cat([like.new_ones(shapes), free])
+        self._loose = like.new_tensor([_LOOSE_TURN**-2] * 3 + [_LOOSE_PLACE**-2] * 3).diag()
+
+    def forward(
+        self,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+    ) -> VideoSolution:
+        """Weights and poses of consecutive frames, each from what was seen until then.
+
+        Args:
+            landmarks: (T,68,2), pixels; NaN for not seen.
+            rotation, translation: tracked poses, rig to camera, (T,3,3) and (T,3), NaN for lost; found here if absent.
+            confidence: how far each landmark is trusted, (T,68) in [0,1].
+
+        Returns:
+            What the face did; differentiable in all arguments.
+
+        Raises:
+            ShapeError: the shapes do not fit each other.
+            ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
+        """
+        count = self._check(landmarks, rotation, translation, confidence)
+        enough = torch.isfinite(landmarks).all(-1).sum(1) >= _FEWEST
+        if not bool(enough.any()):
+            raise ValueRangeError(
+                f"landmarks: found fewer than {_FEWEST} in each of {count} frames, expected a face in some"
+            )
+        # A frame leans on the one before, so frames come one after the other.
+        states, state = [], self.start()
+        first = int(enough.nonzero()[0, 0])
+        for t in range(first, count):
+            state = self.step(
+                state,
+                landmarks[t],
+                None if rotation is None else rotation[t],
+                None if translation is None else translation[t],
+                None if confidence is None else confidence[t],
+            )
+            states.append(state)
+        states = [states[0]] * first + states
+        weights = torch.stack([state.weights for state in states])
+        turned, moved = (torch.stack([getattr(s, name) for s in states]) for name in ("rotation", "translation"))
+        errors = self.reprojection_errors(landmarks, weights, turned, moved)
+        return VideoSolution(weights, turned, moved, errors, enough)
+
+    def start(self) -> VideoState:
+        """The state before the first frame."""
+        return VideoState(None, self.points.rest.new_zeros(1, 0, len(self.names)))
+
+    def step(
+        self,
+        state: VideoState,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+    ) -> VideoState:
+        """The next frame's state; its ``weights``, ``rotation`` and ``translation`` are the frame's.
+
+        A frame with fewer than six landmarks goes on as the priors tell, or as the frame before.
+
+        Args:
+            state: of the frame before; ``start()`` for the first.
+            landmarks: (68,2), pixels; NaN for not seen.
+            rotation, translation: the tracked pose, (3,3) and (3,); the last one's if absent or NaN.
+            confidence: (68,) in [0,1].
+
+        Raises:
+            ShapeError: an argument is not as above.
+            ValueRangeError: the first frame shows fewer than six landmarks, or a landmark is infinite.
+        """
+        batch = [None if x is None else x[None] for x in (rotation, translation, confidence)]
+        self._check(landmarks[None], *batch)
+        dtype = landmarks.dtype
+        found, (rotation, translation, confidence) = (
+            landmarks[None].double(),
+            (None if x is None else x.double() for x in batch),
+        )
+        seen = torch.isfinite(found).all(-1)
+        enough = int(seen.sum()) >= _FEWEST
+        if state.head is None and not enough:
+            raise ValueRangeError(
+                f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_FEWEST} to begin with"
+            )
+        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence)
+        known = (
+            rotation is not None
+            and translation is not None
+            and bool(torch.isfinite(rotation).all() & torch.isfinite(translation).all())
+        )
+        if not known:
+            rotation, translation = self._pose_of(state, found)
+        assert rotation is not None
+        assert translation is not None
+        begin = state.head or HeadState(found.new_zeros(1, len(self.names)), rotation, translation)
+        extra = self._constant
+        window = state.window.double()
+        if self.dynamics is not None and window.shape[1] >= self.dynamics.window:
+            extra = extra + self.dynamics_strength * self.dynamics.energy(window)
+        terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, extra)
+        start = HeadState(begin.weights.detach().double(), rotation.detach(), translation.detach())
+        head = self.solve(terms, start)
+        longest = 0 if self.dynamics is None else self.dynamics.window
+        window = torch.cat([window, head.weights[:, None]], dim=1)[:, -longest:] if longest else window
+        given = HeadState(head.weights.to(dtype), head.rotation.to(dtype), head.translation.to(dtype))
+        return VideoState(given, window, enough)
+
+    def solve(self, terms: FrameTerms, start: HeadState) -> HeadState:
+        """Weights (B,N) and poses of B frames on their own, from a start, float64."""
+        inputs = (terms.landmarks, terms.precision, terms.rotation, terms.translation, terms.extra.H, terms.extra.f)
+        with torch.no_grad():
+            head = start
+            for _ in range(_ROUNDS):
+                before, head = head, self._advanced(terms, head)
+                if float((head.weights - before.weights).abs().max()) < self.tolerance:
+                    break
+        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+            return self._attached(terms, head)
+        return head
+
+    def _advanced(self, terms: FrameTerms, head: HeadState) -> HeadState:
+        """One Gauss-Newton step."""
+        shapes = len(self.names)
+        energy = self.energy(terms, head)
+        begin = torch.nn.functional.pad(head.weights, (0, 6))
+        exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
+        found = box_qp(energy.H, energy.f, self._lower, self._upper, begin, exactness)
+        return head.moved(found[:, :shapes], found[:, shapes:])
+
+    def energy(self, terms: FrameTerms, head: HeadState) -> Quadratic:
+        """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
+        rows = self.points.chosen(head.weights.detach(), head.rotation, head.translation, self.intrinsics)
+        at = linearise(self.points, head, rows, self.intrinsics, terms.landmarks, terms.precision, self.contour_slide)
+        seen = at.quadratic(head.weights)
+        return seen + self._pose_term(terms, head, at) + _beside_motion(self._weight_terms(terms, head))
+
+    def _weight_terms(self, terms: FrameTerms, head: HeadState) -> Quadratic:
+        return terms.extra if self.prior is None else terms.extra + self.prior.energy(head.weights)
+
+    def _pose_term(self, terms: FrameTerms, head: HeadState, at: Linearised) -> Quadratic:
+        """The pull to the tracked pose."""
+        shapes = len(self.names)
+        by_motion = at.jacobian[..., shapes:].flatten(1, 2)
+        precision = self.pose_trust * (by_motion.transpose(1, 2) @ by_motion) + self._loose
+        away = head.motion_from(terms.rotation, terms.translation)
+        H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
+        return Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
+
+    def _attached(self, terms: FrameTerms, head: HeadState) -> HeadState:
+        """The converged state as a differentiable function of the terms."""
+        shapes = len(self.names)
+
+        def gradient(x: Tensor) -> Tensor:
+            near = head.moved(x[:, :shapes], x[:, shapes:])
+            energy = self.energy(terms, near)
+            here = torch.nn.functional.pad(near.weights, (0, 6))
+            return (energy.H @ here[..., None])[..., 0] + energy.f
+
+        x = torch.nn.functional.pad(head.weights, (0, 6))
+        free = (x > self._lower) & (x < self._upper)
+        x = attach_gradients(gradient, x, free)
+        return head.moved(x[:, :shapes], x[:, shapes:])
+
+    def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
+        weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
+        rows = self.points.chosen(weights, rotation, translation, self.intrinsics)
+        placed = self.points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
+        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ self.intrinsics.T
+        squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
+        return squared.nanmean(1).sqrt().to(landmarks.dtype)
+
+    def _precision(self, seen: Tensor, confidence: Tensor | None) -> Tensor:
+        weights = self.landmark_weights * seen
+        if confidence is not None:
+            weights = weights * confidence
+        # The root's slope is infinite at 0.
+        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / self.pixel_noise
+
+    def _pose_of(self, state: VideoState, landmarks: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the frame before, or by all landmarks."""
+        if state.head is not None:
+            return state.head.rotation.double(), state.head.translation.double()
+        pose = solve_pnp(self.points.rest[:LANDMARKS], landmarks, self.intrinsics, self.landmark_weights)
+        return pose.rotation, pose.translation
+
+    def _check(
+        self, landmarks: Tensor, rotation: Tensor | None, translation: Tensor | None, confidence: Tensor | None
+    ) -> int:
+        count = len(landmarks)
+        expected = {"landmarks": (count, LANDMARKS, 2), "rotation": (count, 3, 3), "translation": (count, 3)}
+        expected["confidence"] = (count, LANDMARKS)
+        given = {"landmarks": landmarks, "rotation": rotation, "translation": translation, "confidence": confidence}
+        for name, value in given.items():
+            if value is not None and value.shape != expected[name]:
+                raise ShapeError(f"{name}: found {tuple(value.shape)}, expected {expected[name]}")
+        if torch.isinf(landmarks).any():
+            raise ValueRangeError("landmarks: found infinite ones, expected pixels, or NaN for not seen")
+        if confidence is not None:
+            _check_not_negative("confidence", confidence)
+        return count
+
+    def extra_repr(self) -> str:
+        return f"{len(self.names)} shapes, pixel_noise={self.pixel_noise}, sparsity={self.sparsity}"
+
+
+def _beside_motion(weights: Quadratic) -> Quadratic:
+    """An energy of weights as one of weights and motion."""
+    return replace(
+        weights,
+        H=torch.nn.functional.pad(weights.H, (0, 6, 0, 6)),
+        f=torch.nn.functional.pad(weights.f, (0, 6)),
+    )
+
+
+def _default_weights() -> Tensor:
+    weights = torch.ones(LANDMARKS)
+    weights[:JAW] = CONTOUR_WEIGHT
+    return weights
+
+
+def _check_not_negative(name: str, value: Tensor) -> None:
+    if not bool((torch.isfinite(value) & (value >= 0)).all()):
+        raise ValueRangeError(f"{name}: found {value.flatten()[:5].tolist()}, expected finite ones of at least 0")
