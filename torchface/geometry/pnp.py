@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
-from torchface.geometry.rotations import cross_matrix, rotation_matrix
+from torchface.geometry.rotations import rotation_matrix
 
 _FEWEST = 4
 _NEAREST = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
@@ -180,26 +180,36 @@ def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, trans
     nearest = _NEAREST * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     damping = torch.full_like(translation[:, 0], 1e-4)
     error = _error(x, q, K, w, rotation, translation, nearest)
+    total, going = w.sum(1), torch.arange(len(x), device=x.device)
+    found = Pose(rotation.clone(), translation.clone(), error.clone())
     for _ in range(_ROUNDS):
         seen = x @ rotation.transpose(-1, -2)
         pixels, by_place = pixel_jacobian(seen + translation[:, None], K)
-        jacobian = torch.cat([by_place @ -cross_matrix(seen), by_place], dim=-1)
-        weighted = jacobian * w[..., None, None]
-        H = torch.einsum("bnij,bnik->bjk", weighted, jacobian)
-        g = torch.einsum("bnij,bni->bj", weighted, pixels - q)
+        # A turn by r moves the point s by r x s, so the pixel by (s x a) r where a move by m moves it by a m.
+        by_turn = torch.linalg.cross(seen[:, :, None].expand_as(by_place), by_place)
+        jacobian = torch.cat([by_turn, by_place], dim=-1).flatten(1, 2)
+        weighted = (jacobian * w.repeat_interleave(2, dim=1)[..., None]).transpose(-1, -2)
+        H = weighted @ jacobian
+        g = weighted @ (pixels - q).flatten(1)[..., None]
         H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-12)
-        step = -torch.linalg.solve(H, g)
+        step = -torch.linalg.solve(H, g)[..., 0]
         turned, moved = rotation_matrix(step[:, :3]) @ rotation, translation + step[:, 3:]
-        found = _error(x, q, K, w, turned, moved, nearest)
-        better = found < error
+        reached = _error(x, q, K, w, turned, moved, nearest)
+        better = reached < error
         rotation = torch.where(better[:, None, None], turned, rotation)
         translation = torch.where(better[:, None], moved, translation)
-        settled = (better & (error - found < _DONE * error)) | (~better & (damping > 1e6)) | (error < 1e-20)
-        error = torch.where(better, found, error)
+        settled = (better & (error - reached < _DONE * error)) | (~better & (damping > 1e6)) | (error < 1e-20)
+        error = torch.where(better, reached, error)
         damping = torch.where(better, damping * 0.1, damping * 10).clamp(min=1e-12)
-        if bool(settled.all()):
-            break
-    return Pose(rotation, translation, (error / w.sum(1)).sqrt())
+        found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
+        if bool(settled.any()):  # views that are done wait for no other
+            left = (~settled).nonzero()[:, 0]
+            if not len(left):
+                break
+            going, x, q, K, w = going[left], x[left], q[left], K[left], w[left]
+            rotation, translation, error, damping = rotation[left], translation[left], error[left], damping[left]
+            nearest = nearest[left]
+    return Pose(found.rotation, found.translation, (found.errors / total).sqrt())
 
 
 def _error(
