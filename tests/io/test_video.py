@@ -1,4 +1,4 @@
-"""Grey videos come back as they were written; what is no whole video is refused in words."""
+"""Videos come back as they were written, grey and in colour; what is no whole video is refused in words."""
 
 from __future__ import annotations
 
@@ -34,6 +34,35 @@ def test_floats_become_the_nearest_of_256_greys(tmp_path: Path) -> None:
     ramp = torch.linspace(-0.1, 1.1, 64 * 48).view(48, 64)
     video = write_video([ramp, ramp], tmp_path / "ramp.avi", 25.0)
     assert (video.frame(1) / 255 - ramp.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
+def test_colours_come_back_bit_for_bit(suffix: str, tmp_path: Path) -> None:
+    colors = torch.randint(0, 256, (11, 3, 60, 80), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    video = write_video(colors.split(4), tmp_path / f"a{suffix}", 24.0)
+    assert video == open_video(video.path)
+    chunks = list(video.color_chunks(4))
+    assert [tuple(chunk.shape) for chunk in chunks] == [(4, 3, 60, 80), (4, 3, 60, 80), (3, 3, 60, 80)]
+    assert torch.equal(torch.cat(chunks), colors)
+    assert torch.equal(torch.stack(list(video.color_frames())), colors)
+    grey = torch.cat(list(video.chunks())).float()
+    weights = torch.tensor([0.299, 0.587, 0.114])[:, None, None]  # BT.601
+    assert (grey - (colors * weights).sum(1)).abs().max() <= 1.0
+
+
+def test_grey_frames_are_read_in_colour_too(frames: torch.Tensor, tmp_path: Path) -> None:
+    video = write_video([frames], tmp_path / "a.avi", 24.0)
+    colors = torch.cat(list(video.color_chunks()))
+    assert torch.equal(colors, frames[:, None].expand(-1, 3, -1, -1))
+
+
+def test_lossy_colours_are_near(tmp_path: Path) -> None:
+    y, x = torch.meshgrid(torch.linspace(0, 1, 96), torch.linspace(0, 1, 128), indexing="ij")
+    frame = torch.stack([x, y, 1 - x])
+    video = write_video([frame.expand(5, -1, -1, -1)], tmp_path / "a.mp4", 25.0)
+    read = torch.cat(list(video.color_chunks())) / 255
+    assert read.shape == (5, 3, 96, 128)
+    assert (read - frame).abs().mean() < 0.01
 
 
 def test_a_broken_video_is_refused(frames: torch.Tensor, tmp_path: Path) -> None:
@@ -85,6 +114,10 @@ def test_what_cannot_be_written_is_said(frames: torch.Tensor, tmp_path: Path) ->
         write_video([], tmp_path / "a.avi", 60.0)
     with pytest.raises(ShapeError, match="as the first"):
         write_video([frames, frames[:, :30]], tmp_path / "a.avi", 60.0)
+    with pytest.raises(ShapeError, match="as the first"):
+        write_video([frames[:2], frames[:2, None].expand(-1, 3, -1, -1)], tmp_path / "a.avi", 60.0)
+    with pytest.raises(ShapeError, match="in colour"):
+        write_video([frames[:2, None]], tmp_path / "a.avi", 60.0)
     with pytest.raises(ValueRangeError, match="fps"):
         write_video([frames], tmp_path / "a.avi", float("nan"))
     with pytest.raises(FileFormatError, match="cannot be written"):
