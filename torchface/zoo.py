@@ -14,6 +14,7 @@ from torch import nn
 from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.errors import FileFormatError, NameMismatchError
+from torchface.landmarks.appearance import AppearanceModel
 from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.model_files import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
 from torchface.modeling.head_model import HeadModel
@@ -22,6 +23,7 @@ from torchface.modeling.personalization import ExpressionRegression
 
 KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,
+    "appearance": AppearanceModel,
     "expression_regression": ExpressionRegression,
     "head": HeadModel,
     "marker_solver": MarkerSolver,

@@ -1,6 +1,7 @@
 """Landmarks on faces: in pictures, and on scans unwrapped into UV space."""
 
 from torchface.landmarks.annotations import ScanAnnotation, load_annotations, save_annotations
+from torchface.landmarks.appearance import AppearanceFit, AppearanceModel, AppearanceSettings
 from torchface.landmarks.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.correspondences import AutomaticLandmarks, LandmarkPairs, contour_correspondences
 from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
@@ -14,6 +15,9 @@ from torchface.landmarks.uv import UVLandmarkDetector, UVLandmarks
 
 __all__ = [
     "TWELVE",
+    "AppearanceFit",
+    "AppearanceModel",
+    "AppearanceSettings",
     "AutomaticLandmarks",
     "Contour",
     "CylinderLayout",

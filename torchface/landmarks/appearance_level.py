@@ -1,0 +1,119 @@
+"""One resolution of an appearance model: its texture modes, and the step that improves an alignment."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample
+
+
+class TextureResidual(NamedTuple):
+    """What texture modes cannot explain of sampled features: ``left`` (B,C,N), and their coefficients (B,K)."""
+
+    left: Tensor
+    coefficients: Tensor
+
+
+class AppearanceLevel(nn.Module):
+    r"""Textures of one resolution, sampled at the same N places of every face.
+
+    A step is one of the fast simultaneous inverse compositional algorithm. With sampled features I, mean texture
+    :math:`A_0`, orthonormal modes A and the projection :math:`P = 1 - A A^\top`,
+
+    .. math:: c = A^\top (I - A_0), \quad J = \nabla(A_0 + A c)\, \partial W / \partial q, \quad
+        \Delta q = (J^\top P J / \sigma^2 + \Lambda^{-1})^{-1} (J^\top P (I - A_0) / \sigma^2 + \Lambda^{-1} q)
+
+    moves the *template*, and so the face by its inverse. J is linear in c, hence :math:`J^\top P J` quadratic: its
+    coefficients are computed once, and a step costs as much as sampling does.
+
+    Args:
+        places: N.
+        channels: C, of the features.
+        modes: K, of the texture.
+        motions: Q, shape modes and the similarity's four.
+
+    Source: Tzimiropoulos and Pantic 2013; thesis 4.2.2.
+    """
+
+    corner: Tensor
+    weight: Tensor
+    mean: Tensor
+    modes: Tensor
+    slope: Tensor
+    motion: Tensor
+    scale: Tensor
+    noise: Tensor
+    typical: Tensor
+
+    def __init__(self, places: int, channels: int, modes: int, motions: int) -> None:
+        super().__init__()
+        self.register_buffer("corner", torch.zeros(places, 3, dtype=torch.int64))
+        self.register_buffer("weight", torch.zeros(places, 3))
+        self.register_buffer("mean", torch.zeros(channels, places))
+        self.register_buffer("modes", torch.zeros(modes, channels, places))
+        self.register_buffer("slope", torch.zeros(modes + 1, channels, places, 2))
+        self.register_buffer("motion", torch.zeros(places, 2, motions))
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("noise", torch.ones(()))
+        self.register_buffer("typical", torch.ones(()))
+        self._curvature: Tensor | None = None
+        self._curvature_of: tuple[int, int, torch.device] | None = None
+
+    def sample(self, features: Tensor, points: Tensor) -> Tensor:
+        """Features (B,C,h,w) at the level's places on faces with these points (B,P,2), pixels: (B,C,N)."""
+        places = (points[:, self.corner] * self.weight[..., None]).sum(2)
+        return sample_pixels(features, places)
+
+    def residual(self, sampled: Tensor) -> TextureResidual:
+        """What the modes leave of sampled features (B,C,N), and the coefficients that explain the rest."""
+        left = sampled - self.mean
+        coefficients = torch.einsum("bcn,kcn->bk", left, self.modes)
+        return TextureResidual(left - torch.einsum("bk,kcn->bcn", coefficients, self.modes), coefficients)
+
+    def error(self, residual: TextureResidual) -> Tensor:
+        """Mean squared residual (B,) over what training images that were left out had: about 1 on a good fit."""
+        return residual.left.square().mean((1, 2)) / self.typical
+
+    def step(self, residual: TextureResidual, state: Tensor, precision: Tensor) -> Tensor:
+        """By how much the template should move, (B,Q).
+
+        Args:
+            residual: at the current alignment.
+            state: the current shape along the motions (B,Q), 0 for the similarity's.
+            precision: of the shape along each, (Q,), 0 for the similarity's.
+        """
+        one = torch.ones_like(residual.coefficients[:, :1])
+        mixed = torch.cat([one, residual.coefficients], dim=1)
+        slope = torch.einsum("bk,kcnd->bcnd", mixed, self.slope)
+        pull = torch.einsum("bcn,bcnd->bnd", residual.left, slope)
+        downhill = torch.einsum("bnd,ndq->bq", pull, self.motion) / self.noise
+        curvature = torch.einsum("bj,bk,jkpq->bpq", mixed, mixed, self.curvature()) / self.noise
+        damping = 1e-4 * curvature.diagonal(dim1=1, dim2=2).mean(1)[:, None] + 1e-9
+        system = curvature + torch.diag_embed(precision + damping)
+        return torch.linalg.solve(system, downhill + precision * state)
+
+    def jacobian(self, coefficients: Tensor) -> Tensor:
+        """J (B,C,N,Q) of the texture with these coefficients (B,K)."""
+        mixed = torch.cat([torch.ones_like(coefficients[:, :1]), coefficients], dim=1)
+        return torch.einsum("bk,kcnd,ndq->bcnq", mixed, self.slope, self.motion)
+
+    def curvature(self) -> Tensor:
+        """The coefficients (K+1,K+1,Q,Q) of the projected curvature; kept until the state changes."""
+        known = (self.slope.data_ptr(), self.slope._version, self.slope.device)
+        if self._curvature is None or self._curvature_of != known:
+            terms = torch.einsum("kcnd,ndq->kqcn", self.slope, self.motion).flatten(2)
+            modes = self.modes.flatten(1)
+            flat = (terms - (terms @ modes.T) @ modes).flatten(0, 1)
+            count = len(self.slope)
+            self._curvature = (flat @ flat.T).unflatten(1, (count, -1)).unflatten(0, (count, -1)).transpose(1, 2)
+            self._curvature_of = known
+        return self._curvature
+
+
+def sample_pixels(images: Tensor, places: Tensor) -> Tensor:
+    """Images (B,C,h,w) at places (B,N,2), pixels, bilinear, the border continued: (B,C,N)."""
+    size = images.new_tensor([images.shape[-1], images.shape[-2]])
+    grid = (places + 0.5) * (2 / size) - 1
+    return grid_sample(images, grid[:, None], padding_mode="border", align_corners=False)[:, :, 0]

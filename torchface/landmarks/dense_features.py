@@ -1,0 +1,71 @@
+"""What an image shows at every pixel, told so that light and gain do not matter."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, pad
+
+from torchface.errors import NameMismatchError
+
+Features = Literal["grey", "gradient_direction", "oriented_gradients"]
+CHANNELS: dict[str, int] = {"grey": 1, "gradient_direction": 2, "oriented_gradients": 8}
+"""The kinds of features, and how many channels each has."""
+
+_FAINT = 0.01  # grey values a pixel: gradients below count as flat
+_WINDOW = 17  # pixels of the neighbourhood that grey values are measured against
+_CELL = 1.5  # pixels: deviation of the window that gradients are gathered in
+
+
+def dense_features(images: Tensor, kind: Features) -> Tensor:
+    r"""Features of every pixel.
+
+    ``grey``
+        grey values less the mean of their neighbourhood, in units of its deviation.
+    ``gradient_direction``
+        the gradient's direction, :math:`g / \sqrt{|g|^2 + \epsilon^2}`: a unit vector but where the image is flat.
+    ``oriented_gradients``
+        how much gradient there is in each of eight directions round a pixel, divided by how much there is in all.
+
+    Args:
+        images: grey, (B,1,H,W) in [0,1].
+        kind: which.
+
+    Returns:
+        (B,C,H,W), C as in ``CHANNELS``.
+
+    Source: Tzimiropoulos, Zafeiriou, Pantic 2012 (directions); Lowe 2004, Antonakos et al. 2015 (histograms).
+    """
+    if kind == "grey":
+        mean = _window_mean(images)
+        return (images - mean) / (_window_mean(images.square()) - mean.square() + _FAINT**2).clamp(min=1e-8).sqrt()
+    padded = pad(images, (1, 1, 1, 1), mode="replicate")
+    along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+    along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    if kind == "gradient_direction":
+        strength = (along_x.square() + along_y.square() + _FAINT**2).sqrt()
+        return torch.cat([along_x, along_y], dim=1) / strength
+    if kind == "oriented_gradients":
+        angle = torch.arange(8, dtype=images.dtype, device=images.device)[:, None, None] * (math.pi / 4)
+        gathered = _gathered((angle.cos() * along_x + angle.sin() * along_y).clamp(min=0))
+        around = avg_pool2d(pad(gathered.square().sum(1, keepdim=True), (3,) * 4, mode="replicate"), 7, 1)
+        return gathered / (around + _FAINT**2).sqrt()
+    raise NameMismatchError(f"features: found {kind!r}, expected one of {', '.join(get_args(Features))}")
+
+
+def _window_mean(images: Tensor) -> Tensor:
+    return avg_pool2d(images, _WINDOW, 1, _WINDOW // 2, count_include_pad=False)
+
+
+def _gathered(images: Tensor) -> Tensor:
+    """Each channel under a small Gaussian window."""
+    reach = math.ceil(2.5 * _CELL)
+    offsets = torch.arange(-reach, reach + 1, dtype=images.dtype, device=images.device)
+    kernel = torch.exp(-0.5 * (offsets / _CELL) ** 2)
+    kernel = (kernel / kernel.sum()).expand(images.shape[1], 1, -1)
+    padded = pad(images, (reach,) * 4, mode="replicate")
+    across = conv2d(padded, kernel[:, :, None, :], groups=images.shape[1])
+    return conv2d(across, kernel[:, :, :, None], groups=images.shape[1])
