@@ -9,8 +9,8 @@ import pytest
 import torch
 from mutation import check_reader
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError
-from torchface.io.landmarks import LandmarkPoints, load_landmark_points
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.landmarks import LandmarkPoints, load_landmark_points, save_pts
 from torchface.io.picks import Correspondences, save_correspondences
 
 GROUPS = {"chin": 17, "leye": 6, "reye": 6, "leyebrow": 5, "nose": 9, "reyebrow": 5, "mouth": 20}
@@ -81,6 +81,21 @@ def test_pts_counts_pixels_from_one(tmp_path: Path) -> None:
     text = "version: 1\nn_points:  2\n{\n611.28 272.77\n1 1\n}\n"
     found = load_landmark_points(save(tmp_path / "face.pts", text))
     assert torch.allclose(found.points, torch.tensor([[610.28, 271.77], [0, 0]]).double())
+
+
+def test_pts_come_back_as_they_were_written(tmp_path: Path) -> None:
+    points = 200 * torch.rand(68, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 20
+    save_pts(points, tmp_path / "face.pts")
+    text = (tmp_path / "face.pts").read_text().splitlines()
+    assert text[:3] == ["version: 1", "n_points: 68", "{"]
+    assert float(text[3].split()[0]) == pytest.approx(float(points[0, 0]) + 1, abs=6e-4)  # iBUG counts from 1
+    torch.testing.assert_close(load_landmark_points(tmp_path / "face.pts").points, points, atol=6e-4, rtol=0)
+    points[3] = torch.nan
+    with pytest.raises(ValueRangeError, match="NaN"):
+        save_pts(points, tmp_path / "other.pts")
+    with pytest.raises(ShapeError, match=r"expected \(L,2\)"):
+        save_pts(torch.zeros(68, 3), tmp_path / "other.pts")
+    assert not (tmp_path / "other.pts").exists()
 
 
 def test_pts_of_three_dimensions_are_positions(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from torchface.io.cameras import load_calibration, save_calibration
 from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save_rig
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.images import load_image, save_image, save_image16
-from torchface.io.landmarks import load_landmark_points
+from torchface.io.landmarks import load_landmark_points, save_pts
 from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes import load_mesh, save_mesh
 from torchface.io.normal_maps import load_normal_map, save_normal_map
@@ -47,6 +47,7 @@ __all__ = [
     "save_landmarks",
     "save_mesh",
     "save_normal_map",
+    "save_pts",
     "save_rig",
     "save_take",
 ]

@@ -1,4 +1,4 @@
-"""Landmark points as other programs save them: menpo's LJSON, iBUG's PTS, and the toolkit's own JSON."""
+"""Landmark points as other programs save them: menpo's LJSON, iBUG's PTS (also written), and the toolkit's own JSON."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError
-from torchface.files import read_file
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files import read_file, write_file
 from torchface.io.picks import load_correspondences
 
 _LARGEST_FILE = 16 * 2**20
@@ -73,6 +73,26 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
     if ending == ".json" and isinstance(document, dict) and "format" in document:
         return LandmarkPoints(load_correspondences(path).points)
     return _ljson(path, document)
+
+
+def save_pts(points: Tensor, path: str | Path) -> None:
+    """Writes landmarks in a picture as iBUG's PTS, which counts pixels from 1.
+
+    Args:
+        points: (L,2) pixels, x right, y down, pixel centres at integers from 0.
+        path: the file.
+
+    Raises:
+        ShapeError: not (L,2).
+        ValueRangeError: a position is NaN or infinite; PTS has no way to say so.
+        FileFormatError: the file cannot be written.
+    """
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+        raise ShapeError(f"points: found {tuple(points.shape)}, expected (L,2)")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueRangeError(f"{path}: found points that are NaN or infinite, expected numbers")
+    rows = "\n".join(f"{x + 1:.3f} {y + 1:.3f}" for x, y in points.double().tolist())
+    write_file(path, f"version: 1\nn_points: {len(points)}\n{{\n{rows}\n}}\n".encode())
 
 
 def _json(path: Path) -> Any:
