@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.errors import ShapeError
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,53 @@ def weight_error(solved: Tensor, true: Tensor) -> WeightError:
     scale = a.norm(dim=0) * b.norm(dim=0)
     correlation = torch.where(scale > 1e-9, (a * b).sum(0) / scale.clamp(min=1e-12), torch.nan)
     return WeightError(difference.mean(0), difference.amax(0), correlation.to(solved.dtype))
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeErrors:
+    """Weights by one set of names against weights by another.
+
+    Args:
+        names: shapes of the truth that the result has something to say of, N of them.
+        error: of each.
+        missing: shapes of the truth that the result lacks.
+        frames: how many were compared.
+    """
+
+    names: tuple[str, ...]
+    error: WeightError
+    missing: tuple[str, ...]
+    frames: int
+
+
+def shape_errors(found: Tensor, found_names: Sequence[str], true: Tensor, true_names: Sequence[str]) -> ShapeErrors:
+    """Compares weights (T,N) with true weights (T,M) shape by shape, as :func:`torchface.shape_names.mapping` has it.
+
+    Args:
+        found, found_names: what came back; a frame with NaN is left out.
+        true, true_names: what was.
+
+    Raises:
+        ShapeError: the frames differ in number.
+        NameMismatchError: no name of the one means a shape of the other.
+        ValueRangeError: there is no frame without NaN.
+    """
+    if len(found) != len(true):
+        raise ShapeError(f"shape_errors: found {len(found)} and {len(true)} frames, expected as many")
+    matrix = mapping(found_names, true_names)
+    told = matrix.any(1)
+    if not told.any():
+        raise NameMismatchError(
+            f"shape_errors: found {', '.join(found_names[:5])}, ...; expected some of {', '.join(true_names[:5])}, ..."
+        )
+    whole = torch.isfinite(found).all(1) & torch.isfinite(true).all(1)
+    if not whole.any():
+        raise ValueRangeError("shape_errors: found NaN in every frame, expected weights")
+    error = weight_error(found[whole].float() @ matrix[told].T, true[whole].float()[:, told])
+    names = [
+        [name for name, has in zip(true_names, told.tolist(), strict=True) if has is wanted] for wanted in (True, False)
+    ]
+    return ShapeErrors(tuple(names[0]), error, tuple(names[1]), int(whole.sum()))
 
 
 def marker_rmse(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, markers: Tensor) -> Tensor:
@@ -113,3 +164,107 @@ def mesh_error(
         frame_mean.append(distance.mean(1))
         motion += float(moved.norm(dim=-1).mean(1).sum())
     return MeshError(total / len(true), largest, torch.cat(frame_mean), motion / len(true))
+
+
+def vertex_errors(found: Tensor, true: Tensor) -> Tensor:
+    """Distances (T,V) between vertices (T,V,3) and true vertices (T,V,3), millimetres; NaN where either has none.
+
+    Raises:
+        ShapeError: the shapes differ.
+
+    Source: thesis 4.2.13.
+    """
+    if found.shape != true.shape or found.ndim != 3 or found.shape[2] != 3:
+        raise ShapeError(f"vertex_errors: found {tuple(found.shape)} and {tuple(true.shape)}, expected (T,V,3) twice")
+    return (found - true.to(found)).norm(dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidAlignment:
+    """Frames laid on true ones.
+
+    Args:
+        vertices: the moved frames, (T,V,3).
+        motion: what moved them, without a change of size, T of them.
+    """
+
+    vertices: Tensor
+    motion: Similarity
+
+    @property
+    def degrees(self) -> Tensor:
+        """How far each frame was turned, (T,)."""
+        trace = self.motion.rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+        return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
+
+
+def rigidly_aligned(found: Tensor, true: Tensor) -> RigidAlignment:
+    """Each frame (T,V,3) turned and moved, without a change of size, to where it is nearest to the true one (T,V,3).
+
+    A vertex that is NaN in either has no say. Where the two share a space this hides errors of the pose; it is for
+    scans and results whose spaces differ.
+
+    Raises:
+        ShapeError: the shapes differ, or a frame has fewer than three vertices.
+    """
+    motion = similarity_transform(found, true.to(found), scale=False)
+    return RigidAlignment(motion.apply(found), motion)
+
+
+@dataclass(frozen=True)
+class ErrorFigures:
+    """Distances over frames and vertices in a few numbers, millimetres.
+
+    Args:
+        mean, median, percentile_95, largest: over all vertices of all frames that were compared.
+        total: sum over the vertices of a frame, mean over the frames; for a single frame what the thesis calls the
+            total error.
+        vertices: how many were compared in any frame.
+    """
+
+    mean: float
+    median: float
+    percentile_95: float
+    largest: float
+    total: float
+    vertices: int
+
+
+def error_figures(errors: Tensor) -> ErrorFigures:
+    """The figures of distances (T,V); NaN was not compared.
+
+    Raises:
+        ValueRangeError: nothing was compared.
+
+    Source: thesis 4.2.13.
+    """
+    known = torch.isfinite(errors)
+    if not known.any():
+        raise ValueRangeError("error_figures: found no distance that is a number, expected at least one")
+    values = errors[known].double().numpy()
+    median, high = np.quantile(values, (0.5, 0.95))
+    totals = torch.where(known, errors, 0).double().sum(1)[known.any(1)]
+    return ErrorFigures(
+        float(values.mean()),
+        float(median),
+        float(high),
+        float(values.max()),
+        float(totals.mean()),
+        int(known.any(0).sum()),
+    )
+
+
+def region_figures(errors: Tensor, regions: Mapping[str, Tensor]) -> dict[str, ErrorFigures]:
+    """The figures of distances (T,V) in each region, a mask (V,) by name; one where nothing was compared is left out.
+
+    Raises:
+        ShapeError: a mask is not (V,).
+    """
+    for name, mask in regions.items():
+        if mask.shape != errors.shape[1:] or mask.dtype != torch.bool:
+            raise ShapeError(
+                f"regions[{name!r}]: found {mask.dtype} {tuple(mask.shape)}, expected a mask of "
+                f"{tuple(errors.shape[1:])}"
+            )
+    inside = {name: errors[:, mask] for name, mask in regions.items()}
+    return {name: error_figures(part) for name, part in inside.items() if torch.isfinite(part).any()}

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from torchface.cli.attach import attach
 from torchface.cli.demo import demo
+from torchface.cli.evaluate import evaluate
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
@@ -42,6 +43,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "attach": attach,
     "solve": solve,
     "retarget": retarget,
+    "evaluate": evaluate,
     "render": render,
     "info": info,
     "view": view,

@@ -1,0 +1,79 @@
+"""``torchface evaluate``: how far a result is from the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import console, steps
+
+
+def evaluate(
+    result: Annotated[Positional[Path], arg(metavar="RESULT")],
+    truth: Annotated[Positional[tuple[Path, ...]], arg(metavar="TRUTH...")],
+    out: Path = Path("out/evaluation"),
+    rig: Path | None = None,
+    truth_rig: Path | None = None,
+    part: str | None = None,
+    frames: tuple[int, ...] | None = None,
+    scans: bool = False,
+    landmarks: Path | None = None,
+    unit: str | None = None,
+    align: bool = False,
+    as_is: bool = False,
+    scale: float | None = None,
+    height: int = 290,
+    quiet: bool = False,
+) -> None:
+    """Compare a result with the truth: error of every vertex, by region, by shape, over time, as heat maps.
+
+    RESULT and TRUTH are each weights (.csv, with the rig that they move), an animated .glb, a mesh sequence
+    (.safetensors), a mesh, or a folder of meshes, a frame each; both of one topology. Or the truth is raw scans
+    (--scans), which are registered first; killed and started again, what is registered is kept.
+
+    Writes OUT/index.html with its pictures, OUT/regions.csv, frames.csv, shapes.csv where both have weights, and
+    summary.json.
+
+    Args:
+        result: What came back.
+        truth: What was; several files only with --scans.
+        out: Folder of the report.
+        rig: The rig that the result's weights move, or whose topology its meshes have.
+        truth_rig: The rig that the truth's weights move; --rig if absent.
+        part: Keep this region only, such as face.
+        frames: Which of the result's frames, from 0, the truth's are, in order; all if absent.
+        scans: TRUTH is raw scans, in files or folders.
+        landmarks: A folder of landmark files named as the scans; see `torchface register`.
+        unit: Unit of the scans (mm, cm, m) where it is not the format's own.
+        align: Turn and move each frame of the result to where it is nearest to the truth; scans are always so.
+        as_is: Leave the result where it is, with scans too.
+        scale: Where the heat maps' red begins, millimetres; at a rounded 95th percentile if absent.
+        height: Of each view of a face in the report, pixels.
+        quiet: Show no progress.
+    """
+    from torchface.errors import ValueRangeError
+    from torchface.workflows.evaluate import EvaluationSettings
+    from torchface.workflows.evaluate import evaluate as run
+    from torchface.workflows.evaluate_page import write_evaluation_page
+
+    if align and as_is:
+        raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
+    choice = True if align else False if as_is else None
+    settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
+    with steps(quiet) as step:
+        found = run(result, truth, out, settings, step)
+        step("drawing")
+        page = write_evaluation_page(found, out, height)
+    table = Table(title=f"{found.result} against {found.truth}, millimetres")
+    for head in ("region", "mean", "median", "95 %", "largest", "total", "vertices"):
+        table.add_column(head, justify="left" if head == "region" else "right")
+    for name, figures in found.regions.items():
+        numbers = (figures.mean, figures.median, figures.percentile_95, figures.largest)
+        table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.4e}", str(figures.vertices))
+    console.print(table)
+    for line in found.lines():
+        console.print(line, highlight=False, markup=False)
+    print(page)

@@ -1,0 +1,380 @@
+"""From a result and the truth on disk to how far they are apart: figures, tables, heat maps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.evaluation import (
+    ErrorFigures,
+    ShapeErrors,
+    error_figures,
+    region_figures,
+    rigidly_aligned,
+    shape_errors,
+    vertex_errors,
+)
+from torchface.files import write_file
+from torchface.io.csv_table import write_table
+from torchface.mesh import Mesh
+from torchface.shape_names import mapping
+from torchface.viz.heat_maps import round_maximum
+from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
+from torchface.workflows.compared_regions import compared_regions
+from torchface.workflows.scan_truth import ScanTruth, scan_truth
+
+ALL = "all vertices"
+"""What the table of regions calls the whole mesh."""
+
+_CHUNK = 32
+_MOST_DISTANCES = 2**29
+_SUMMARY = "torchface.evaluation/1"
+_SAME_RATE = 0.002
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is compared how.
+
+    Args:
+        rig: moves the result's weights, is the template of scans, and annotates meshes of its topology.
+        truth_rig: moves the truth's weights; ``rig`` if absent.
+        part: keep this annotated region only.
+        frames: frames of the result that the truth's are, in order, from 0; all if absent.
+        scans: the truth is raw scans, which are registered first.
+        landmarks: a folder of the scans' landmark files.
+        unit: of the scans' files; each format's own if absent.
+        align: lay each frame of the result rigidly on the truth; if absent, on scans only, which have a space of
+            their own.
+        maximum: of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent.
+    """
+
+    rig: Path | None = None
+    truth_rig: Path | None = None
+    part: str | None = None
+    frames: tuple[int, ...] | None = None
+    scans: bool = False
+    landmarks: Path | None = None
+    unit: str | None = None
+    align: bool | None = None
+    maximum: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One frame as it was compared, for pictures.
+
+    Args:
+        frame: of the result.
+        found, true: vertices (V,3); the found ones as they were compared, laid on the truth where that was asked for.
+        errors: (V,), millimetres; NaN was not compared.
+    """
+
+    frame: int
+    found: Tensor
+    true: Tensor
+    errors: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """How far a result is from the truth.
+
+    Args:
+        result, truth: names of the files.
+        mesh: topology and annotations, in the pose that errors are painted on.
+        frames: which of the result were compared, (T,) int64.
+        fps: frames a second, where that is told.
+        errors: (T,V), millimetres; NaN was not compared.
+        regions: figures by region, all vertices first.
+        shapes: by shape, where both have weights.
+        aligned: whether each frame was laid rigidly on the truth.
+        turned, moved: by how many degrees and millimetres that was, (T,); none without.
+        shown: frames for pictures: the one of median error and the worst.
+        maximum: of the heat maps' scale, millimetres.
+        notes: what was found and done, for people to read.
+        surface: where the truth was scans, how far the result is from their surface, laid on it anew where it was
+            aligned.
+    """
+
+    result: str
+    truth: str
+    mesh: Mesh
+    frames: Tensor
+    fps: float | None
+    errors: Tensor
+    regions: dict[str, ErrorFigures]
+    shapes: ShapeErrors | None
+    aligned: bool
+    turned: Tensor | None
+    moved: Tensor | None
+    shown: tuple[Compared, ...]
+    maximum: float
+    notes: tuple[str, ...]
+    surface: ErrorFigures | None = None
+
+    @property
+    def frame_mean(self) -> Tensor:
+        """Mean error of each frame, (T,); NaN where nothing was compared."""
+        return self.errors.nanmean(1)
+
+    @property
+    def frame_total(self) -> Tensor:
+        """The sum of errors over the vertices of each frame, (T,)."""
+        return self.errors.nansum(1)
+
+    @property
+    def vertex_mean(self) -> Tensor:
+        """Mean error of each vertex over the frames, (V,); NaN where it never was compared."""
+        return self.errors.nanmean(0)
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        how = "each frame laid rigidly on the truth" if self.aligned else "as they are, without alignment"
+        lines = [f"{len(self.frames)} frames compared, {how}"]
+        for name in (ALL, "face"):
+            if name in self.regions:
+                found = self.regions[name]
+                lines.append(
+                    f"{name}: mean {found.mean:.3f} mm, median {found.median:.3f}, 95th percentile "
+                    f"{found.percentile_95:.3f}, largest {found.largest:.3f}; total {found.total:.4e} mm a frame"
+                )
+        if self.surface is not None:
+            lines.append(f"to the scans' surface: mean {self.surface.mean:.3f} mm, median {self.surface.median:.3f}")
+        if self.shapes is not None:
+            error = self.shapes.error
+            lines.append(
+                f"weights: mean error {float(error.mean.mean()):.4f}, largest {float(error.largest.max()):.3f}, over "
+                f"{len(self.shapes.names)} shapes"
+            )
+        return lines + list(self.notes)
+
+
+def evaluate(
+    result: Path,
+    truth: Sequence[Path],
+    out: Path,
+    settings: EvaluationSettings = EvaluationSettings(),
+    progress: Callable[[str], None] | None = None,
+) -> Evaluation:
+    """Reads, compares and writes tables and a summary; see ``torchface evaluate --help`` for the arguments.
+
+    Writes ``regions.csv``, ``frames.csv``, ``shapes.csv`` where both have weights, and ``summary.json``;
+    :func:`torchface.workflows.evaluate_page.write_evaluation_page` makes the report. Scans are registered into
+    ``out/registered``, and those that are there from an earlier run are taken as they are.
+
+    Raises:
+        TopologyError: result and truth have not the same vertices and triangles.
+        ShapeError: they have not the same number of frames.
+        ValueRangeError: there is nothing to compare, or too much.
+        TorchfaceError: any file is broken.
+    """
+    say = progress or (lambda line: None)
+    say("reading")
+    found = load_animated(result, settings.rig, settings.part)
+    scans: ScanTruth | None = None
+    if settings.scans:
+        scans = scan_truth(found, truth, out / "registered", settings.landmarks, settings.unit, say)
+        true = scans.animated
+    else:
+        if len(truth) != 1:
+            raise ValueRangeError(f"truth: found {len(truth)} files, expected one, or a folder; or scans (--scans)")
+        true = load_animated(truth[0], settings.truth_rig or settings.rig, settings.part)
+        true.require_topology_of(found, "; raw scans need --scans, other rigs --truth-rig")
+    say("comparing")
+    evaluation = compare(found, true, settings, scans)
+    say("writing")
+    out.mkdir(parents=True, exist_ok=True)
+    write_tables(evaluation, out)
+    return evaluation
+
+
+def compare(
+    found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings, scans: ScanTruth | None = None
+) -> Evaluation:
+    """Compares frame by frame.
+
+    Args:
+        found: the result.
+        true: of its topology.
+        settings: which frames, and how.
+        scans: the truth's scans, where it was registered to such.
+
+    Raises:
+        ShapeError: the frames do not fit.
+        ValueRangeError: there is nothing to compare, or too much.
+    """
+    frames = _frames(found, true, settings.frames)
+    aligned = scans is not None if settings.align is None else settings.align
+    notes = [] if scans is None else list(scans.notes)
+    if found.fps is not None and true.fps is not None and abs(found.fps / true.fps - 1) > _SAME_RATE:
+        notes.append(f"found {found.fps:g} and {true.fps:g} frames a second; frames were compared by their number")
+    if len(frames) * len(found.neutral.vertices) > _MOST_DISTANCES:
+        raise ValueRangeError(
+            f"{found.path}: found {len(frames)} frames of {len(found.neutral.vertices)} vertices, more than "
+            f"{_MOST_DISTANCES} distances; expected fewer (--part face, or --frames)"
+        )
+    errors, turned, moved, surface = [], [], [], []
+    for begin in range(0, len(frames), _CHUNK):  # some frames at a time: all of a take's vertices fill the memory
+        rows = frames[begin : begin + _CHUNK]
+        a, b, motion = _pair(found, true, rows, begin, aligned)
+        errors.append(vertex_errors(a, b))
+        if motion is not None:
+            turned.append(motion[0])
+            moved.append(motion[1])
+        if scans is not None:
+            surface.append(scans.surface_errors(begin, scans.settled(begin, a) if aligned else a))
+    distances = torch.cat(errors)
+    empty = ~torch.isfinite(distances).any(1)
+    if empty.all():
+        raise ValueRangeError(f"{found.path}: found NaN in every frame of it or of {true.path}, expected vertices")
+    if empty.any():
+        first = int(frames[empty][0])
+        notes.append(f"{int(empty.sum())} of {len(frames)} frames are NaN (the first {first}) and were left out")
+    maximum = settings.maximum
+    if maximum is not None and not 0 < maximum < float("inf"):
+        raise ValueRangeError(f"scale: found {maximum}, expected a positive number of millimetres")
+    regions = {ALL: torch.ones(distances.shape[1], dtype=torch.bool), **compared_regions(found.neutral)}
+    figures = region_figures(distances, regions)
+    return Evaluation(
+        found.path.name,
+        true.path.name,
+        found.neutral,
+        frames,
+        found.fps or true.fps,
+        distances,
+        figures,
+        _shapes(found, true, frames),
+        aligned,
+        torch.cat(turned) if turned else None,
+        torch.cat(moved) if moved else None,
+        tuple(_shown(found, true, frames, distances, aligned)),
+        round_maximum(figures[ALL].percentile_95) if maximum is None else maximum,
+        tuple(notes),
+        error_figures(torch.cat(surface)) if surface else None,
+    )
+
+
+def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | None) -> Tensor:
+    if chosen is None:
+        if found.count != true.count:
+            raise ShapeError(
+                f"{found.path}: found {found.count} frames, expected the {true.count} of {true.path}; or say which "
+                "of the result's frames they are (--frames)"
+            )
+        return torch.arange(found.count)
+    wrong = [frame for frame in chosen if not 0 <= frame < found.count]
+    if wrong or len(chosen) != true.count:
+        what = f"frame {wrong[0]}" if wrong else f"{len(chosen)} frames"
+        raise ShapeError(
+            f"frames: found {what}, expected one of 0 to {found.count - 1} for each of the {true.count} of {true.path}"
+        )
+    return torch.tensor(chosen)
+
+
+def _pair(
+    found: AnimatedMesh, true: AnimatedMesh, rows: Tensor, begin: int, aligned: bool
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
+    """Vertices (t,V,3) of the result's frames and of the truth's, and by how much the former were turned and moved."""
+    first, last = int(rows.min()), int(rows.max()) + 1
+    together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
+    a = found.read(first, last) if together else torch.cat([found.read(r, r + 1) for r in rows.tolist()])
+    b = true.read(begin, begin + len(rows)).to(a)
+    if not aligned:
+        return a, b, None
+    usable = (torch.isfinite(a) & torch.isfinite(b)).all(2).sum(1) >= 3
+    laid, turned, moved = a.clone(), torch.full((len(a),), torch.nan), torch.full((len(a),), torch.nan)
+    if usable.any():
+        motion = rigidly_aligned(a[usable], b[usable])
+        laid[usable], turned[usable] = motion.vertices, motion.degrees.to(turned)
+        moved[usable] = (motion.vertices - a[usable]).nanmean(1).norm(dim=-1).to(moved)
+    laid[~usable] = torch.nan
+    return laid, b, (turned, moved)
+
+
+def _shown(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, errors: Tensor, aligned: bool) -> list[Compared]:
+    """The frame of median error and the worst one."""
+    mean = errors.nanmean(1)
+    order = mean.nan_to_num(-1.0).argsort()
+    order = order[torch.isfinite(mean[order])]
+    picked = dict.fromkeys([int(order[(len(order) - 1) // 2]), int(order[-1])])
+    shown = []
+    for row in picked:
+        a, b, _ = _pair(found, true, frames[row : row + 1], row, aligned)
+        shown.append(Compared(int(frames[row]), a[0], b[0], errors[row]))
+    return shown
+
+
+def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor) -> ShapeErrors | None:
+    if found.weights is None or true.weights is None or not mapping(found.weights.names, true.weights.names).any():
+        return None
+    solved, actual = found.weights.values[frames, :, 0], true.weights.values[..., 0]
+    return shape_errors(solved, found.weights.names, actual, true.weights.names)
+
+
+def write_tables(evaluation: Evaluation, out: Path) -> None:
+    """Writes the figures as CSV and ``summary.json`` into a folder that is there."""
+    columns = ("mean_mm", "median_mm", "percentile_95_mm", "largest_mm", "total_mm", "vertices")
+    rows = [[name, *map(_number, asdict(figures).values())] for name, figures in evaluation.regions.items()]
+    write_table(out / "regions.csv", ["region", *columns], rows)
+    known = torch.isfinite(evaluation.errors)
+    values = np.where(known.numpy(), evaluation.errors.double().numpy(), np.nan)
+    empty = ~known.any(1).numpy()
+    values[empty] = 0.0  # so that no quantile is asked of nothing; these rows are written empty
+    high, largest = np.nanquantile(values, 0.95, axis=1), np.nanmax(values, axis=1)
+    means, totals = np.nanmean(values, axis=1), np.nansum(values, axis=1)
+    moved = (evaluation.turned, evaluation.moved)
+    rows = [
+        [
+            str(frame),
+            *("" if empty[i] else _number(x) for x in (means[i], high[i], largest[i], totals[i])),
+            *(_number(float(column[i])) for column in moved if column is not None),
+        ]
+        for i, frame in enumerate(evaluation.frames.tolist())
+    ]
+    extra = ["turned_degrees", "moved_mm"] if evaluation.aligned else []
+    write_table(out / "frames.csv", ["frame", "mean_mm", "percentile_95_mm", "largest_mm", "total_mm", *extra], rows)
+    if evaluation.shapes is not None:
+        error = evaluation.shapes.error
+        columns_of = zip(evaluation.shapes.names, error.mean, error.largest, error.correlation, strict=True)
+        rows = [[name, *(_number(float(x)) for x in numbers)] for name, *numbers in columns_of]
+        write_table(out / "shapes.csv", ["shape", "mean", "largest", "correlation"], rows)
+    else:
+        (out / "shapes.csv").unlink(missing_ok=True)  # one of an earlier run would tell of other files
+    write_file(out / "summary.json", json.dumps(summary(evaluation), indent=1).encode())
+
+
+def summary(evaluation: Evaluation) -> dict[str, object]:
+    """The figures as JSON has them."""
+    shapes = evaluation.shapes
+    return {
+        "format": _SUMMARY,
+        "result": evaluation.result,
+        "truth": evaluation.truth,
+        "frames": len(evaluation.frames),
+        "alignment": "rigid, a frame" if evaluation.aligned else "none",
+        "unit": "millimetres",
+        "regions": {name: asdict(figures) for name, figures in evaluation.regions.items()},
+        "surface": None if evaluation.surface is None else asdict(evaluation.surface),
+        "weights": None
+        if shapes is None
+        else {
+            "mean": float(shapes.error.mean.mean()),
+            "largest": float(shapes.error.largest.max()),
+            "shapes": len(shapes.names),
+            "missing": list(shapes.missing),
+            "frames": shapes.frames,
+        },
+        "notes": list(evaluation.notes),
+    }
+
+
+def _number(value: float) -> str:
+    return "" if value != value else f"{value:.6g}" if isinstance(value, float) else str(value)
