@@ -1,0 +1,194 @@
+"""The search for a lamp: directions all round, then Gauss-Newton with the strengths eliminated, shadows cast anew."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.capture.video.seen_skin import SeenSkin
+from torchface.rendering.color_space import to_srgb
+from torchface.rendering.point_light import FARTHEST
+
+_DARKEST = 0.01  # linear; below, noise of the camera and not its coding decides
+_LEAST_WIDTH = 3.0 / 255  # sRGB; a few steps of the file are no outlier
+_WIDTH = 2.5  # medians of the residuals; some 3.7 deviations of normal noise in three channels
+_STARTS, _KEPT, _APART = 128, 3, 30.0  # directions tried, refined, and degrees between those
+_USUAL = 1000.0  # millimetres at which lamps are looked for first
+_NEAREST = 1.6  # radii of what was seen; a lamp cannot stand in the face
+_ROUNDS, _STEPS, _DONE = 5, 30, 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A unit direction (3,) from the middle of what was seen, and the inverse of the distance from there, 1/mm."""
+
+    direction: Tensor
+    nearness: float
+
+    def position(self, centre: Tensor) -> Tensor:
+        """In the frame of the centre, (3,), millimetres."""
+        return centre + self.direction / self.nearness
+
+
+@dataclass(frozen=True, eq=False)
+class LampFit:
+    """A lamp and what comes with it.
+
+    Args:
+        lamp: where it stands.
+        strengths: ambient and of the lamp, linear, (2,3).
+        falling: cosine of the light at each vertex, 0 in shadow, (Q,).
+        residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
+        trust: robust weight of each vertex, in (0,1], (Q,).
+        cost: the objective.
+    """
+
+    lamp: Lamp
+    strengths: Tensor
+    falling: Tensor
+    residuals: Tensor
+    trust: Tensor
+    cost: float
+
+
+def find_lamp(seen: SeenSkin) -> LampFit:
+    """The lamp that explains best what was seen; see ``estimate_light``."""
+    starts, width = _starts(seen)
+    found = [_refined(seen, start, width) for start in starts]  # a few; each casts its own shadows
+    best = min(found, key=lambda one: one.cost)
+    # Once more with what is left as the measure of what is an outlier.
+    return _refined(seen, best.lamp, min(width, _width(best.residuals, seen)))
+
+
+def information(seen: SeenSkin, fit: LampFit) -> Tensor:
+    """Curvature of the objective over two angles across the direction (radians) and the nearness, (3,3)."""
+    return _normal_equations(seen, fit)[0]
+
+
+def _starts(seen: SeenSkin) -> tuple[list[Lamp], float]:
+    """The best of directions all round, some degrees apart, and the robust estimator's width at the very best."""
+    number = torch.arange(_STARTS, dtype=torch.float64)
+    z = 1 - 2 * (number + 0.5) / _STARTS
+    turn = number * math.pi * (3 - math.sqrt(5))
+    directions = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], dim=1)
+    lamps = [Lamp(direction, 1 / _USUAL) for direction in directions]
+    tried = [_with_strengths(seen, lamp, None) for lamp in lamps]  # a lamp at a time: each casts its own shadows
+    width = min(_width(one.residuals, seen) for one in tried)
+    costs = torch.tensor([_cost(one.residuals, seen, width) for one in tried])
+    chosen: list[int] = []
+    for i in costs.argsort().tolist():
+        if all(float(directions[i] @ directions[j]) < math.cos(math.radians(_APART)) for j in chosen):
+            chosen.append(i)
+    return [lamps[i] for i in chosen[:_KEPT]], width
+
+
+def _refined(seen: SeenSkin, start: Lamp, width: float) -> LampFit:
+    """Levenberg's steps over direction and nearness; the strengths are at their optimum all the time."""
+    reach = float((seen.points - seen.centre).norm(dim=1).max())
+    now, damping = _with_strengths(seen, start, width), 1e-3
+    H, g = _normal_equations(seen, now)
+    for _ in range(_STEPS):
+        step = -torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-9).diag(), g)
+        then = _with_strengths(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / (_NEAREST * reach)), width)
+        if then.cost >= now.cost:  # too far, or shadows that fell otherwise
+            damping *= 8
+            if damping > 1e4:
+                break
+            continue
+        gain, now, damping = 1 - then.cost / now.cost, then, max(damping / 5, 1e-7)
+        if gain < _DONE:
+            break
+        H, g = _normal_equations(seen, now)
+    return now
+
+
+def _moved(lamp: Lamp, step: Tensor, least: float, most: float) -> Lamp:
+    """Across the direction by at most half a radian, and in nearness within bounds."""
+    turn = step[:2] * min(1.0, 0.5 / max(float(step[:2].norm()), 1e-12))
+    direction = torch.nn.functional.normalize(lamp.direction + turn @ _tangents(lamp.direction), dim=0)
+    return Lamp(direction, min(max(lamp.nearness + float(step[2]) / _USUAL, least), most))
+
+
+def _tangents(direction: Tensor) -> Tensor:
+    """Two unit vectors across a direction, (2,3)."""
+    aside = torch.zeros(3, dtype=torch.float64)
+    aside[direction.abs().argmin()] = 1.0
+    first = torch.nn.functional.normalize(torch.linalg.cross(direction, aside), dim=0)
+    return torch.stack([first, torch.linalg.cross(direction, first)])
+
+
+def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None) -> LampFit:
+    """The best strengths for a lamp, by reweighted least squares; without a width the residuals themselves give it."""
+    position = lamp.position(seen.centre)
+    toward = torch.nn.functional.normalize(position - seen.points, dim=-1)
+    falling = (seen.normals * toward).sum(-1).clamp(min=0) * seen.lit_by(position)
+    wanted, slope, trust = seen.colors, _slope(seen.colors), torch.ones_like(falling)
+    coded = to_srgb(seen.colors)
+    for _ in range(_ROUNDS):
+        weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
+        strengths = _strengths(seen.albedo, seen.albedo * falling[:, None], wanted, weight)
+        shaded = seen.albedo * (strengths[0] + strengths[1] * falling[:, None])
+        slope = _slope(shaded)
+        residuals = seen.valid * (to_srgb(shaded) - coded)
+        wanted = shaded - residuals * slope
+        spread = _width(residuals, seen) if width is None else width
+        trust = (1 + residuals.square().sum(1) / spread**2).pow(-2)
+    cost = math.nan if width is None else _cost(residuals, seen, width)
+    return LampFit(lamp, strengths, falling, residuals, trust, cost)
+
+
+def _strengths(ambient: Tensor, lamp: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
+    """Non-negative a and p, (2,3), with the least weighted square of ``a ambient + p lamp - wanted``, all (Q,3)."""
+    aa, ap, pp = ((weight * x * y).sum(0) for x, y in ((ambient, ambient), (ambient, lamp), (lamp, lamp)))
+    aw, pw = (weight * ambient * wanted).sum(0), (weight * lamp * wanted).sum(0)
+    determinant = (aa * pp - ap * ap).clamp(min=1e-30)
+    both = torch.stack([pp * aw - ap * pw, aa * pw - ap * aw]) / determinant
+    alone = torch.stack([aw / aa.clamp(min=1e-30), pw / pp.clamp(min=1e-30)]).clamp(min=0)
+    # With one of two at its bound the other is at its own optimum; the smaller energy of the two says which.
+    without_lamp = alone[0] * aw > alone[1] * pw
+    bounded = torch.stack([alone[0] * without_lamp, alone[1] * ~without_lamp])
+    inside = (both >= 0).all(0) & (aa * pp - ap * ap > 1e-9 * aa * pp)
+    return torch.where(inside, both, bounded)
+
+
+def _normal_equations(seen: SeenSkin, fit: LampFit) -> tuple[Tensor, Tensor]:
+    """H (3,3) and g (3,) of the lamp's place, with the strengths' directions projected out (variable projection)."""
+    direction = fit.lamp.direction
+    aside = seen.points - seen.centre
+    way = direction - fit.lamp.nearness * aside
+    length = way.norm(dim=1, keepdim=True)
+    toward = way / length
+    across = (seen.normals - (seen.normals * toward).sum(1, keepdim=True) * toward) / length
+    moved = torch.stack([*(across @ _tangents(direction).T).unbind(1), -(across * aside).sum(1) / _USUAL], dim=1)
+    moved = moved * (fit.falling > 0)[:, None]
+    shaded = seen.albedo * (fit.strengths[0] + fit.strengths[1] * fit.falling[:, None])
+    root = (seen.valid * (seen.area * fit.trust)[:, None]).sqrt()
+    scaled = root / _slope(shaded) * seen.albedo
+    H, g = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    for c in range(3):  # channels: each has strengths of its own to project out
+        columns = scaled[:, c, None] * torch.stack([torch.ones_like(fit.falling), fit.falling], dim=1)
+        basis = torch.linalg.qr(columns[:, fit.strengths[:, c] > 0])[0]
+        J = scaled[:, c, None] * fit.strengths[1, c] * moved
+        J = J - basis @ (basis.T @ J)
+        H, g = H + J.T @ J, g + J.T @ (root[:, c] * fit.residuals[:, c])
+    return H, g
+
+
+def _slope(linear: Tensor) -> Tensor:
+    """How much linear light changes with its sRGB code."""
+    return 2.4 / 1.055 * linear.clamp(min=_DARKEST).pow(1.4 / 2.4)
+
+
+def _width(residuals: Tensor, seen: SeenSkin) -> float:
+    """Of the robust estimator, from the median of the residuals, every pixel counting alike."""
+    sizes, order = residuals.norm(dim=1).sort()
+    share = seen.area[order].cumsum(0)
+    return max(_LEAST_WIDTH, _WIDTH * float(sizes[torch.searchsorted(share, share[-1:] / 2)]))
+
+
+def _cost(residuals: Tensor, seen: SeenSkin, width: float) -> float:
+    square = residuals.square().sum(1)
+    return float((seen.area * square / (1 + square / width**2)).sum())
