@@ -15,6 +15,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.landmarks.appearance import AppearanceModel
+from torchface.landmarks.trees import LandmarkTrees
 from torchface.landmarks.uv import UVLandmarkDetector
 from torchface.model_files import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
 from torchface.modeling.head_model import HeadModel
@@ -26,6 +27,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "appearance": AppearanceModel,
     "expression_regression": ExpressionRegression,
     "head": HeadModel,
+    "landmark_trees": LandmarkTrees,
     "marker_solver": MarkerSolver,
     "morphable": MorphableModel,
     "uv_landmarks": UVLandmarkDetector,

@@ -10,6 +10,8 @@ from torchface.landmarks.detector_settings import DetectorSettings
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.relief import relief
 from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
+from torchface.landmarks.tree_training import TreeSettings
+from torchface.landmarks.trees import LandmarkTrees
 from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
 from torchface.landmarks.uv import UVLandmarkDetector, UVLandmarks
 
@@ -24,9 +26,11 @@ __all__ = [
     "DetectorSettings",
     "FaceFrame",
     "LandmarkPairs",
+    "LandmarkTrees",
     "ScanAnnotation",
     "ScanLandmarks",
     "TraceSettings",
+    "TreeSettings",
     "UVLandmarkDetector",
     "UVLandmarks",
     "UnwrappedHead",
