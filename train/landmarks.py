@@ -1,0 +1,261 @@
+"""``python -m train.landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in pictures.
+
+A folder of iBUG's kind holds pictures with a ``.pts`` beside each; a dlib ``.xml`` names its pictures itself.
+``--performers 2000`` learns from so many rendered pictures of made-up people, alone or besides the data.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from torchface import TorchfaceError, zoo
+from torchface.errors import FileFormatError
+from torchface.io.images import load_image
+from torchface.io.landmarks import load_landmark_points
+from torchface.io.landmarks_dlib import load_dlib_faces
+from torchface.landmarks import LandmarkTrees, TreeSettings
+from torchface.landmarks.ibug import box_around, relative_errors
+from torchface.synthetic.face_pictures import PictureSettings, face_pictures
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+_LUMA = torch.tensor([0.299, 0.587, 0.114])
+_LARGEST_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
+_AROUND = 0.8  # of the box that is kept on every side
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        data: Folders of pictures with .pts files, or dlib .xml files.
+        performers: So many rendered pictures of made-up people.
+        out: Folder for the model and its card.
+        held_out: Faces of the data, the last ones, or rendered pictures of other people, that are kept for the test.
+        seed: Draws people, poses and lights.
+        licence: Under which the model may be used.
+        trees: How trees are grown.
+        pictures: What is rendered how widely.
+    """
+
+    data: tuple[Path, ...] = ()
+    performers: int = 0
+    out: Path = Path("models/face_landmarks")
+    held_out: int = 0
+    seed: int = 1
+    licence: str = "MIT"
+    trees: TreeSettings = field(default_factory=TreeSettings)
+    pictures: PictureSettings = field(default_factory=PictureSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """Grey pictures uint8 (H,W), boxes (M,4) and landmarks (M,68,2) in their pixels."""
+
+    images: list[Tensor]
+    boxes: Tensor
+    landmarks: Tensor
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, rows: slice) -> Faces:
+        return Faces(self.images[rows], self.boxes[rows], self.landmarks[rows])
+
+    def __add__(self, other: Faces) -> Faces:
+        return Faces(
+            self.images + other.images,
+            torch.cat([self.boxes, other.boxes]),
+            torch.cat([self.landmarks, other.landmarks]),
+        )
+
+
+NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2))
+
+
+def train(settings: Settings, say: Callable[[str], None] | None = None) -> tuple[LandmarkTrees, Tensor]:
+    """Loads or renders, splits, fits, evaluates and saves; the model, and its errors on the faces held out.
+
+    A checkpoint is kept in ``out`` until the model is saved: a run that was killed goes on from there.
+
+    Raises:
+        TorchfaceError: neither data nor performers, too few faces, or a file that cannot be used.
+    """
+    say = say or (lambda line: None)
+    learn, test = split(settings, say)
+    say(f"{len(learn)} faces to learn from, {len(test)} to test on")
+    settings.out.mkdir(parents=True, exist_ok=True)
+    checkpoint = settings.out / "checkpoint.safetensors"
+    model = LandmarkTrees.fit(
+        learn.images, learn.boxes, learn.landmarks, settings.trees, _every(50, "trees", say), checkpoint=checkpoint
+    )
+    errors = evaluate(model, test)
+    _save(model, settings, errors, len(learn))
+    checkpoint.unlink(missing_ok=True)
+    return model, errors
+
+
+def split(settings: Settings, say: Callable[[str], None] | None = None) -> tuple[Faces, Faces]:
+    """The faces to learn from, and those to test on."""
+    say = say or (lambda line: None)
+    if not settings.data and settings.performers < 1:
+        raise TorchfaceError("found neither data nor performers, expected --data DIR... or --performers NUMBER")
+    real = NO_FACES
+    for path in settings.data:
+        real = real + load_faces(path)
+        say(f"{path}: {len(real)} faces so far")
+    kept = settings.held_out if settings.data else 0
+    if settings.data and len(real) <= kept:
+        raise TorchfaceError(f"data: found {len(real)} faces, expected more than the {kept} held out")
+    learn, test = real[: len(real) - kept], real[len(real) - kept :]
+    if settings.performers:
+        learn = learn + rendered_faces(settings.performers, settings.seed, settings.pictures, say)
+        if not settings.data:
+            test = rendered_faces(settings.held_out, settings.seed + 1_000_000, settings.pictures, say)
+    return learn, test
+
+
+def load_faces(path: Path) -> Faces:
+    """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
+
+    Raises:
+        FileFormatError: neither of both, no annotated face in it, or a picture is missing.
+    """
+    found: list[tuple[Path, Tensor]] = []
+    if path.suffix.lower() == ".xml":
+        for face in load_dlib_faces(path):
+            if face.points.shape == (68, 2) and bool(torch.isfinite(face.points).all()):
+                found.append((_beside(path, face.image), face.points))
+    elif path.is_dir():
+        for points in sorted(path.rglob("*.pts")):
+            pictures = [points.with_suffix(ending) for ending in _ENDINGS if points.with_suffix(ending).is_file()]
+            if not pictures:
+                raise FileFormatError(f"{points}: found no picture of the same name, expected one beside it")
+            found.append((pictures[0], load_landmark_points(points).ibug()))
+    else:
+        raise FileFormatError(f"{path}: found no folder and no .xml, expected iBUG's .pts files or dlib's XML")
+    if not found:
+        raise FileFormatError(f"{path}: found no face with 68 landmarks, expected at least one")
+    known: dict[Path, Tensor] = {}
+    faces = NO_FACES
+    for picture, points in found:
+        if picture not in known:
+            known = {picture: torch.einsum("chw,c->hw", load_image(picture), _LUMA)}  # faces of a picture come in a row
+        faces = faces + _cropped(known[picture], points.float())
+    return faces
+
+
+def rendered_faces(
+    count: int, seed: int, settings: PictureSettings | None = None, say: Callable[[str], None] | None = None
+) -> Faces:
+    """Pictures of made-up people."""
+    progress = None if say is None else _every(100, "pictures", say)
+    pictures = list(face_pictures(count, seed, settings, progress))
+    if not pictures:
+        return NO_FACES
+    return Faces(
+        [picture.image for picture in pictures],
+        torch.stack([picture.box for picture in pictures]),
+        torch.stack([picture.landmarks for picture in pictures]),
+    )
+
+
+def evaluate(model: LandmarkTrees, faces: Faces) -> Tensor:
+    """Errors (M,) over the distance of the outer corners of the eyes."""
+    found = [
+        model(image[None, None].float() / 255, box[None])  # sizes differ: a face at a time
+        for image, box in zip(faces.images, faces.boxes, strict=True)
+    ]
+    return relative_errors(torch.cat(found), faces.landmarks) if found else torch.zeros(0)
+
+
+def _beside(path: Path, name: str) -> Path:
+    """A picture that an XML names; one outside of its folder is refused."""
+    picture = path.parent / name
+    if not picture.resolve().is_relative_to(path.parent.resolve()):
+        raise FileFormatError(f"{path}: found the picture {name!r:.80}, expected one in the same folder")
+    return picture
+
+
+def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
+    """A face cut out of a picture (H,W) in [0,1], smaller where it is very large."""
+    box = box_around(landmarks)
+    high, wide = grey.shape
+    low = (box[:2] - _AROUND * box[2:]).floor().clamp(min=0).minimum(torch.tensor([wide - 1.0, high - 1.0]))
+    end = (box[:2] + (1 + _AROUND) * box[2:]).ceil().clamp(min=1).minimum(torch.tensor([float(wide), float(high)]))
+    end = torch.maximum(end, low + 1)
+    (x, y), (right, bottom) = low.long().tolist(), end.long().tolist()
+    part, zoom = grey[y:bottom, x:right], min(1.0, _LARGEST_BOX / float(box[2]))
+    landmarks = landmarks - low
+    if zoom < 1:
+        size = [max(1, round(side * zoom)) for side in part.shape]
+        part = torch.nn.functional.interpolate(part[None, None], size, mode="bilinear", antialias=True)[0, 0]
+        scale = torch.tensor([part.shape[1] / (right - x), part.shape[0] / (bottom - y)])
+        landmarks = (landmarks + 0.5) * scale - 0.5
+    stored = (255 * part).round().clamp(0, 255).to(torch.uint8).contiguous()
+    return Faces([stored], box_around(landmarks)[None], landmarks[None])
+
+
+def _every(count: int, what: str, say: Callable[[str], None]) -> Callable[[int, int], None]:
+    def progress(done: int, total: int) -> None:
+        if done % count == 0 or done == total:
+            say(f"{done} of {total} {what}")
+
+    return progress
+
+
+def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) -> None:
+    effective = asdict(settings) | {"data": [path.name for path in settings.data], "out": settings.out.name}
+    own = f"{settings.performers} rendered pictures of the embedded performer; no person's face."
+    given = f"{count - settings.performers} faces of {', '.join(path.name for path in settings.data)}"
+    data = own if not settings.data else (f"{given}, {own}" if settings.performers else f"{given}.")
+    flags = [f"--data {' '.join(path.name for path in settings.data)}"] if settings.data else []
+    flags += [f"--performers {settings.performers}"] if settings.performers else []
+    flags += [f"--held-out {settings.held_out} --seed {settings.seed}"]
+    for part in ("trees", "pictures"):  # a default a turn: what differs is said
+        usual, ours = asdict(type(getattr(settings, part))()), asdict(getattr(settings, part))
+        flags += [f"--{part}.{key.replace('_', '-')} {ours[key]}" for key in ours if ours[key] != usual[key]]
+    metrics = {}
+    if len(errors):
+        metrics = {
+            "mean error, % of the distance of the eyes' outer corners": 100 * float(errors.mean()),
+            "median error, %": 100 * float(errors.median()),
+            "share of faces with more than 10 %, %": 100 * float((errors > 0.1).float().mean()),
+        }
+    zoo.save_model(
+        model,
+        settings.out,
+        licence=settings.licence,
+        data=data,
+        metrics=metrics,
+        recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
+        card=(
+            "iBUG's 68 landmarks of faces in grey pictures, from boxes as OpenCV's Haar cascade gives them or "
+            "`torchface.landmarks.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
+            f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
+        ),
+        settings=effective,
+        half=("offsets", "thresholds", "bases"),
+    )
+
+
+def main() -> None:
+    """Parses flags, trains, prints."""
+    try:
+        settings = tyro.cli(Settings, description=__doc__)
+        train(settings, print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
+    for key, value in zoo.describe(settings.out.resolve()).metrics.items():
+        print(f"{key:60} {value:8.2f}")
+
+
+if __name__ == "__main__":
+    main()
