@@ -19,6 +19,7 @@ from torchface.landmarks.shape_modes import PlanarPose, planar_pose
 COUNT = 68
 _MARGIN = 0.3
 _MOST_SAMPLES = 8
+_STILL = 0.02  # pixels of a level: a face whose landmarks move by less has arrived
 _LUMA = (0.299, 0.587, 0.114)
 
 
@@ -254,27 +255,32 @@ class AppearanceModel(nn.Module):
         corner = torch.view_as_complex(low.contiguous())
         pose = PlanarPose(pose.turn / resolution, pose.shift + pose.turn * corner)
         width, height = ((high - low) * resolution).ceil().long().tolist()
-        samples = min(_MOST_SAMPLES, max(1, int(pose.scale.max().round())))
-        step = (torch.arange(samples, device=images.device) + 0.5) / samples - 0.5
-        x = (torch.arange(width, device=images.device)[:, None] + step).flatten()
-        y = (torch.arange(height, device=images.device)[:, None] + step).flatten()
-        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(images.dtype)
-        picture = sample_pixels(images, pose.apply(grid)).unflatten(2, (len(y), len(x)))
         # Several samples a pixel where the image is finer than the crop: skipping pixels would alias.
-        return FaceCrop(dense_features(avg_pool2d(picture, samples), self.settings.features), pose)
+        samples = pose.scale.round().long().clamp(1, _MOST_SAMPLES)
+        pictures = images.new_empty(len(images), 1, height, width)
+        for count in samples.unique().tolist():
+            rows = samples == count
+            some = PlanarPose(pose.turn[rows], pose.shift[rows])
+            pictures[rows] = _cut_out(images[rows], some, (width, height), count)
+        return FaceCrop(dense_features(pictures, self.settings.features), pose)
 
     def _refine_level(self, level: AppearanceLevel, images: Tensor, landmarks: Tensor) -> Tensor:
         resolution = float(level.scale)
         crop = self.crop(images, landmarks, resolution)
         found = crop.pose.undo(landmarks)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
+        still = torch.zeros(len(found), dtype=torch.bool, device=found.device)
         for _ in range(self.settings.iterations):
             residual = level.residual(level.sample(crop.features, self._points(found)))
             _, state = self._shape(found)
             step = level.step(residual, state, precision)
             moved = torch.einsum("bq,qlc->blc", step, self.motions)
             warp = self._linear_parts(found)
-            found = self._onto_modes(found - torch.einsum("blij,blj->bli", warp, moved))
+            before, found = found, self._onto_modes(found - torch.einsum("blij,blj->bli", warp, moved))
+            still |= (found - before).flatten(1).abs().amax(1) < _STILL
+            found = torch.where(still[:, None, None], before, found)
+            if still.all():
+                break
         return crop.pose.apply(found)
 
     def _points(self, landmarks: Tensor) -> Tensor:
@@ -332,6 +338,14 @@ def grey_images(images: Tensor) -> Tensor:
     if images.shape[1] == 1:
         return images
     return (images * images.new_tensor(_LUMA)[:, None, None]).sum(1, keepdim=True)
+
+
+def _cut_out(images: Tensor, pose: PlanarPose, size: tuple[int, int], samples: int) -> Tensor:
+    """Pictures (B,1,height,width) whose pixels lie where a pose puts them, each a mean over ``samples`` a side."""
+    step = (torch.arange(samples, device=images.device) + 0.5) / samples - 0.5
+    x, y = ((torch.arange(count, device=images.device)[:, None] + step).flatten() for count in size)
+    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(images.dtype)
+    return avg_pool2d(sample_pixels(images, pose.apply(grid)).unflatten(2, (len(y), len(x))), samples)
 
 
 def _edges(points: Tensor, triangles: Tensor) -> Tensor:

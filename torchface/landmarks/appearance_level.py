@@ -69,8 +69,9 @@ class AppearanceLevel(nn.Module):
     def residual(self, sampled: Tensor) -> TextureResidual:
         """What the modes leave of sampled features (B,C,N), and the coefficients that explain the rest."""
         left = sampled - self.mean
-        coefficients = torch.einsum("bcn,kcn->bk", left, self.modes)
-        return TextureResidual(left - torch.einsum("bk,kcn->bcn", coefficients, self.modes), coefficients)
+        modes = self.modes.flatten(1)
+        coefficients = left.flatten(1) @ modes.T
+        return TextureResidual(left - (coefficients @ modes).view_as(left), coefficients)
 
     def error(self, residual: TextureResidual) -> Tensor:
         """Mean squared residual (B,) over what training images that were left out had: about 1 on a good fit."""
@@ -84,20 +85,20 @@ class AppearanceLevel(nn.Module):
             state: the current shape along the motions (B,Q), 0 for the similarity's.
             precision: of the shape along each, (Q,), 0 for the similarity's.
         """
-        one = torch.ones_like(residual.coefficients[:, :1])
-        mixed = torch.cat([one, residual.coefficients], dim=1)
-        slope = torch.einsum("bk,kcnd->bcnd", mixed, self.slope)
-        pull = torch.einsum("bcn,bcnd->bnd", residual.left, slope)
-        downhill = torch.einsum("bnd,ndq->bq", pull, self.motion) / self.noise
-        curvature = torch.einsum("bj,bk,jkpq->bpq", mixed, mixed, self.curvature()) / self.noise
+        mixed = _with_one(residual.coefficients)
+        slope = (mixed @ self.slope.flatten(1)).unflatten(1, self.slope.shape[1:])
+        pull = (residual.left[..., None] * slope).sum(1)
+        downhill = pull.flatten(1) @ self.motion.flatten(0, 1) / self.noise
+        products = (mixed[:, :, None] * mixed[:, None]).flatten(1)
+        curvature = products @ self.curvature().flatten(2).flatten(0, 1) / self.noise
+        curvature = curvature.unflatten(1, (state.shape[1], -1))
         damping = 1e-4 * curvature.diagonal(dim1=1, dim2=2).mean(1)[:, None] + 1e-9
         system = curvature + torch.diag_embed(precision + damping)
         return torch.linalg.solve(system, downhill + precision * state)
 
     def jacobian(self, coefficients: Tensor) -> Tensor:
         """J (B,C,N,Q) of the texture with these coefficients (B,K)."""
-        mixed = torch.cat([torch.ones_like(coefficients[:, :1]), coefficients], dim=1)
-        return torch.einsum("bk,kcnd,ndq->bcnq", mixed, self.slope, self.motion)
+        return torch.einsum("bk,kcnd,ndq->bcnq", _with_one(coefficients), self.slope, self.motion)
 
     def curvature(self) -> Tensor:
         """The coefficients (K+1,K+1,Q,Q) of the projected curvature; kept until the state changes."""
@@ -106,10 +107,15 @@ class AppearanceLevel(nn.Module):
             terms = torch.einsum("kcnd,ndq->kqcn", self.slope, self.motion).flatten(2)
             modes = self.modes.flatten(1)
             flat = (terms - (terms @ modes.T) @ modes).flatten(0, 1)
-            count = len(self.slope)
-            self._curvature = (flat @ flat.T).unflatten(1, (count, -1)).unflatten(0, (count, -1)).transpose(1, 2)
+            products = (flat @ flat.T).unflatten(1, (len(terms), -1)).unflatten(0, (len(terms), -1))
+            self._curvature = products.transpose(1, 2).contiguous()
             self._curvature_of = known
         return self._curvature
+
+
+def _with_one(coefficients: Tensor) -> Tensor:
+    """Coefficients (B,K) with that of the mean texture before them, (B,K+1)."""
+    return torch.cat([torch.ones_like(coefficients[:, :1]), coefficients], dim=1)
 
 
 def sample_pixels(images: Tensor, places: Tensor) -> Tensor:
