@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
-from torchface.landmarks import DetectorSettings, UVLandmarkDetector
+from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
 from torchface.landmarks.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model
@@ -53,7 +53,14 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     places = torch.tensor([[20.0, 20.0], [40.0, 44.0]]) + noise(3, 2, 2)
     settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
     detector = UVLandmarkDetector.fit(images, places, ("left", "right"), "relief", settings)
-    for name, model in {"head": head, "expressions": regression, "uv_landmarks": detector, "solver": solver}.items():
+    picture = (255 * torch.nn.functional.interpolate(torch.rand(1, 1, 12, 20), (360, 640), mode="bilinear")[0, 0]).byte()
+    box = torch.tensor([[220.0, 90, 180, 180]])
+    few = TreeSettings(cascades=2, trees=4, depth=2, oversampling=4, components=4)
+    trees = LandmarkTrees.fit([picture], box, 220 + 100 * torch.rand(1, 68, 2), few)
+    (path / "picture.gray").write_bytes(picture.numpy().tobytes())
+    np.save(path / "picture.npy", picture.numpy())
+    models = {"head": head, "expressions": regression, "uv_landmarks": detector, "face_landmarks": trees}
+    for name, model in {**models, "solver": solver}.items():
         export_model(model, path / f"{name}.onnx")
     markers = solver.rest + solver.basis[..., 0] * torch.linspace(0, 1, 5)[:, None, None]
     markers[2, 3] = torch.nan
@@ -91,6 +98,7 @@ RESULTS = {
     "A head from coefficients": "vertices",
     "A rig from a neutral face": "offsets",
     "Landmarks of an unwrapped head": "pixels",
+    "Landmarks of faces in a picture": "landmarks",
     "Weights from markers": "previous",
 }
 
