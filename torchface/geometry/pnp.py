@@ -74,6 +74,30 @@ def solve_pnp(
     return best
 
 
+def pose_covariance(
+    points: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    r"""How far off poses of least squares are, where every pixel is off by a deviation of one.
+
+    .. math:: \Sigma = \Big( \sum_i w_i J_i^\top J_i \Big)^{-1}, \qquad
+        J = \frac{\partial \pi(K (\exp([\theta]) R x + t + m))}{\partial (\theta, m)}
+
+    Args:
+        points: x, (N,3), millimetres.
+        rotation, translation: world to camera, (B,3,3) and (B,3).
+        intrinsics: K, (3,3) or (B,3,3).
+        weights: w, (B,N); equal if absent.
+
+    Returns:
+        Covariance of the turn in the camera's frame, radians, and of the move, millimetres, (B,6,6) float64.
+
+    Source: first-order propagation of noise, Hartley and Zisserman 2004, 5.2.
+    """
+    jacobian = _jacobian(points.double() @ rotation.transpose(-1, -2), translation, intrinsics.double())[1]
+    weighted = jacobian if weights is None else jacobian * weights.double().repeat_interleave(2, dim=1)[..., None]
+    return torch.linalg.inv(weighted.transpose(-1, -2) @ jacobian)
+
+
 def pixel_jacobian(seen: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (B,N,2) of points (B,N,3) in the camera's frame, and what moves them: (B,N,2,3)."""
     image = seen @ intrinsics.transpose(-1, -2)
@@ -183,11 +207,7 @@ def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, trans
     total, going = w.sum(1), torch.arange(len(x), device=x.device)
     found = Pose(rotation.clone(), translation.clone(), error.clone())
     for _ in range(_ROUNDS):
-        seen = x @ rotation.transpose(-1, -2)
-        pixels, by_place = pixel_jacobian(seen + translation[:, None], K)
-        # A turn by r moves the point s by r x s, so the pixel by (s x a) r where a move by m moves it by a m.
-        by_turn = torch.linalg.cross(seen[:, :, None].expand_as(by_place), by_place)
-        jacobian = torch.cat([by_turn, by_place], dim=-1).flatten(1, 2)
+        pixels, jacobian = _jacobian(x @ rotation.transpose(-1, -2), translation, K)
         weighted = (jacobian * w.repeat_interleave(2, dim=1)[..., None]).transpose(-1, -2)
         H = weighted @ jacobian
         g = weighted @ (pixels - q).flatten(1)[..., None]
@@ -210,6 +230,14 @@ def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, trans
             rotation, translation, error, damping = rotation[left], translation[left], error[left], damping[left]
             nearest = nearest[left]
     return Pose(found.rotation, found.translation, (found.errors / total).sqrt())
+
+
+def _jacobian(turned: Tensor, translation: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (B,N,2) of points turned into the camera's frame (B,N,3), and what moves them: (B,2N,6)."""
+    pixels, by_place = pixel_jacobian(turned + translation[:, None], K)
+    # A turn by r moves the point s by r x s, so the pixel by (s x a) r where a move by m moves it by a m.
+    by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
+    return pixels, torch.cat([by_turn, by_place], dim=-1).flatten(1, 2)
 
 
 def _error(

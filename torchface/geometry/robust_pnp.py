@@ -40,7 +40,7 @@ def robust_pnp(
     points: Tensor,
     pixels: Tensor,
     intrinsics: Tensor,
-    threshold: float = 4.0,
+    threshold: float | Tensor = 4.0,
     weights: Tensor | None = None,
     start: Pose | None = None,
     hypotheses: int = 64,
@@ -58,7 +58,7 @@ def robust_pnp(
         points: x, (N,3), millimetres.
         pixels: q, (B,N,2); a NaN row counts as not seen.
         intrinsics: K, (3,3).
-        threshold: :math:`\tau`, pixels; three deviations of good landmarks or so.
+        threshold: :math:`\tau`, pixels, one for all or (B,); three deviations of good landmarks or so.
         weights: w, non-negative, (B,N) or (N,); equal if absent. A point of weight 0 is never an inlier.
         start: poses to be tried beside, such as those of the frames before; NaN where there is none.
         hypotheses: threes drawn a frame; 64 find a good one nearly always while half of the points are wrong.
@@ -74,12 +74,13 @@ def robust_pnp(
 
     Source: Fischler and Bolles 1981; Torr and Zisserman 2000; thesis 4.2.4.
     """
-    x, q, K, w = _checked(points, pixels, intrinsics, threshold, weights, hypotheses)
+    x, q, K, w = _checked(points, pixels, intrinsics, weights)
+    limit = _limits(threshold, len(q), hypotheses)
     given = _given(start, len(q))
     order = torch.rand(hypotheses, len(x), generator=torch.Generator().manual_seed(seed))
     size = max(1, _LARGEST // (hypotheses * 4 * len(x)))
     chunks = [
-        _consensus(x, q[i : i + size], K, w[i : i + size], given[i : i + size], order, threshold)
+        _consensus(x, q[i : i + size], K, w[i : i + size], given[i : i + size], order, limit[i : i + size])
         for i in range(0, max(1, len(q)), size)
     ]
     parts = [torch.cat(part) for part in zip(*chunks, strict=True)]
@@ -87,7 +88,7 @@ def robust_pnp(
 
 
 def _consensus(
-    x: Tensor, q: Tensor, K: Tensor, w: Tensor, given: Tensor, order: Tensor, threshold: float
+    x: Tensor, q: Tensor, K: Tensor, w: Tensor, given: Tensor, order: Tensor, limit: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rotations, translations, errors and inliers of a chunk of frames; ``given`` holds [R|t] to try beside."""
     enough = ((w > 0).sum(1) >= _FEWEST).nonzero()[:, 0]
@@ -95,19 +96,19 @@ def _consensus(
     errors, inliers = q.new_full((len(q),), torch.nan), torch.zeros_like(w, dtype=torch.bool)
     if not len(enough):
         return rotation, translation, errors, inliers
-    q, w = q[enough], w[enough]
+    q, w, limit = q[enough], w[enough], limit[enough]
     turned, moved = _hypotheses(x, q, K, w, order)
     turned = torch.cat([turned, given[enough, None, :, :3]], dim=1)
     moved = torch.cat([moved, given[enough, None, :, 3]], dim=1)
     # Single precision is enough to tell which are worth more work.
-    rough = _scores(x.float(), q.float(), K.float(), w.float(), turned.float(), moved.float(), threshold)
+    rough = _scores(x.float(), q.float(), K.float(), w.float(), turned.float(), moved.float(), limit.float())
     kept = rough.topk(min(_KEPT, turned.shape[1]), dim=1, largest=False).indices
     row = torch.arange(len(q))[:, None]
-    turned, moved = _refined(x, q, K, w, turned[row, kept], moved[row, kept], threshold)
-    best = _scores(x, q, K, w, turned, moved, threshold).argmin(1)
+    turned, moved = _refined(x, q, K, w, turned[row, kept], moved[row, kept], limit)
+    best = _scores(x, q, K, w, turned, moved, limit).argmin(1)
     turned, moved = turned[row[:, 0], best], moved[row[:, 0], best]
     squared = _squared(x, q, K, turned[:, None], moved[:, None])[:, 0]
-    agreed = (squared < threshold**2) & (w > 0)
+    agreed = (squared < limit[:, None].square()) & (w > 0)
     found = agreed.sum(1) >= _FEWEST
     share = torch.where(agreed, w, 0.0)
     error = (torch.where(agreed, squared * w, 0.0).sum(1) / share.sum(1)).sqrt()
@@ -128,7 +129,7 @@ def _hypotheses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, order: Tensor) -> tu
 
 
 def _refined(
-    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, threshold: float
+    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, limit: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Poses (B,H) after least squares on their own inliers, chosen anew a few times."""
     shape = rotation.shape[:2]
@@ -136,7 +137,7 @@ def _refined(
     before = torch.zeros(*shape, len(x), dtype=torch.bool)
     for _ in range(_ROUNDS):
         squared = _squared(x, q, K, rotation, translation)
-        agreed = (squared < threshold**2) & (w > 0)[:, None]
+        agreed = (squared < limit[:, None, None].square()) & (w > 0)[:, None]
         going = ((agreed.sum(-1) >= _FEWEST) & (agreed != before).any(-1)).nonzero(as_tuple=True)
         if not len(going[0]):
             break
@@ -148,12 +149,10 @@ def _refined(
     return rotation, translation
 
 
-def _scores(
-    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, threshold: float
-) -> Tensor:
+def _scores(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, limit: Tensor) -> Tensor:
     """Truncated squared errors (B,H), summed over the points seen."""
     squared = _squared(x, q, K, rotation, translation)
-    return (squared.clamp(max=threshold**2) * w[:, None]).sum(-1)
+    return (torch.minimum(squared, limit[:, None, None].square()) * w[:, None]).sum(-1)
 
 
 def _squared(x: Tensor, q: Tensor, K: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
@@ -178,8 +177,19 @@ def _given(start: Pose | None, frames: int) -> Tensor:
     return torch.cat([start.rotation.detach().double(), start.translation.detach().double()[..., None]], dim=-1)
 
 
+def _limits(threshold: float | Tensor, frames: int, hypotheses: int) -> Tensor:
+    limit = torch.as_tensor(threshold, dtype=torch.float64).detach()
+    if limit.shape not in ((), (frames,)):
+        raise ShapeError(f"threshold: found {tuple(limit.shape)}, expected one number or ({frames},)")
+    if not ((limit > 0) & limit.isfinite()).all() or hypotheses < 1:
+        raise ValueRangeError(
+            f"robust_pnp: found threshold {threshold} and {hypotheses} hypotheses, expected positive numbers"
+        )
+    return limit.expand(frames)
+
+
 def _checked(
-    points: Tensor, pixels: Tensor, intrinsics: Tensor, threshold: float, weights: Tensor | None, hypotheses: int
+    points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     if points.ndim != 2 or points.shape[1] != 3 or pixels.ndim != 3 or pixels.shape[1:] != (len(points), 2):
         raise ShapeError(
@@ -190,10 +200,6 @@ def _checked(
         raise ShapeError(f"robust_pnp: found {len(points)} points, expected at least {_FEWEST}")
     if intrinsics.shape != (3, 3):
         raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
-    if not 0 < threshold < float("inf") or hypotheses < 1:
-        raise ValueRangeError(
-            f"robust_pnp: found threshold {threshold} and {hypotheses} hypotheses, expected positive numbers"
-        )
     q = pixels.detach().double()
     seen = torch.isfinite(q).all(-1)
     w = torch.ones_like(seen, dtype=torch.float64)

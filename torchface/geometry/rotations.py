@@ -1,4 +1,4 @@
-"""Rotations from their axis and angle."""
+"""Rotations from their axis and angle, and the way back."""
 
 from __future__ import annotations
 
@@ -30,3 +30,32 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
     second = torch.where(small, 0.5 - square / 24, 2 * (safe / 2).sin().square() / safe.square())
     cross = cross_matrix(vectors)
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + first * cross + second * (cross @ cross)
+
+
+def rotation_vector(rotations: Tensor) -> Tensor:
+    r"""The axes times angles (...,3) of rotations (...,3,3): :func:`rotation_matrix` turned back, up to half a turn.
+
+    By way of the unit quaternion whose largest part is computed first, so that no angle loses digits.
+
+    Example:
+        >>> turn = torch.tensor([0.1, -0.2, 0.3])
+        >>> torch.allclose(rotation_vector(rotation_matrix(turn)), turn)
+        True
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    # Each row is the quaternion times four times one of its parts; the row of the largest part is the most exact.
+    rows = torch.stack(
+        [
+            torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
+            torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
+            torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
+            torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*rows.shape[:-2], 1, 4)
+    unit = torch.nn.functional.normalize(rows.gather(-2, largest)[..., 0, :], dim=-1)
+    unit = torch.where(unit[..., :1] < 0, -unit, unit)
+    sine = unit[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, unit[..., :1])
+    return unit[..., 1:] * torch.where(sine < 1e-12, 2.0, angle / sine.clamp(min=1e-12))
