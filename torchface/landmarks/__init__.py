@@ -7,6 +7,7 @@ from torchface.landmarks.correspondences import AutomaticLandmarks, LandmarkPair
 from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.detector_files import load_detector, save_detector
 from torchface.landmarks.detector_settings import DetectorSettings
+from torchface.landmarks.face_box import FaceBoxes, HaarDetector, NoFaceError, YuNetDetector, find_face, find_faces
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.relief import relief
 from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
@@ -24,9 +25,12 @@ __all__ = [
     "Contour",
     "CylinderLayout",
     "DetectorSettings",
+    "FaceBoxes",
     "FaceFrame",
+    "HaarDetector",
     "LandmarkPairs",
     "LandmarkTrees",
+    "NoFaceError",
     "ScanAnnotation",
     "ScanLandmarks",
     "TraceSettings",
@@ -34,8 +38,11 @@ __all__ = [
     "UVLandmarkDetector",
     "UVLandmarks",
     "UnwrappedHead",
+    "YuNetDetector",
     "appearance_image",
     "contour_correspondences",
+    "find_face",
+    "find_faces",
     "line_image",
     "load_annotations",
     "load_detector",
