@@ -13,6 +13,7 @@ from torch import nn
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.landmarks.appearance import AppearanceModel
 from torchface.landmarks.trees import LandmarkTrees
@@ -25,11 +26,14 @@ from torchface.modeling.personalization import ExpressionRegression
 KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,
     "appearance": AppearanceModel,
+    "dynamics_prior": DynamicsPrior,
     "expression_regression": ExpressionRegression,
     "head": HeadModel,
     "landmark_trees": LandmarkTrees,
     "marker_solver": MarkerSolver,
     "morphable": MorphableModel,
+    "reciprocal_prior": ReciprocalPrior,
+    "shape_prior": ShapePrior,
     "uv_landmarks": UVLandmarkDetector,
 }
 """What a file may ask for: a kind is looked up here and nowhere else."""

@@ -11,13 +11,17 @@ from torchface.capture.markers import (
     fit_attachment,
     rest_residual,
 )
+from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.video import VideoSolver
 
 __all__ = [
     "ActionUnitClassifier",
+    "DynamicsPrior",
+    "DynamicsSettings",
     "HelmetSolver",
     "HybridSolver",
     "MarkerSolver",
+    "ShapePrior",
     "VideoSolver",
     "WholeTakeSolver",
     "action_unit_curves",

@@ -1,14 +1,21 @@
 """What faces do, learned from takes: which weights, and how they go on."""
 
+from torchface.capture.priors.dynamics import DynamicsPrior, DynamicsSettings
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
+from torchface.capture.priors.motion import face_regions, resampled, windows_of
 from torchface.capture.priors.parzen import ParzenDensity, automatic_bandwidth
 from torchface.capture.priors.shape_prior import ReciprocalPrior, ShapePrior, face_halves
 
 __all__ = [
+    "DynamicsPrior",
+    "DynamicsSettings",
     "GaussianMixture",
     "ParzenDensity",
     "ReciprocalPrior",
     "ShapePrior",
     "automatic_bandwidth",
     "face_halves",
+    "face_regions",
+    "resampled",
+    "windows_of",
 ]

@@ -145,10 +145,7 @@ class ShapePrior(nn.Module):
         Raises:
             NameMismatchError: they are others, or in another order.
         """
-        if tuple(names) != self.names:
-            odd = sorted(set(names) ^ set(self.names))
-            shown = ", ".join(odd[:5]) or "another order"
-            raise NameMismatchError(f"prior: learned for other shapes than the rig has ({shown}); expected the same")
+        require_same_names(self.names, names)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -246,6 +243,30 @@ class ReciprocalPrior(ShapePrior):
         made = ShapePrior.from_config(config)
         densities: list[Any] = list(made.densities)
         return cls(made.names, made.groups, densities, made.strength, float(config.get("guard", 1e-2)))
+
+
+def require_same_names(learned: Sequence[str], names: Sequence[str]) -> None:
+    """Checks that a rig's shapes are those that a prior was learned for.
+
+    Raises:
+        NameMismatchError: they are others, or in another order.
+    """
+    if tuple(names) == tuple(learned):
+        return
+    lacking = [name for name in learned if name not in set(names)]
+    beyond = [name for name in names if name not in set(learned)]
+    found = []
+    if lacking:
+        found.append(f"{len(lacking)} that the rig lacks ({', '.join(lacking[:3])})")
+    if beyond:
+        found.append(f"none of {len(beyond)} that it has ({', '.join(beyond[:3])})")
+    if not found:
+        row = next(i for i, pair in enumerate(zip(learned, names, strict=False)) if pair[0] != pair[1])
+        found.append(f"{learned[row]} in place {row} where the rig has {names[row]}")
+    raise NameMismatchError(
+        f"prior: learned for other shapes than the rig has: {' and '.join(found)}; expected the same in the same order "
+        "(train.priors --names makes a prior for a rig's names)"
+    )
 
 
 def _chosen_mixture(takes: list[Tensor], seed: int) -> GaussianMixture:

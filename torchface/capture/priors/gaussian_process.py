@@ -1,0 +1,177 @@
+"""Gaussian processes with inducing points, ready to predict with plain tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import ShapeError
+
+# Directions of the inducing points that the kernel tells apart by less than this are left out: float32 cannot.
+_SMALLEST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    r"""The kernel of one process, with the noise of what it learns from.
+
+    .. math:: k(x, x') = \theta_0 \exp\Big(-\tfrac12 \sum_d \frac{(x_d - x'_d)^2}{\ell_d^2}\Big)
+
+    Args:
+        signal: :math:`\theta_0`.
+        inverse_lengths: :math:`1/\ell_d`, (F,); 0 for inputs that it does not look at.
+        noise: :math:`\beta^{-1}`, the variance of targets around the function.
+
+    Source: thesis 4.2.10, equations 58 and 59, with a length for each input.
+    """
+
+    signal: float
+    inverse_lengths: Tensor
+    noise: float
+
+    def between(self, first: Tensor, second: Tensor) -> Tensor:
+        """k of inputs (A,F) and (B,F), (A,B)."""
+        scaled = [inputs * self.inverse_lengths.to(inputs) for inputs in (first, second)]
+        return self.signal * torch.exp(-0.5 * _squared_distances(*scaled))
+
+
+class GaussianProcesses(nn.Module):
+    r"""G independent processes over the same inputs, each for some of N targets.
+
+    With :math:`\Phi = k(X,Z) K_{ZZ}^{-1/2}` the inducing points Z stand for all inputs X, and a process predicts
+
+    .. math:: m(x) = k(x,Z) K_{ZZ}^{-1/2} (\Phi^\top\Phi + \beta^{-1} I)^{-1} \Phi^\top t, \qquad
+        \sigma^2(x) = \theta_0 - k(x,Z) \big(K_{ZZ}^{-1} - K_{ZZ}^{-1/2}(\beta\,\Phi^\top\Phi + I)^{-1} K_{ZZ}^{-1/2}
+        \big) k(Z,x)
+
+    which is equations 62 and 63 where Z = X. The variance is that of the function, without the noise of targets.
+
+    Args:
+        inverse_lengths: (G,F).
+        inducing: Z times the inverse lengths, (G,M,F).
+        signal: (G,).
+        whitening: :math:`K_{ZZ}^{-1/2}`, (G,M,M).
+        spread: R with :math:`R R^\top = K_{ZZ}^{-1/2}(\beta\,\Phi^\top\Phi + I)^{-1} K_{ZZ}^{-1/2}`, (G,M,M).
+        weights: what R's columns add to the mean, (G,M,N).
+
+    Source: thesis 4.2.10, equations 60 to 63; Titsias 2009 for the inducing points.
+    """
+
+    inverse_lengths: Tensor
+    inducing: Tensor
+    signal: Tensor
+    whitening: Tensor
+    spread: Tensor
+    weights: Tensor
+
+    def __init__(
+        self,
+        inverse_lengths: Tensor,
+        inducing: Tensor,
+        signal: Tensor,
+        whitening: Tensor,
+        spread: Tensor,
+        weights: Tensor,
+    ) -> None:
+        super().__init__()
+        groups, points, inputs = inducing.shape
+        expected = {
+            "inverse_lengths": (inverse_lengths, (groups, inputs)),
+            "inducing": (inducing, (groups, points, inputs)),
+            "signal": (signal, (groups,)),
+            "whitening": (whitening, (groups, points, points)),
+            "spread": (spread, (groups, points, points)),
+            "weights": (weights, (groups, points, weights.shape[-1])),
+        }
+        for name, (value, shape) in expected.items():
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"Gaussian processes: found {name} {tuple(value.shape)}, expected {shape}")
+            self.register_buffer(name, value.detach())
+
+    @classmethod
+    def stacked(cls, learned: list[Posterior], kernels: list[Kernel]) -> GaussianProcesses:
+        """Processes that were learned one by one."""
+        return cls(
+            torch.stack([kernel.inverse_lengths for kernel in kernels]),
+            torch.stack([one.inducing for one in learned]),
+            torch.tensor([kernel.signal for kernel in kernels], dtype=learned[0].inducing.dtype),
+            torch.stack([one.whitening for one in learned]),
+            torch.stack([one.spread for one in learned]),
+            torch.stack([one.weights for one in learned]),
+        )
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean of all targets, and the variance of each process' function.
+
+        Args:
+            inputs: (B,F).
+
+        Returns:
+            (B,N), summed over the processes, and (B,G) in units of the signal.
+        """
+        scaled = inputs * self.inverse_lengths[:, None]
+        near = self.signal[:, None, None] * torch.exp(-0.5 * _squared_distances(scaled, self.inducing))
+        told = near @ self.spread
+        known = (near @ self.whitening).square().sum(-1)
+        variance = (self.signal[:, None] - known).clamp(min=0.0) + told.square().sum(-1)
+        return (told @ self.weights).sum(0), variance.T
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What one process has learned; fields as of :class:`GaussianProcesses`, for one."""
+
+    inducing: Tensor
+    whitening: Tensor
+    spread: Tensor
+    weights: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Frames in terms of the inducing points: sums over frames, so that takes can be added and left out.
+
+    Args:
+        square: :math:`\\Phi^\\top\\Phi`, (M,M).
+        product: :math:`\\Phi^\\top t`, (M,N).
+    """
+
+    square: Tensor
+    product: Tensor
+
+    def __add__(self, other: Evidence) -> Evidence:
+        return Evidence(self.square + other.square, self.product + other.product)
+
+
+def whitening_of(kernel: Kernel, inducing: Tensor) -> Tensor:
+    """:math:`K_{ZZ}^{-1/2}` (M,M), in float64, without the directions in which K is all but singular."""
+    values, vectors = torch.linalg.eigh(kernel.between(inducing, inducing))
+    kept = values > _SMALLEST * values[-1]
+    root = torch.where(kept, values.clamp(min=1e-300).rsqrt(), torch.zeros_like(values))
+    return (vectors * root) @ vectors.T
+
+
+def posterior(kernel: Kernel, inducing: Tensor, whitening: Tensor, evidence: Evidence, redundancy: float) -> Posterior:
+    """What a process knows after evidence.
+
+    Args:
+        kernel: of the process.
+        inducing: Z, (M,F).
+        whitening: of :func:`whitening_of`, (M,M).
+        evidence: of all frames.
+        redundancy: how many frames tell as much as one that is independent of the others would.
+    """
+    noise = kernel.noise * redundancy
+    eye = torch.eye(len(inducing), dtype=inducing.dtype)
+    factor = torch.linalg.cholesky(evidence.square / noise + eye)
+    root = torch.linalg.solve_triangular(factor, eye, upper=False).T
+    weights = root.T @ evidence.product / noise
+    return Posterior(inducing * kernel.inverse_lengths, whitening, whitening @ root, weights)
+
+
+def _squared_distances(first: Tensor, second: Tensor) -> Tensor:
+    """(...,A,F) and (...,B,F) to (...,A,B), by one product."""
+    lengths = first.square().sum(-1, keepdim=True) + second.square().sum(-1)[..., None, :]
+    return (lengths - 2 * first @ second.transpose(-1, -2)).clamp(min=0.0)

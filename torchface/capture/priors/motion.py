@@ -1,0 +1,95 @@
+"""How a window of weights moves: where it is, how fast it goes, how that changes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+
+_REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
+_MOST_ORDERS = 3
+
+
+def face_regions(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """The shapes that move together: gaze, lids, brows, cheeks with nose, and all others (jaw, lips, tongue).
+
+    Returns:
+        Rows of ``names``, a tuple a region; every shape in one of them; regions without shapes are left out.
+
+    Example:
+        >>> face_regions(["jawOpen", "eyeBlink_L", "eyeLookIn_L", "browInnerUp", "mouthPucker"])
+        ((2,), (1,), (3,), (0, 4))
+    """
+    home = [next(i for i, kind in enumerate(_REGIONS) if re.match(kind, name, re.IGNORECASE)) for name in names]
+    regions = (tuple(row for row, region in enumerate(home) if region == i) for i in range(len(_REGIONS)))
+    return tuple(region for region in regions if region)
+
+
+def motion_basis(window: int) -> Tensor:
+    """Discrete orthonormal polynomials over a window's frames: place, slope and curvature, (J,O), float64.
+
+    White noise of the frames is white, and of the same size, in all of them.
+
+    Args:
+        window: J; O is J or 3, what is less.
+    """
+    # On the CPU also where a model is being rebuilt without memory: it is computed, not loaded.
+    steps = torch.linspace(-1, 1, window, dtype=torch.float64, device="cpu")
+    powers = torch.stack([steps**order for order in range(min(window, _MOST_ORDERS))], dim=1)
+    basis, triangle = torch.linalg.qr(powers)
+    return basis * triangle.diagonal().sign()
+
+
+def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """Every window of a take, and the frame that follows it.
+
+    Args:
+        weights: (T,N); windows that meet a NaN are left out.
+        window: J.
+
+    Returns:
+        (B,J,N) and (B,N).
+
+    Raises:
+        ShapeError: the take is too short for a single window with a frame after it.
+        ValueRangeError: no window is free of NaN.
+    """
+    if weights.ndim != 2 or len(weights) <= window:
+        raise ShapeError(
+            f"take: found {tuple(weights.shape)}, expected (T,N) with at least {window + 1} frames for a window of "
+            f"{window} and the frame after it"
+        )
+    frames = weights.unfold(0, window + 1, 1).transpose(1, 2)
+    frames = frames[torch.isfinite(frames).flatten(1).all(1)]
+    if not len(frames):
+        raise ValueRangeError(f"take: found NaN in every window of {window + 1} frames, expected some without")
+    return frames[:, :window], frames[:, window]
+
+
+def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
+    """A take at another frame rate, by straight lines between frames; a NaN spreads to the frames beside it.
+
+    Args:
+        weights: (T,N).
+        from_fps: frames a second that it has.
+        to_fps: frames a second that it should have.
+
+    Returns:
+        (T',N), over the same time.
+
+    Raises:
+        ValueRangeError: a rate is not positive.
+    """
+    if not (0 < from_fps < float("inf") and 0 < to_fps < float("inf")):
+        raise ValueRangeError(f"frame rate: found {from_fps} and {to_fps} a second, expected positive numbers")
+    if from_fps == to_fps or len(weights) < 2:
+        return weights
+    count = int((len(weights) - 1) * to_fps / from_fps + 1e-9) + 1
+    place = torch.arange(count, dtype=torch.float64, device=weights.device) * (from_fps / to_fps)
+    before = place.floor().long().clamp(max=len(weights) - 2)
+    share = (place - before).to(weights)[:, None]
+    return torch.lerp(weights[before], weights[before + 1], share)
