@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.demo import demo
 from torchface.cli.evaluate import evaluate
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "info": info,
     "view": view,
     "pick": pick,
+    "annotate": annotate,
 }
 DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship them as ONNX and glTF."
 

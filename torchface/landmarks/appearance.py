@@ -39,6 +39,7 @@ class AppearanceSettings:
         shape_weight: how many neighbouring places count as one: weighs the shape's prior against the texture.
         jaw_margin: how far beyond the jaw line textures reach, in parts of its distance from the nose.
         parts: upper and lower face each have texture modes of their own.
+        mirror: learn from every image's mirror image too.
     """
 
     features: Features = "oriented_gradients"
@@ -48,9 +49,10 @@ class AppearanceSettings:
     reach: float = 0.8
     flexibility: float = 0.02
     variance_kept: float = 0.99
-    shape_weight: float = 20.0
+    shape_weight: float = 80.0
     jaw_margin: float = 0.05
     parts: bool = True
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         if self.features not in get_args(Features):

@@ -11,6 +11,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.appearance import COUNT, AppearanceModel, AppearanceSettings, grey_images
 from torchface.landmarks.appearance_level import AppearanceLevel, sample_pixels
 from torchface.landmarks.face_warp import FaceGrid, face_grid, face_triangles, with_forehead
+from torchface.landmarks.ibug import MIRROR_68
 from torchface.landmarks.shape_modes import learn_shape_modes, similarity_modes
 
 _FEWEST = 3
@@ -28,11 +29,14 @@ def learn_appearance(
     grey = [_checked(image, number) for number, image in enumerate(images)]
     _check_landmarks(grey, landmarks)
     landmarks = landmarks.float()
+    if settings.mirror:
+        landmarks = torch.cat([landmarks, mirrored(landmarks, [image.shape[-1] for image in grey])])
+        grey = [*grey, *(image.flip(-1) for image in grey)]
     shapes = learn_shape_modes(landmarks, settings.reach, settings.flexibility, settings.variance_kept)
     triangles = face_triangles(shapes.mean)
     points = with_forehead(shapes.mean[None], settings.jaw_margin)[0]
     grids = [face_grid(points * (one / settings.spacing), triangles) for one in settings.resolutions]
-    modes = len(images) - 1
+    modes = len(grey) - 1
     parts = 2 if settings.parts else 1
     model = AppearanceModel(
         len(shapes.modes), [len(grid.pixels) for grid in grids], [parts * modes] * len(grids), len(triangles), settings
@@ -52,6 +56,13 @@ def learn_appearance(
     for level, found in zip(model.levels, textures, strict=True):
         _learn_textures(model, level, torch.stack(found))
     return model.eval()
+
+
+def mirrored(landmarks: Tensor, widths: Sequence[int]) -> Tensor:
+    """Landmarks (M,68,2) of the mirror images of pictures with these widths, pixels."""
+    flipped = landmarks[:, list(MIRROR_68)].clone()
+    flipped[..., 0] = flipped.new_tensor(widths)[:, None] - 1 - flipped[..., 0]
+    return flipped
 
 
 def _lay_out(model: AppearanceModel, level: AppearanceLevel, resolution: float, grid: FaceGrid) -> None:

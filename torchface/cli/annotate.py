@@ -1,0 +1,84 @@
+"""``torchface annotate``: landmarks of a few frames of an actor, corrected by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from torchface.cli.progress import console, steps
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchface.io.video import VideoFile
+
+
+def annotate(
+    video: Positional[Path],
+    out: Path,
+    landmarks: str = "face_landmarks",
+    count: int = 15,
+    face: int = 0,
+    browser: bool = True,
+    port: int = 8080,
+    quiet: bool = False,
+) -> None:
+    """Correct the landmarks of a few frames of a video by hand, in the browser, for an appearance model to learn from.
+
+    The video is tracked, and frames are proposed that span what the face does in it. On the page every landmark can be
+    dragged; Save writes the frame as a picture and iBUG's .pts beside it into OUT and turns to the next. Started again,
+    it goes on where it was. Then: python -m train.appearance --data OUT --out models/NAME. The page is at 127.0.0.1 and
+    no other machine can open it; it needs the extra: pip install torchface[viewer].
+
+    Args:
+        video: A video of the actor, extreme faces among what it shows.
+        out: The folder for pictures and .pts files.
+        landmarks: The model that finds landmarks to start from, of the zoo by name or its folder.
+        count: How many frames.
+        face: Which face, from 0, the largest first, where there are several.
+        browser: Open the page; --no-browser writes the proposed landmarks at once, to be corrected elsewhere.
+        port: The first port to try.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.annotate import prepare_annotation, write_proposals
+
+    if browser:
+        from torchface.viz.browser.page import import_viser
+
+        import_viser()
+    with steps(quiet) as step:
+
+        def track(film: VideoFile) -> tuple[Tensor, Tensor | None]:
+            from torchface import zoo
+            from torchface.errors import NameMismatchError
+            from torchface.landmarks import LandmarkTrees
+            from torchface.landmarks.tracking import LandmarkTracker, track_landmarks
+
+            model = zoo.get_model(landmarks)
+            if not isinstance(model, LandmarkTrees):
+                raise NameMismatchError(
+                    f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
+                )
+            step(f"tracking {film.path.name}")
+            found = track_landmarks(film, LandmarkTracker(model, face=face))
+            return found.values, found.confidence
+
+        step("reading")
+        annotation = prepare_annotation(video, out, track, count)
+    if not browser:
+        for path in write_proposals(annotation):
+            print(path)
+        return
+    from torchface.viz.browser.annotating import AnnotationSession
+    from torchface.viz.browser.landmark_editor import LandmarkEditor
+
+    session = AnnotationSession(annotation.frames, annotation.folder, annotation.saved)
+    editor = LandmarkEditor(session, video.stem, port)
+    console.print(f"{len(annotation.saved)} of {len(annotation.frames)} frames are saved. Open this page; Ctrl+C ends.")
+    print(editor.url, flush=True)
+    try:
+        editor.wait()
+    except KeyboardInterrupt:
+        editor.stop()

@@ -1,0 +1,294 @@
+"""The annotation page: a frame with its 68 landmarks, which are dragged to where they belong."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import TorchfaceError
+from torchface.viz.browser.annotating import AnnotationSession
+from torchface.viz.browser.landmark_sets import IBUG_68
+from torchface.viz.browser.listing import caption, pick_list
+from torchface.viz.browser.page import HOST, icon, start_server, stop_server
+
+if TYPE_CHECKING:
+    import viser
+
+_VIEW = math.radians(30.0)
+_FACE = 1.0  # units of the page that a face's size is shown at
+_DOT = 0.024
+_LIFT = 0.01  # dots lie this much before the picture, lines half of it
+_PARTS = (
+    (slice(0, 17), (80, 200, 255)),
+    (slice(17, 27), (255, 170, 60)),
+    (slice(27, 36), (120, 230, 120)),
+    (slice(36, 48), (255, 105, 180)),
+    (slice(48, 60), (255, 80, 80)),
+    (slice(60, 68), (255, 190, 190)),
+)
+_CHOSEN = (255, 255, 0)
+_LINES = (
+    (range(0, 17), False),
+    (range(17, 22), False),
+    (range(22, 27), False),
+    (range(27, 31), False),
+    (range(31, 36), False),
+    (range(36, 42), True),
+    (range(42, 48), True),
+    (range(48, 60), True),
+    (range(60, 68), True),
+)
+
+
+class LandmarkEditor:
+    """Frames in the browser, their landmarks to be dragged.
+
+    A dot is dragged, or chosen by a click; a click on the picture brings the chosen one there. *Save* writes the
+    frame's files and turns to the next.
+
+    Args:
+        session: the frames.
+        label: heads the panel.
+        port: the first to try, 0 for any.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+    """
+
+    def __init__(self, session: AnnotationSession, label: str = "torchface annotate", port: int = 8080) -> None:
+        self.session = session
+        self.chosen: int | None = None
+        self._offset = torch.zeros(2, dtype=torch.float64)
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self._showing = False
+        self.server = start_server(label, port)
+        self.server.scene.remove_by_name("/light")  # it models form; dots have a colour each
+        self.server.scene.add_light_ambient("/light/even", intensity=2.0)
+        self._dots: Any = None
+        self._lines: Any = None
+        self._add_panel()
+        self._show_frame()
+        self.server.scene.on_click()(self._clicked)
+        self.server.on_client_connect(self._straighten)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Closes the page."""
+        self._stopped.set()
+        stop_server(self.server)
+
+    def wait(self) -> None:
+        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
+        self._stopped.wait()
+
+    def to_page(self, pixels: Tensor) -> Tensor:
+        """Where pixels (...,2) of the picture lie in the page's scene, (...,2) along x and y."""
+        return (pixels.double() - self._middle) * torch.tensor([self._unit, -self._unit], dtype=torch.float64)
+
+    def to_pixels(self, origin: Tensor, way: Tensor) -> Tensor:
+        """Where a ray of the scene, origin (3,) and direction (3,), meets the picture, (2,) pixels."""
+        reached = origin - way * (origin[2] / way[2])
+        return reached[:2] / torch.tensor([self._unit, -self._unit], dtype=torch.float64) + self._middle
+
+    def save(self) -> str:
+        """Writes the frame, turns to the next that is not saved, and says so."""
+        with self._lock:
+            path = self.session.save()
+            more = self.session.advance()
+            self.chosen = None
+            self._show_frame()
+            return f"{path}" if more else f"{path}; all frames are saved now"
+
+    @property
+    def _unit(self) -> float:
+        return _FACE / self.session.extent
+
+    @property
+    def _middle(self) -> Tensor:
+        height, width = self.session.frame.image.shape[-2:]
+        return torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+
+    def _add_panel(self) -> None:
+        gui, session = self.server.gui, self.session
+        with gui.add_folder("Frame"):
+            self._status = gui.add_html("")
+            self._frame: Any = gui.add_dropdown("Frame", [frame.name for frame in session.frames])
+            save = gui.add_button("Save and next", icon=icon("DEVICE_FLOPPY"), hint=f"Writes to {session.folder}")
+            undo = gui.add_button("Undo", icon=icon("ARROW_BACK_UP"))
+            reset = gui.add_button("As proposed", icon=icon("REFRESH"))
+            straight = gui.add_button("Straight view", icon=icon("FOCUS_CENTERED"))
+        with gui.add_folder("Landmark"):
+            self._name = gui.add_html("")
+            self._reach = gui.add_slider(
+                "Others follow", 0.0, 1.0, 0.02, 0.0, hint="How far around a dragged landmark the others go along"
+            )
+        self._frame.on_update(lambda _: self._frame_chosen())
+        save.on_click(self._save_clicked)
+        undo.on_click(lambda _: self._change(self.session.undo))
+        reset.on_click(lambda _: self._change(self.session.reset))
+        straight.on_click(lambda event: self._straighten(event.client))
+
+    def _change(self, act: Any) -> None:
+        with self._lock:
+            act()
+            self._refresh()
+
+    def _frame_chosen(self) -> None:
+        if not self._showing:
+            names = [frame.name for frame in self.session.frames]
+            with self._lock:
+                self.session.show(names.index(self._frame.value))
+                self.chosen = None
+                self._show_frame()
+
+    def _show_frame(self) -> None:
+        session = self.session
+        image = (session.frame.image.permute(1, 2, 0).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        height, width = image.shape[:2]
+        scene = self.server.scene
+        with self.server.atomic():
+            # Turned about x: an image's rows run along y, which the page shows upward.
+            scene.add_image(
+                "/picture", image, width * self._unit, height * self._unit,
+                wxyz=(0.0, 1.0, 0.0, 0.0), cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+            for handle in (self._dots, self._lines):
+                if handle is not None:
+                    handle.remove()
+            vertices, faces = _disc(_DOT)
+            places = self._places()
+            self._dots = scene.add_batched_meshes_simple(
+                "/landmarks", vertices, faces, np.tile([1.0, 0, 0, 0], (len(places), 1)).astype(np.float32), places,
+                batched_colors=self._colors(), side="double", lod="off", cast_shadow=False, receive_shadow=False,
+                opacity=0.9,
+            )  # fmt: skip
+            self._lines = scene.add_line_segments(
+                "/outline", self._segments(), (255, 255, 255), thickness=1.2, thickness_units="screen"
+            )
+            self._dots.on_drag("left")(self._dragged)
+            self._dots.on_click(self._dot_clicked)
+            self._showing = True
+            self._frame.value = session.frame.name
+            self._showing = False
+            self._refresh()
+            for client in self.server.get_clients().values():
+                self._straighten(client)
+
+    def _refresh(self) -> None:
+        session = self.session
+        with self.server.atomic():
+            self._dots.batched_positions = self._places()
+            self._dots.batched_colors = self._colors()
+            self._lines.points = self._segments()
+            done = "saved" if session.frame.name in session.saved else "not saved"
+            counts = [("saved", f"{len(session.saved)} of {len(session.frames)}"), (session.frame.name, done)]
+            self._status.content = pick_list(counts, [])
+            name = "Drag a dot, or click one to choose it." if self.chosen is None else IBUG_68.names[self.chosen]
+            self._name.content = caption(name)
+
+    def _places(self) -> np.ndarray:
+        flat = self.to_page(self.session.landmarks)
+        return torch.cat([flat, torch.full((len(flat), 1), _LIFT)], dim=1).numpy().astype(np.float32)
+
+    def _segments(self) -> np.ndarray:
+        flat = self._places() - np.array([0, 0, _LIFT / 2], dtype=np.float32)
+        pairs = [
+            (row, line[i + 1] if i + 1 < len(line) else line[0])
+            for line, closed in _LINES
+            for i, row in enumerate(line)
+            if closed or i + 1 < len(line)
+        ]
+        return flat[np.array(pairs)]
+
+    def _colors(self) -> np.ndarray:
+        colors = np.zeros((68, 3), dtype=np.uint8)
+        for rows, color in _PARTS:
+            colors[rows] = color
+        if self.chosen is not None:
+            colors[self.chosen] = _CHOSEN
+        return colors
+
+    async def _dragged(self, event: viser.SceneNodeDragEvent) -> None:  # async: start, updates and end stay in order
+        if event.instance_index is None:
+            return
+        eye = torch.tensor(event.client.camera.position, dtype=torch.float64)
+        with self._lock:
+            if event.phase == "start":
+                self.chosen = event.instance_index
+                self.session.grab(self.chosen)
+                grabbed = self._under(eye, event.start_position)
+                self._offset = self.session.landmarks[self.chosen] - grabbed
+            try:
+                self.session.drag(
+                    self._under(eye, event.end_position) + self._offset, self._reach.value * self.session.extent
+                )
+            except TorchfaceError:  # an undo in between has let it go, or the pointer left the picture's plane
+                return
+            if event.phase == "end":
+                self.session.let_go()
+            self._refresh()
+
+    def _under(self, eye: Tensor, point: tuple[float, float, float]) -> Tensor:
+        return self.to_pixels(eye, torch.tensor(point, dtype=torch.float64) - eye)
+
+    def _dot_clicked(self, event: Any) -> None:
+        with self._lock:
+            self.chosen = event.instance_index
+            self._refresh()
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Brings the chosen landmark to a click on the picture; a click on a dot has just chosen it."""
+        origin = torch.tensor(event.ray_origin, dtype=torch.float64)
+        way = torch.tensor(event.ray_direction, dtype=torch.float64)
+        with self._lock:
+            place = self.to_pixels(origin, way)
+            near = (self.session.landmarks - place).norm(dim=1)
+            if self.chosen is None or float(near.min()) * self._unit < _DOT:
+                return
+            self.session.grab(self.chosen)
+            try:
+                self.session.drag(place, self._reach.value * self.session.extent)
+            except TorchfaceError:
+                self.session.undo()
+            self.session.let_go()
+            self._refresh()
+
+    def _save_clicked(self, event: viser.GuiEvent) -> None:
+        assert event.client is not None
+        try:
+            event.client.add_notification("Saved", self.save(), auto_close_seconds=6.0, color="teal")
+        except (TorchfaceError, OSError) as error:
+            event.client.add_notification("Not saved", str(error), color="red")
+
+    def _straighten(self, client: viser.ClientHandle | None) -> None:
+        """Puts a visitor's camera straight before the face."""
+        if client is None:
+            return
+        centre = self.to_page(self.session.landmarks).mean(0)
+        x, y = centre.tolist()
+        distance = 2.1 * _FACE / math.tan(_VIEW / 2)
+        with client.atomic():
+            client.camera.up_direction = (0.0, 1.0, 0.0)
+            client.camera.fov = _VIEW
+            client.camera.position = (x, y, distance)
+            client.camera.look_at = (x, y, 0.0)
+
+
+def _disc(radius: float, corners: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """A round plate in the plane of x and y: vertices and triangles."""
+    turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    rim = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(corners)], axis=1)
+    vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
+    following = np.roll(np.arange(corners), -1)
+    faces = np.stack([np.zeros(corners, dtype=int), 1 + np.arange(corners), 1 + following], axis=1)
+    return vertices, faces.astype(np.uint32)
