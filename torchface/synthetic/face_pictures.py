@@ -19,12 +19,15 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic.annotations import head_annotations
 from torchface.synthetic.backdrops import backdrop, photographed, uniform
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
-from torchface.synthetic.identity import draw_identities, mean_vertices, ramp
+from torchface.synthetic.identity import IDENTITY, draw_identities, mean_vertices, ramp
 from torchface.synthetic.performance import GESTURES
 from torchface.synthetic.performer import performer
-from torchface.synthetic.portrait_geometry import Hairdo, hair_share, portrait, visible_contour
+from torchface.synthetic.portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait
 
 _LUMA = torch.tensor([0.35, 0.5, 0.15])
+# What people in photographs have more or less of than the mean head, standard deviations: width, most of all.
+_LEANING = {"face_width": 1.2, "jaw_width": 1.3, "cheek_fullness": 1.0, "head_width": 0.8, "pupil_distance": -0.4,
+            "face_height": 0.4, "chin_height": 0.4, "mouth_width": 0.6, "brow_height": 0.5}  # fmt: skip
 _REFERENCE = 220  # pixels a side that rays are cast for; the picture is then made smaller or a little larger
 
 
@@ -39,13 +42,13 @@ class PictureSettings:
         spread: of identities, 1 as varied as people are.
     """
 
-    yaw: float = 18.0
+    yaw: float = 20.0
     pitch: float = 9.0
     roll: float = 9.0
     smallest: int = 90
     largest: int = 240
     each: int = 3
-    spread: float = 1.2
+    spread: float = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class FacePicture:
 
     Args:
         image: grey, uint8 (H,W).
-        landmarks: iBUG's 68, (68,2) pixels; the jaw's are those of the visible outline.
+        landmarks: iBUG's 68, (68,2) pixels, as an annotator sees them: see ``annotated_landmarks``.
         box: x, y, width, height round the face as a detector draws it, (4,) pixels.
         person: its number.
     """
@@ -107,7 +110,8 @@ def face_pictures(
 
 
 def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Person:
-    rig = performer(draw_identities(1, generator, settings.spread)[0])
+    leaning = torch.tensor([_LEANING.get(parameter.name, 0.0) for parameter in IDENTITY])
+    rig = performer(draw_identities(1, generator, settings.spread)[0] + leaning)
     mesh = rig.neutral
     assert mesh.texture is not None
     texture = torch.einsum("chw,c->hw", mesh.texture, _LUMA)[None]
@@ -233,7 +237,7 @@ def _picture(person: _Person, settings: PictureSettings, generator: torch.Genera
     height = int(uniform(settings.smallest, settings.largest + 1, generator))
     stored = photographed(picture.clamp(0, 1) ** curve, height, generator)
     zoom = height / _REFERENCE
-    landmarks = (visible_contour(pixels).float() + 0.5) * zoom - 0.5
+    landmarks = (annotated_landmarks(pixels).float() + 0.5) * zoom - 0.5
     return FacePicture(stored, landmarks, box_around(landmarks), 0)
 
 

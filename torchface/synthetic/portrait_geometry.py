@@ -16,6 +16,8 @@ from torchface.synthetic.identity import mean_vertices, ramp
 from torchface.synthetic.topology import topology
 
 _TEETH_DEEP = 5.0  # behind the lips, millimetres
+# The upper edge of the left brow from its inner end, where annotators put the landmarks; the head's own lie in its middle.
+_BROW_EDGE = ((10.0, 20.5, 92.0), (20.0, 24.0, 90.0), (31.0, 26.0, 87.0), (42.0, 24.5, 79.0), (51.5, 18.0, 67.0))
 
 
 @dataclass(frozen=True)
@@ -178,14 +180,28 @@ def _contour_lines() -> tuple[Tensor, ...]:
     return tuple(lines)
 
 
-def visible_contour(pixels: Tensor) -> Tensor:
-    """The 68 landmarks (68,2) as an annotator sees them: where cheeks hide the jaw's line, the cheeks' outline.
+@lru_cache(maxsize=1)
+def _brow_edge() -> tuple[Tensor, Tensor]:
+    """Vertices (10,3) and weights (10,3) that give the brows' upper edges, in the order of landmarks 17 to 26."""
+    left = torch.tensor(_BROW_EDGE).double()
+    spots = torch.cat([left.flip(0) * left.new_tensor([-1.0, 1.0, 1.0]), left])
+    distance, rows = torch.cdist(spots, mean_vertices()).topk(3, dim=1, largest=False)
+    weights = 1 / distance.clamp(min=0.1)
+    return rows, weights / weights.sum(1, keepdim=True)
+
+
+def annotated_landmarks(pixels: Tensor) -> Tensor:
+    """The 68 landmarks (68,2) as an annotator sees them.
+
+    Brows are marked along their upper edge, and where cheeks hide the jaw's line, the cheeks' outline is.
 
     Args:
         pixels: where a camera sees the head's vertices, (V,2).
     """
     marks = head_annotations().landmarks
     seen = pixels[marks].clone()
+    rows, weights = _brow_edge()
+    seen[17:27] = (pixels[rows] * weights[..., None].to(pixels)).sum(1)
     middle = seen[27:36].mean(0)
     for row, line in enumerate(_contour_lines()):  # lines differ in length
         way = torch.nn.functional.normalize(seen[row] - middle, dim=0)
