@@ -18,6 +18,7 @@ _WIDTH = 2.5  # medians of the residuals; some 3.7 deviations of normal noise in
 _STARTS, _KEPT, _APART = 128, 3, 30.0  # directions tried, refined, and degrees between those
 _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 1.6  # radii of what was seen; a lamp cannot stand in the face
+_SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
 _ROUNDS, _STEPS, _DONE = 5, 30, 1e-5
 
 
@@ -39,8 +40,9 @@ class LampFit:
 
     Args:
         lamp: where it stands.
-        strengths: ambient and of the lamp, linear, (2,3).
-        falling: cosine of the light at each vertex, 0 in shadow, (Q,).
+        strengths: ambient, of the lamp, and of its gloss, linear, (3,3).
+        lit: 1 where the lamp reaches, else 0, (Q,).
+        columns: what the strengths are factors of, (3,Q,3).
         residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
         trust: robust weight of each vertex, in (0,1], (Q,).
         cost: the objective.
@@ -48,7 +50,8 @@ class LampFit:
 
     lamp: Lamp
     strengths: Tensor
-    falling: Tensor
+    lit: Tensor
+    columns: Tensor
     residuals: Tensor
     trust: Tensor
     cost: float
@@ -122,58 +125,70 @@ def _tangents(direction: Tensor) -> Tensor:
 
 def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None) -> LampFit:
     """The best strengths for a lamp, by reweighted least squares; without a width the residuals themselves give it."""
-    position = lamp.position(seen.centre)
-    toward = torch.nn.functional.normalize(position - seen.points, dim=-1)
-    falling = (seen.normals * toward).sum(-1).clamp(min=0) * seen.lit_by(position)
+    lit = seen.lit_by(lamp.position(seen.centre)).double()
+    falling, gloss = (part * lit for part in _reflected(seen, lamp.direction, torch.tensor(lamp.nearness)))
+    columns = torch.stack([seen.albedo, seen.albedo * falling[:, None], gloss[:, None].expand(-1, 3)])
     wanted, slope, trust = seen.colors, _slope(seen.colors), torch.ones_like(falling)
     coded = to_srgb(seen.colors)
     for _ in range(_ROUNDS):
         weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
-        strengths = _strengths(seen.albedo, seen.albedo * falling[:, None], wanted, weight)
-        shaded = seen.albedo * (strengths[0] + strengths[1] * falling[:, None])
+        strengths = _strengths(columns, wanted, weight)
+        shaded = (strengths[:, None] * columns).sum(0)
         slope = _slope(shaded)
         residuals = seen.valid * (to_srgb(shaded) - coded)
         wanted = shaded - residuals * slope
         spread = _width(residuals, seen) if width is None else width
         trust = (1 + residuals.square().sum(1) / spread**2).pow(-2)
     cost = math.nan if width is None else _cost(residuals, seen, width)
-    return LampFit(lamp, strengths, falling, residuals, trust, cost)
+    return LampFit(lamp, strengths, lit, columns, residuals, trust, cost)
 
 
-def _strengths(ambient: Tensor, lamp: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
-    """Non-negative a and p, (2,3), with the least weighted square of ``a ambient + p lamp - wanted``, all (Q,3)."""
-    aa, ap, pp = ((weight * x * y).sum(0) for x, y in ((ambient, ambient), (ambient, lamp), (lamp, lamp)))
-    aw, pw = (weight * ambient * wanted).sum(0), (weight * lamp * wanted).sum(0)
-    determinant = (aa * pp - ap * ap).clamp(min=1e-30)
-    both = torch.stack([pp * aw - ap * pw, aa * pw - ap * aw]) / determinant
-    alone = torch.stack([aw / aa.clamp(min=1e-30), pw / pp.clamp(min=1e-30)]).clamp(min=0)
-    # With one of two at its bound the other is at its own optimum; the smaller energy of the two says which.
-    without_lamp = alone[0] * aw > alone[1] * pw
-    bounded = torch.stack([alone[0] * without_lamp, alone[1] * ~without_lamp])
-    inside = (both >= 0).all(0) & (aa * pp - ap * ap > 1e-9 * aa * pp)
-    return torch.where(inside, both, bounded)
+def _reflected(seen: SeenSkin, direction: Tensor, nearness: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine of the falling light and Blinn's highlight at each vertex, as if nothing threw a shadow, (Q,) each."""
+    toward = torch.nn.functional.normalize(direction - nearness * (seen.points - seen.centre), dim=-1)
+    half = torch.nn.functional.normalize(toward - torch.nn.functional.normalize(seen.points, dim=-1), dim=-1)
+    falling = (seen.normals * toward).sum(-1).clamp(min=0)
+    return falling, (seen.normals * half).sum(-1).clamp(min=0) ** _SHININESS * (falling > 0)
+
+
+def _strengths(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
+    """Non-negative factors (K,3) of columns (K,Q,3) with the least weighted square distance to ``wanted`` (Q,3).
+
+    All 2^K sets of factors that are not zero are solved; the best of those without a negative factor is the answer.
+    """
+    H = torch.einsum("iqc,jqc,qc->cij", columns, columns, weight)
+    f = torch.einsum("iqc,qc,qc->ci", columns, wanted, weight)
+    scale = H.diagonal(dim1=1, dim2=2).clamp(min=1e-12).rsqrt()
+    H, f = H * scale[:, :, None] * scale[:, None], f * scale
+    free = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=H.dtype)] * len(columns))
+    eye = torch.eye(len(columns), dtype=H.dtype)
+    inside = free[:, :, None] * free[:, None]
+    found = torch.linalg.solve(inside * (H[:, None] + 1e-9 * eye) + (1 - free)[:, None] * eye, free * f[:, None])
+    gain = (found * f[:, None]).sum(-1).masked_fill((found < 0).any(-1), -1.0)  # (C,2^K)
+    best = found[torch.arange(len(found)), gain.argmax(1)]
+    return (best * scale).T
 
 
 def _normal_equations(seen: SeenSkin, fit: LampFit) -> tuple[Tensor, Tensor]:
     """H (3,3) and g (3,) of the lamp's place, with the strengths' directions projected out (variable projection)."""
-    direction = fit.lamp.direction
-    aside = seen.points - seen.centre
-    way = direction - fit.lamp.nearness * aside
-    length = way.norm(dim=1, keepdim=True)
-    toward = way / length
-    across = (seen.normals - (seen.normals * toward).sum(1, keepdim=True) * toward) / length
-    moved = torch.stack([*(across @ _tangents(direction).T).unbind(1), -(across * aside).sum(1) / _USUAL], dim=1)
-    moved = moved * (fit.falling > 0)[:, None]
-    shaded = seen.albedo * (fit.strengths[0] + fit.strengths[1] * fit.falling[:, None])
+    place = torch.zeros(3, dtype=torch.float64)
+
+    def shaded(moved: Tensor) -> Tensor:
+        direction = fit.lamp.direction + moved[:2] @ _tangents(fit.lamp.direction)
+        falling, gloss = _reflected(seen, direction, fit.lamp.nearness + moved[2] / _USUAL)
+        bare = seen.albedo * (fit.strengths[0] + fit.strengths[1] * (falling * fit.lit)[:, None])
+        return bare + fit.strengths[2] * (gloss * fit.lit)[:, None]
+
+    J = torch.func.jacfwd(shaded)(place)  # (Q,3,3): vertex, channel, place
+    slope = _slope((fit.strengths[:, None] * fit.columns).sum(0))
     root = (seen.valid * (seen.area * fit.trust)[:, None]).sqrt()
-    scaled = root / _slope(shaded) * seen.albedo
     H, g = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for c in range(3):  # channels: each has strengths of its own to project out
-        columns = scaled[:, c, None] * torch.stack([torch.ones_like(fit.falling), fit.falling], dim=1)
-        basis = torch.linalg.qr(columns[:, fit.strengths[:, c] > 0])[0]
-        J = scaled[:, c, None] * fit.strengths[1, c] * moved
-        J = J - basis @ (basis.T @ J)
-        H, g = H + J.T @ J, g + J.T @ (root[:, c] * fit.residuals[:, c])
+        scaled = root[:, c] / slope[:, c]
+        basis = torch.linalg.qr((scaled * fit.columns[fit.strengths[:, c] > 0, :, c]).T)[0]
+        part = scaled[:, None] * J[:, c]
+        part = part - basis @ (basis.T @ part)
+        H, g = H + part.T @ part, g + part.T @ (root[:, c] * fit.residuals[:, c])
     return H, g
 
 
