@@ -70,8 +70,8 @@ def estimate_light(
     over the vertices that the camera sees. s is 0 where the mesh stands between vertex and lamp, a the pixels that a
     vertex covers, g the sRGB coding (light adds up in linear values: colours are decoded first), :math:`\phi` Geman
     and McClure's function of a width taken from the residuals, so that highlights, foreign shadows and hair count
-    little. What the lamp's gloss adds (Blinn's highlight, one strength a channel) is estimated with the rest, or the broad
-    part of it would pass for light, and left out of the answer. Directions all round are tried; from the best,
+    little. What the lamp's gloss adds (Blinn's highlight, one strength a channel) is estimated with the rest, or the
+    broad part of it would pass for light, and left out of the answer. Directions all round are tried; from the best,
     Gauss-Newton moves the lamp while the strengths, linear and not negative, are eliminated (variable projection), and
     shadows are cast anew in each step. Only products of light
     and reflectance can be told: see :class:`PointLight`.
