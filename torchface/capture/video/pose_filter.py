@@ -29,13 +29,16 @@ class PoseFilterSettings:
         noise: deviations of a landmark, pixels.
         turning: deviations of what the angular acceleration changes by in a frame, radians a frame².
         moving: the same of the translation, millimetres a frame².
+        fading: what is left of an acceleration after a frame; 1 is constant acceleration. Heads turn back soon, so
+            that a little less foretells better and does not run away in gaps.
         memory: frames after which a forecast counts 1/e.
         longest_gap: frames without a pose that are bridged by prediction; then the head counts as lost.
     """
 
     noise: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
-    turning: tuple[float, ...] = (1e-5, 6e-5, 4e-4, 2.5e-3)
-    moving: tuple[float, ...] = (1e-3, 6e-3, 0.04, 0.25)
+    turning: tuple[float, ...] = (1e-5, 3.3e-5, 1.1e-4, 3.6e-4, 1.2e-3, 4e-3)
+    moving: tuple[float, ...] = (1e-3, 3.3e-3, 0.011, 0.036, 0.12, 0.4)
+    fading: float = 0.92
     memory: float = 30.0
     longest_gap: int = 10
 
@@ -44,10 +47,10 @@ class PoseFilterSettings:
             values = getattr(self, name)
             if not values or not all(0 < value < float("inf") for value in values):
                 raise ValueRangeError(f"{name}: found {values}, expected positive deviations, one at least")
-        if self.longest_gap < 0 or not self.memory > 0:
+        if self.longest_gap < 0 or not self.memory > 0 or not 0 <= self.fading <= 1:
             raise ValueRangeError(
-                f"pose filter: found longest_gap {self.longest_gap} and memory {self.memory}, expected a gap from 0 "
-                "and positive frames"
+                f"pose filter: found longest_gap {self.longest_gap}, memory {self.memory} and fading {self.fading}, "
+                "expected a gap from 0, positive frames and 0 to 1"
             )
 
 
@@ -69,11 +72,11 @@ class _Belief:
 
 
 class PoseFilter:
-    r"""A causal filter of constant acceleration for rigid motion.
+    r"""A causal filter of (slowly fading) acceleration for rigid motion.
 
     .. math::
         R_t = \exp([\omega + \tfrac12 \alpha]) R_{t-1}, \quad p_t = p_{t-1} + v + \tfrac12 a, \quad
-        (\omega, v)_t = (\omega, v)_{t-1} + (\alpha, a), \quad (\alpha, a)_t = (\alpha, a)_{t-1} + \text{white jerk}
+        (\omega, v)_t = (\omega, v)_{t-1} + (\alpha, a), \quad (\alpha, a)_t = \rho (\alpha, a)_{t-1} + \text{jerk}
 
     What is estimated of a rotation is the small turn away from the predicted one, so that there is no sign to choose,
     as there is of quaternions, and every answer is a rotation.
@@ -81,7 +84,7 @@ class PoseFilter:
     Args:
         settings: motions and noises.
 
-    Source: Kalman 1960; Lefferts, Markley, Shuster 1982; thesis 4.2.5.
+    Source: Kalman 1960; Singer 1970; Magill 1965; Lefferts, Markley, Shuster 1982; thesis 4.2.5.
     """
 
     def __init__(self, settings: PoseFilterSettings) -> None:
@@ -98,8 +101,7 @@ class PoseFilter:
         self._drift = torch.einsum("ab,mi,ij->maibj", shares, jerk, torch.eye(6, dtype=torch.float64)).reshape(
             -1, 18, 18
         )
-        steps = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], dtype=torch.float64)
-        self.transition = torch.kron(steps, torch.eye(6, dtype=torch.float64))
+        self._steps = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, settings.fading]], dtype=torch.float64)
         self.belief: _Belief | None = None
         self.began = False
         """Whether the last frame began anew, whatever was before."""
@@ -115,9 +117,13 @@ class PoseFilter:
         self.belief = _Belief(
             rotation_matrix(step[:, :3]) @ b.rotation,
             b.place + step[:, 3:],
-            torch.stack([velocity + acceleration, acceleration], dim=1),
-            self.transition @ b.covariance @ self.transition.T + self._drift,
+            torch.stack([velocity + acceleration, self.settings.fading * acceleration], dim=1),
+            self.moved(self.moved(b.covariance).transpose(1, 2)) + self._drift,
         )
+
+    def moved(self, covariance: Tensor) -> Tensor:
+        """The transition, which mixes place, velocity and acceleration alike for all six, times covariances."""
+        return (self._steps @ covariance.reshape(-1, 3, 6 * 18)).reshape(-1, 18, 18)
 
     def correct(self, rotation: Tensor, translation: Tensor, covariance: Tensor) -> None:
         """Takes in a frame's pose (3,3), (3,) with its covariance (6,6) at one pixel of noise; NaN where not found."""
@@ -132,7 +138,8 @@ class PoseFilter:
         b = self.belief
         off = torch.cat([rotation_vector(rotation @ b.rotation.transpose(1, 2)), translation - b.place], dim=1)
         spread = torch.linalg.cholesky(_symmetric(b.covariance[:, :6, :6] + noise))
-        squared = torch.linalg.solve_triangular(spread, off[..., None], upper=False)[..., 0].square().sum(1)
+        whitened = torch.linalg.solve_triangular(spread, off[..., None], upper=False)
+        squared = whitened[..., 0].square().sum(1)
         if float(squared.min()) > _GATE:
             self._odd += 1
             if self._odd >= _PATIENCE:
@@ -143,16 +150,14 @@ class PoseFilter:
         self._odd = self._unseen = 0
         certainty = -0.5 * squared - spread.diagonal(dim1=1, dim2=2).log().sum(1)
         self.scores = self.scores * (1 - 1 / max(self.settings.memory, 1.0)) + certainty
-        gain = torch.cholesky_solve(b.covariance[:, :6], spread).transpose(1, 2)
-        change = (gain @ off[..., None])[..., 0]
-        # Joseph's form stays symmetric and positive, whatever is rounded.
-        keep = torch.eye(18, dtype=torch.float64).expand(len(gain), 18, 18).clone()
-        keep[:, :, :6] -= gain
+        # The gain is W L⁻¹ with S = L Lᵀ, and what is learned of the covariance W Wᵀ: symmetric whatever is rounded.
+        learned = torch.linalg.solve_triangular(spread, b.covariance[:, :6], upper=False).transpose(1, 2)
+        change = (learned @ whitened)[..., 0]
         self.belief = _Belief(
             _orthonormal(rotation_matrix(change[:, :3]) @ b.rotation),
             b.place + change[:, 3:6],
             b.rate + change[:, 6:].reshape(-1, 2, 6),
-            _symmetric(keep @ b.covariance @ keep.transpose(1, 2) + gain @ noise @ gain.transpose(1, 2)),
+            b.covariance - learned @ learned.transpose(1, 2),
         )
 
     def pose(self) -> tuple[Tensor, Tensor]:
@@ -229,7 +234,7 @@ def smooth_rigid_motion(
     kept = here[-1]
     smoothed = [kept]
     for t in range(len(rotation) - 2, -1, -1):  # backward, a frame needs the one after
-        kept = here[t] if began[t + 1] else _smoothed(here[t], ahead[t + 1], kept, running.transition)
+        kept = here[t] if began[t + 1] else _smoothed(here[t], ahead[t + 1], kept, running)
         smoothed.append(kept)
     turned, moved = rotation.double().clone(), translation.double().clone()
     for t, belief in enumerate(reversed(smoothed)):
@@ -240,11 +245,13 @@ def smooth_rigid_motion(
     return turned, moved
 
 
-def _smoothed(here: _Belief | None, ahead: _Belief | None, after: _Belief | None, transition: Tensor) -> _Belief | None:
+def _smoothed(
+    here: _Belief | None, ahead: _Belief | None, after: _Belief | None, running: PoseFilter
+) -> _Belief | None:
     """What a frame was, now that the one after is known; ``ahead`` is what was foretold of that one."""
     if here is None or ahead is None or after is None:
         return here
-    gain = torch.linalg.solve(ahead.covariance, transition @ here.covariance).transpose(1, 2)
+    gain = torch.linalg.solve(ahead.covariance, running.moved(here.covariance)).transpose(1, 2)
     off = torch.cat(
         [
             rotation_vector(after.rotation @ ahead.rotation.transpose(1, 2)),
