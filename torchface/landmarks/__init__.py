@@ -11,6 +11,13 @@ from torchface.landmarks.face_box import FaceBoxes, HaarDetector, NoFaceError, Y
 from torchface.landmarks.face_frame import FaceFrame
 from torchface.landmarks.relief import relief
 from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
+from torchface.landmarks.tracking import (
+    LandmarkTracker,
+    TrackedFace,
+    find_landmarks,
+    landmark_jitter,
+    track_landmarks,
+)
 from torchface.landmarks.tree_training import TreeSettings
 from torchface.landmarks.trees import LandmarkTrees
 from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
@@ -29,11 +36,13 @@ __all__ = [
     "FaceFrame",
     "HaarDetector",
     "LandmarkPairs",
+    "LandmarkTracker",
     "LandmarkTrees",
     "NoFaceError",
     "ScanAnnotation",
     "ScanLandmarks",
     "TraceSettings",
+    "TrackedFace",
     "TreeSettings",
     "UVLandmarkDetector",
     "UVLandmarks",
@@ -43,6 +52,8 @@ __all__ = [
     "contour_correspondences",
     "find_face",
     "find_faces",
+    "find_landmarks",
+    "landmark_jitter",
     "line_image",
     "load_annotations",
     "load_detector",
@@ -51,6 +62,7 @@ __all__ = [
     "save_detector",
     "scan_landmarks",
     "trace_contour",
+    "track_landmarks",
     "twelve_from_ibug",
     "unwrap",
 ]
