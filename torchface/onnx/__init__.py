@@ -2,6 +2,7 @@
 
 from torchface.onnx.action_units import ActionUnitReport, export_action_units
 from torchface.onnx.checked import ExportReport
+from torchface.onnx.dynamics_prior import export_dynamics_prior
 from torchface.onnx.hybrid import HybridGraph
 from torchface.onnx.model_export import export_model
 from torchface.onnx.solver import SolverGraph
@@ -14,6 +15,7 @@ __all__ = [
     "SolverGraph",
     "SolverReport",
     "export_action_units",
+    "export_dynamics_prior",
     "export_hybrid_solver",
     "export_model",
     "export_solver",

@@ -8,10 +8,12 @@ from pathlib import Path
 from torch import nn
 
 from torchface.capture import MarkerSolver
+from torchface.capture.priors import DynamicsPrior
 from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkTrees, UVLandmarkDetector
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.checked import ExportReport
+from torchface.onnx.dynamics_prior import export_dynamics_prior
 from torchface.onnx.expression_graph import export_expression_regression
 from torchface.onnx.head_decoder import export_head_decoder
 from torchface.onnx.landmark_bank import export_landmark_bank
@@ -25,7 +27,8 @@ def export_model(
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:
-        model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkTrees`` or ``MarkerSolver``.
+        model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkTrees``,
+            ``DynamicsPrior`` or ``MarkerSolver``.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -40,9 +43,11 @@ def export_model(
         return export_landmark_bank(model, path, facts)
     if isinstance(model, LandmarkTrees):
         return export_landmark_trees(model, path, facts)
+    if isinstance(model, DynamicsPrior):
+        return export_dynamics_prior(model, path, facts)
     if isinstance(model, MarkerSolver):
         return export_marker_solver(model, path, facts=facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkTrees or MarkerSolver"
+        "LandmarkTrees, DynamicsPrior or MarkerSolver"
     )

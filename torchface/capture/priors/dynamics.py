@@ -29,7 +29,8 @@ class DynamicsSettings:
         inducing: M, how many windows stand for all others.
         subset: how many windows the kernels' hyperparameters are learned from.
         rounds: of gradient ascent on the bound of the marginal likelihood.
-        redundancies: from which it is chosen how many frames tell as much as a single independent one.
+        memory: seconds of a take that tell as much as a single independent frame: frames repeat each other, and a
+            process that counts each of them trusts what one take happened to show too much.
         floor: the least standard deviation that is predicted, in weights.
         seed: draws windows and noise.
     """
@@ -37,14 +38,13 @@ class DynamicsSettings:
     inducing: int = 100
     subset: int = 1500
     rounds: int = 50
-    redundancies: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0)
+    memory: float = 0.5
     floor: float = 1e-3
     seed: int = 0
 
     def __post_init__(self) -> None:
         counts = min(self.inducing, self.subset, self.rounds)
-        odd = [value for value in self.redundancies if not 0 < value < math.inf]
-        if counts < 1 or not self.redundancies or odd or not 0 < self.floor < math.inf:
+        if counts < 1 or not 0 < self.memory < math.inf or not 0 < self.floor < math.inf:
             raise ValueRangeError(f"dynamics settings: found {self}, expected positive numbers")
 
 
@@ -147,9 +147,9 @@ class DynamicsPrior(nn.Module):
     ) -> DynamicsPrior:
         """Learns from takes; what cannot be known from a take itself is judged on takes left out in turn.
 
-        The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). How much the frames
-        of a take repeat each other, how far the processes are trusted, and the noise are chosen such that a take that
-        was left out is predicted best; of a single take its quarters are left out.
+        The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). How far the
+        processes are trusted, and the noise, are such that takes that were left out are predicted best; of a single
+        take its quarters are left out.
 
         Args:
             takes: weights of each take, (T,N), all at one frame rate (see ``resampled``); windows with a NaN are left

@@ -106,7 +106,7 @@ def learn(
             fitted_kernel(everything[some], steps[some][:, list(group)], inducing, looked_at, settings.rounds)
         )
         targets = [part[:, list(group)] for part in unseen]
-        chosen.append(cross_validated(kernels[-1], inducing, inputs, targets, settings.redundancies))
+        chosen.append(cross_validated(kernels[-1], inducing, inputs, targets, max(settings.memory * fps, 1.0)))
     progress("noise")
     told, known = torch.zeros_like(steps), torch.zeros_like(steps)
     weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in groups]
@@ -209,48 +209,33 @@ class CrossValidated:
 
 
 def cross_validated(
-    kernel: Kernel,
-    inducing: Tensor,
-    inputs: Sequence[Tensor],
-    targets: Sequence[Tensor],
-    redundancies: Sequence[float],
+    kernel: Kernel, inducing: Tensor, inputs: Sequence[Tensor], targets: Sequence[Tensor], redundancy: float
 ) -> CrossValidated:
-    """Chooses how much frames repeat each other, and how far to trust the process, on parts left out in turn.
+    """Learns a process, and how far to trust it by what it tells of parts left out in turn.
 
     Args:
         kernel: of the process.
         inducing: (M,F).
         inputs: of each part, (B,F).
         targets: of each part, as they look to one that has not seen the part, (B,n).
-        redundancies: to choose from.
+        redundancy: how many frames tell as much as a single independent one.
     """
     whitening = whitening_of(kernel, inducing)
     near = [kernel.between(part, inducing) for part in inputs]
     features = [part @ whitening for part in near]
     evidence = [Evidence(f.T @ f, f.T @ t) for f, t in zip(features, targets, strict=True)]
-    whole = _summed(evidence)
-    wanted = torch.cat(list(targets))
+    means, variances = [], []
+    for i, (k, f) in enumerate(zip(near, features, strict=True)):
+        own = posterior(kernel, inducing, whitening, _summed(evidence[:i] + evidence[i + 1 :]), redundancy)
+        told = k @ own.spread
+        means.append(told @ own.weights)
+        variances.append((kernel.signal - f.square().sum(1)).clamp(min=0.0) + told.square().sum(1))
+    mean, wanted = torch.cat(means), torch.cat(list(targets))
     # A lively take must not decide for all: errors count relative to those that the take has without the process.
     weight = torch.cat([(1 / t.square().sum().clamp(min=_SMALLEST)).expand(len(t), 1) for t in targets])
-    best: CrossValidated | None = None
-    least = math.inf
-    for redundancy in redundancies:
-        means, variances = [], []
-        for i, (k, f) in enumerate(zip(near, features, strict=True)):
-            others = _summed(evidence[:i] + evidence[i + 1 :])
-            own = posterior(kernel, inducing, whitening, others, redundancy)
-            told = k @ own.spread
-            means.append(told @ own.weights)
-            variances.append((kernel.signal - f.square().sum(1)).clamp(min=0.0) + told.square().sum(1))
-        mean = torch.cat(means)
-        trust = float(((weight * mean * wanted).sum() / (weight * mean.square()).sum().clamp(min=1e-12)).clamp(0, 1))
-        missed = float((weight * (trust * mean - wanted).square()).sum())
-        if missed < least:
-            least = missed
-            all_of_it = posterior(kernel, inducing, whitening, whole, redundancy)
-            best = CrossValidated(all_of_it, trust, trust * mean, trust**2 * torch.cat(variances))
-    assert best is not None
-    return best
+    trust = float(((weight * mean * wanted).sum() / (weight * mean.square()).sum().clamp(min=1e-12)).clamp(0, 1))
+    whole = posterior(kernel, inducing, whitening, _summed(evidence), redundancy)
+    return CrossValidated(whole, trust, trust * mean, trust**2 * torch.cat(variances))
 
 
 def _own_coefficients(parts: Sequence[_Part], center: Tensor) -> tuple[Tensor, list[Tensor]]:
