@@ -16,6 +16,7 @@ from torchface.rendering.raycast import RayCaster
 
 _EDGE_SAMPLES = 4  # a pixel side, where the surface ends or jumps
 _JUMP = 0.006  # of the distance; neighbours that differ by more lie on different parts of the face
+_BLUR = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
 _NEAR = 1.0  # millimetres before the lens
 
 
@@ -63,6 +64,28 @@ class Footprint:
             points=self.points[rows],
             normals=self.normals[rows],
         )
+
+    def softened(self, values: Tensor, weights: Tensor | None = None, rounds: int = 1) -> Tensor:
+        """Values (S,C) of the samples, blurred over the picture, (S,C).
+
+        Args:
+            values: of each sample.
+            weights: what each counts beside its share of a pixel, (S,).
+            rounds: of a blur of one pixel's standard deviation; r rounds reach as far as the root of r pixels.
+        """
+        weight = (self.share if weights is None else self.share * weights).float()[:, None]
+        rows, columns = self.pixel // self.width, self.pixel % self.width
+        (top, left), (bottom, right) = (int(rows.min()), int(columns.min())), (int(rows.max()), int(columns.max()))
+        height, width = bottom - top + 1, right - left + 1
+        place = (rows - top) * width + columns - left
+        held = torch.zeros(height * width, values.shape[1] + 1)
+        held.index_add_(0, place, torch.cat([weight * values.float(), weight], dim=1))
+        part = held.T.reshape(-1, 1, height, width)
+        for _ in range(rounds):
+            part = torch.nn.functional.conv2d(part, _BLUR.view(1, 1, -1, 1), padding=(len(_BLUR) // 2, 0))
+            part = torch.nn.functional.conv2d(part, _BLUR.view(1, 1, 1, -1), padding=(0, len(_BLUR) // 2))
+        blurred = part.reshape(len(part), -1).T[place]
+        return blurred[:, :-1] / blurred[:, -1:].clamp(min=1e-6)
 
     def blended(self, picture: Tensor, over: Tensor, alpha: Tensor) -> Tensor:
         """A picture (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, laid over it."""

@@ -20,8 +20,9 @@ _NOT_SKIN = (
     "eyeball", "eye_socket", "eye_blend", "eye_occlusion", "eyelash", "lacrimal", "mouth_interior", "mouth_socket",
     "gums", "teeth", "tongue", "nostrils",
 )  # fmt: skip
-_MOST_GAIN = 4.0
-_LEAST_LIGHT = 0.02
+_MOST_GAIN = 8.0
+_FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
+_BESIDE = 9  # rounds of blur; three pixels
 _LARGEST = 8192
 
 
@@ -135,7 +136,7 @@ def overlay(
     colors = paint.at(covered, _coarseness(covered, paint))
     painted = (colors[:, 3] > 1e-4).nonzero()[:, 0]
     covered, colors = covered.select(painted), colors[painted]
-    shade = _light_on(covered, light)
+    shade = _light_on(covered, light, _soft_shadow(covered, light))
     mixed = covered.blended(to_linear(picture), colors[:, :3] * shade, colors[:, 3])
     return _as(frame, picture, mixed, covered.pixel)
 
@@ -154,7 +155,7 @@ def relight(
 
     .. math:: C' = C\; \frac{I'_a + I'_p \max(0, N \cdot L')\, s'}{I_a + I_p \max(0, N \cdot L)\, s}
 
-    in linear light, so that pores, beard and colour stay; no albedo is needed. At most four times as bright: noise of
+    in linear light, so that pores, beard and colour stay; no albedo is needed. At most eight times as bright: noise of
     black shadows is no skin. Highlights of the old lamp stay where they were.
 
     Args:
@@ -184,17 +185,27 @@ def relight(
     covered = footprint(vertices, faces, torch.ones(len(faces), dtype=torch.bool), camera, calibration)
     if len(covered.pixel) == 0:
         return frame
-    gain = (_light_on(covered, new_light) + 1e-4) / (_light_on(covered, light) + 1e-4).clamp(min=_LEAST_LIGHT)
-    gain = gain.clamp(max=_MOST_GAIN)
     linear = to_linear(picture)
-    old = linear.reshape(3, -1).T[covered.pixel]
+    old, lit = linear.reshape(3, -1).T[covered.pixel], _soft_shadow(covered, light)
+    reflected = (old + _FLOOR) / (_light_on(covered, light, lit) + _FLOOR)
+    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line: the skin beside it goes there.
+    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2
+    reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
+    new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
+    new = torch.minimum(new.clamp(min=0), _MOST_GAIN * old)
     alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
-    return _as(frame, picture, covered.blended(linear, old * gain * alpha[:, None], alpha), covered.pixel)
+    return _as(frame, picture, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
 
 
-def _light_on(covered: Footprint, light: PointLight) -> Tensor:
+def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
+    """The share of the lamp that samples see, (S,); edges are soft, as those of lamps with a size and lenses."""
     lit = lit_by(light.position, covered.caster, covered.points, covered.normals)
-    return irradiance(covered.points, covered.normals, light, lit).float()
+    return covered.softened(lit[:, None])[:, 0]
+
+
+def _light_on(covered: Footprint, light: PointLight, lit: Tensor) -> Tensor:
+    """Red, green and blue light at the samples, (S,3)."""
+    return irradiance(covered.points, covered.normals, light, lit.double()).float()
 
 
 def _coarseness(covered: Footprint, paint: FacePaint) -> float:
