@@ -276,7 +276,9 @@ def test_a_landmark_that_some_pictures_lack_is_learned_from_the_others() -> None
     points[::3, 1] = torch.nan
     model = LandmarkTrees.fit(images, boxes, points, FEW)
     new = blobs(40, 1)
-    assert errors(model, *new)[:, 1].mean() < 0.7 * (start_shapes(model.mean, new[1]) - new[2]).norm(dim=-1)[:, 1].mean()
+    assert (
+        errors(model, *new)[:, 1].mean() < 0.7 * (start_shapes(model.mean, new[1]) - new[2]).norm(dim=-1)[:, 1].mean()
+    )
 
 
 def test_ibug_pairs_are_the_heads_mirror_images() -> None:
@@ -323,7 +325,9 @@ def test_the_shipped_model_finds_real_faces(data: Path) -> None:
         away = (seen[:, :2] + seen[:, 2:] / 2 - box[:2] - box[2:] / 2).norm(dim=1) / box[2]
         if len(seen) and away.min() < 0.25:
             detected.append(relative_errors(model(image, seen[away.argmin()][None]), truth))
-    print(f"\nreal faces: {100 * torch.cat(given).mean():.1f} %, from detected boxes {100 * torch.cat(detected).mean():.1f}")
+    print(
+        f"\nreal faces: {100 * torch.cat(given).mean():.1f} %, from detected boxes {100 * torch.cat(detected).mean():.1f}"
+    )
     assert len(detected) >= 14
     assert torch.cat(given).median() < 0.09
     assert torch.cat(detected).median() < 0.10

@@ -361,7 +361,9 @@ def _resume(path: Path, signature: Tensor, model: LandmarkTrees, shapes: Tensor)
     expected = {**model.state_dict(), "shapes": shapes, "signature": signature, "done": torch.zeros(1).long()}
     state, _ = read_state(path, expected, path.stat().st_size)
     if not torch.equal(state.pop("signature"), signature) or not 0 < int(state["done"]) <= model.sizes["cascades"]:
-        raise FileFormatError(f"{path}: found a checkpoint of other pictures or settings, expected one of these; delete it")
+        raise FileFormatError(
+            f"{path}: found a checkpoint of other pictures or settings, expected one of these; delete it"
+        )
     done, shapes = int(state.pop("done")), state.pop("shapes")
     model.load_state_dict(state)
     model.check_state()

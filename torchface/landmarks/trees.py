@@ -100,7 +100,9 @@ class LandmarkTrees(nn.Module):
                             ("second", self.sizes["features"])):  # fmt: skip
             values = getattr(self, name)
             if int(values.min()) < 0 or int(values.max()) >= limit:
-                raise ValueRangeError(f"{name}: found {int(values.min())} to {int(values.max())}, expected below {limit}")
+                raise ValueRangeError(
+                    f"{name}: found {int(values.min())} to {int(values.max())}, expected below {limit}"
+                )
         if not float((self.mean - self.mean.mean(0)).abs().max()) > 0:
             raise ValueRangeError("mean: found a single point, expected a shape")
 

@@ -180,5 +180,3 @@ def _leaves(build: _IntegerBuilder, model: LandmarkTrees, cascade: int, grey: st
     leaves = build.stored(f"leaves{cascade}", model.leaves[cascade].reshape(trees * 2**depth, -1))
     held = op("Cast", op("Gather", leaves, place), to=TensorProto.FLOAT)
     return op("MatMul", build.constant(f"scales{cascade}", model.scales[cascade][None]), held)
-
-

@@ -304,7 +304,9 @@ def _light(
             falls = falls * torch.where(dark, uniform(0.0, 0.5, generator), 1.0)
         light = light + strength * falls
         half = torch.nn.functional.normalize(toward - ways, dim=-1)
-        mirrored = mirrored + strength * (normals * half).sum(-1).clamp(min=0) ** uniform(8, 40, generator) * (falls > 0)
+        mirrored = mirrored + strength * (normals * half).sum(-1).clamp(min=0) ** uniform(8, 40, generator) * (
+            falls > 0
+        )
     return albedo * light + gloss * mirrored
 
 
