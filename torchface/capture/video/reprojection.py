@@ -32,6 +32,9 @@ class HeadState:
         rotation = rotation_matrix(motion[:, :3]) @ self.rotation
         return HeadState(weights, rotation, self.translation + motion[:, 3:])
 
+    def detached(self) -> HeadState:
+        return HeadState(self.weights.detach(), self.rotation.detach(), self.translation.detach())
+
     def motion_from(self, rotation: Tensor, translation: Tensor) -> Tensor:
         """What moves a pose (B,3,3), (B,3) here, (B,6); turns are below half a turn."""
         turn = self.rotation @ rotation.transpose(-1, -2)

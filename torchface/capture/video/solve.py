@@ -2,50 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
+from torchface.capture.priors.dynamics import DynamicsPrior
 from torchface.capture.priors.shape_prior import ShapePrior
+from torchface.capture.video.belief import Belief, Expectation
 from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
 from torchface.capture.video.fixed_point import attach_gradients
-from torchface.capture.video.reprojection import HeadState, Linearised, linearise
+from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.pnp import solve_pnp
-from torchface.optim import box_qp
+from torchface.optim.active_set import projected_newton
+from torchface.optim.box_problem import BoxProblem
 from torchface.rig import BlendshapeRig
 
-SPARSITY = 0.0
+SPARSITY = 1.0
 RIDGE = 1e-2
 CONTOUR_WEIGHT = 0.5
 CONTOUR_SLIDE = 0.3
-POSE_TRUST = 0.1
+TURN, SHIFT = 0.02, 4.0
+"""How far a head moves from frame to frame: standard deviations in radians and millimetres."""
 
 _FEWEST = 6
 _ROUNDS = 30
-# What is known of a pose when no landmark tells: turns to half a radian, places to half a metre.
+# What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre.
 _LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
+# Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full.
+_LOOSE_WEIGHT, _LOOSE_STEP = 1.0, 0.1
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
-
-
-class Dynamics(Protocol):
-    """What the solver asks of a prior of how weights go on; see ``torchface.capture.priors.DynamicsPrior``.
-
-    Args:
-        window: how many frames it looks back.
-    """
-
-    window: int
-
-    def energy(self, windows: Tensor) -> Quadratic:
-        """Of the weights that follow windows (B,J,N)."""
-
-    def require(self, names: Sequence[str]) -> None:
-        """Raises ``NameMismatchError`` for other shapes than it was learned for."""
+_NEWTON_STEPS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +58,17 @@ class VideoSolution:
 
 @dataclass(frozen=True, eq=False)
 class VideoState:
-    """What one frame hands on to the next.
+    """What one frame hands on to the next, in float64.
 
     Args:
         head: weights (1,N) and pose of the frame; None before the first.
+        belief: what landmarks and dynamics told until now; None before the first, and without a dynamics prior.
         window: weights of the latest frames, the newest last, (1,J,N) with J growing up to the dynamics prior's window.
         solved: whether the frame showed at least six landmarks.
     """
 
     head: HeadState | None
+    belief: Belief | None
     window: Tensor
     solved: bool = False
 
@@ -110,14 +101,19 @@ class FrameTerms:
         landmarks: finite, (B,68,2).
         precision: of each, one over its standard deviation, 0 where not seen, (B,68).
         rotation, translation: the tracked pose, (B,3,3) and (B,3).
-        extra: energies of the weights that do not change from step to step.
+        expected: what is known before the frames are seen.
     """
 
     landmarks: Tensor
     precision: Tensor
     rotation: Tensor
     translation: Tensor
-    extra: Quadratic
+    expected: Expectation
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        mean = self.expected.mean
+        own = (self.landmarks, self.precision, self.rotation, self.translation, self.expected.information)
+        return (*own, mean.weights, mean.rotation, mean.translation)
 
 
 class VideoSolver(nn.Module):
@@ -126,14 +122,21 @@ class VideoSolver(nn.Module):
     .. math::
         \min_{0 \le w \le 1,\, R,\, t} \; \tfrac12 \sum_l \frac{c_l}{\sigma^2}
         \lVert \pi(K (R (b_l + B_l w) + t)) - q_l \rVert^2
-        - \lambda \log p(w) + \gamma \tfrac12 \frac{\lVert w - m(w_{-j..-1}) \rVert^2}{V}
-        + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2 + \kappa \, D(R, t; \hat R, \hat t)
+        - \lambda \log p(w) + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
+        + \tfrac12 (x - m)^\top (V + P)^{-1} (x - m) + \kappa \, D(R, t; \hat R, \hat t)
 
-    Every term is a negative log likelihood, so each is in units of its own variance. Frames are solved one after the
-    other, each from the one before, by Gauss-Newton's steps: quadratic programs in a box. A pose tracked from stable
-    landmarks is noisy and biased by what the face does, so it is only where the search starts and a weak prior: D is
-    the distance from it in what the frame's own landmarks tell of a pose. Contour landmarks slide to where the face
-    is seen to end; their errors along the contour count less. Solved in float64.
+    Every term is a negative log likelihood, so each is in units of its own variance. It is solved by Gauss-Newton's
+    steps, quadratic programs in a box, each frame from the one before, in float64. Contour landmarks slide to where the
+    face is seen to end; their errors along the contour count less.
+
+    The term before the last is the dynamics prior's: x are weights and pose, m where the last frames lead to and V the
+    variance of that. The thesis divides by V alone, as if the last frames' weights were true. They are known with a
+    covariance P, which a Kalman filter of the landmarks carries on; it tells directions in which the landmarks show
+    little, such as depth, from those that they show well, and so averages over the more frames the less one tells.
+    Without a dynamics prior each frame is solved on its own.
+
+    A pose tracked from stable landmarks is noisy, and biased by what the face does, so it is where the search starts,
+    no more, unless ``pose_trust`` is positive: D is the distance from it in what the frame's landmarks tell of a pose.
 
     Args:
         rig: N shapes, of the person in the picture.
@@ -145,8 +148,8 @@ class VideoSolver(nn.Module):
         sparsity: :math:`\beta`, for a weight of 1.
         ridge: :math:`\varepsilon`, for a squared weight of 1.
         landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
-        dynamics_strength: :math:`\gamma`; 1 is Bayes' rule.
-        pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks; 0 refines freely.
+        dynamics_strength: by what the dynamics prior's variance is divided.
+        pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks.
         contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
             are the vertices themselves.
         tolerance: steps end when no weight moves further than this.
@@ -167,13 +170,13 @@ class VideoSolver(nn.Module):
         landmark_vertices: Tensor | None,
         intrinsics: Tensor,
         prior: ShapePrior | None = None,
-        dynamics: Dynamics | None = None,
+        dynamics: DynamicsPrior | None = None,
         pixel_noise: float = 1.0,
         sparsity: float = SPARSITY,
         ridge: float = RIDGE,
         landmark_weights: Tensor | None = None,
         dynamics_strength: float = 1.0,
-        pose_trust: float = POSE_TRUST,
+        pose_trust: float = 0.0,
         contour_slide: float = CONTOUR_SLIDE,
         tolerance: float = 1e-3,
     ) -> None:
@@ -188,12 +191,12 @@ class VideoSolver(nn.Module):
         _check_not_negative("landmark_weights", weights)
         for name, value in (("sparsity", sparsity), ("ridge", ridge), ("pose_trust", pose_trust)):
             _check_not_negative(name, torch.tensor(value))
-        _check_not_negative("dynamics_strength", torch.tensor(dynamics_strength))
-        if not 0 < pixel_noise < float("inf") or not 0 <= contour_slide <= 1 or not tolerance > 0:
-            raise ValueRangeError(
-                f"video solver: found pixel_noise {pixel_noise}, contour_slide {contour_slide}, tolerance {tolerance}, "
-                "expected pixels above 0, a share, and a positive number"
-            )
+        positive = {"pixel_noise": pixel_noise, "dynamics_strength": dynamics_strength, "tolerance": tolerance}
+        for name, value in positive.items():
+            if not 0 < value < float("inf"):
+                raise ValueRangeError(f"{name}: found {value}, expected a positive number")
+        if not 0 <= contour_slide <= 1:
+            raise ValueRangeError(f"contour_slide: found {contour_slide}, expected a share from 0 to 1")
         for learned in (prior, dynamics):
             if learned is not None:
                 learned.require(rig.names)
@@ -209,7 +212,11 @@ class VideoSolver(nn.Module):
         free = like.new_full((6,), torch.inf)
         self._lower = torch.cat([like.new_zeros(shapes), -free])
         self._upper = torch.cat([like.new_ones(shapes), free])
-        self._loose = like.new_tensor([_LOOSE_TURN**-2] * 3 + [_LOOSE_PLACE**-2] * 3).diag()
+        self._motion = like.new_tensor([TURN**2] * 3 + [SHIFT**2] * 3)
+        # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
+        weight = 0.0 if dynamics is None else _LOOSE_WEIGHT**-2
+        loose = [weight] * shapes + [_LOOSE_TURN**-2] * 3 + [_LOOSE_PLACE**-2] * 3
+        self._loose = like.new_tensor(loose).diag()
 
     def forward(
         self,
@@ -226,11 +233,30 @@ class VideoSolver(nn.Module):
             confidence: how far each landmark is trusted, (T,68) in [0,1].
 
         Returns:
-            What the face did; differentiable in all arguments.
+            What the face did, in the dtype of the landmarks; differentiable in all arguments.
 
         Raises:
             ShapeError: the shapes do not fit each other.
             ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
+        """
+        states, enough = self.states(landmarks, rotation, translation, confidence)
+        weights, turned, moved = (
+            torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
+            for name in ("weights", "rotation", "translation")
+        )
+        errors = self.reprojection_errors(landmarks, weights, turned, moved)
+        return VideoSolution(weights, turned, moved, errors, enough)
+
+    def states(
+        self,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+    ) -> tuple[list[VideoState], Tensor]:
+        """The states after each of T frames, and which frames showed a face, (T,) bool; arguments as ``forward``.
+
+        Frames before the first face have its state.
         """
         count = self._check(landmarks, rotation, translation, confidence)
         enough = torch.isfinite(landmarks).all(-1).sum(1) >= _FEWEST
@@ -238,27 +264,18 @@ class VideoSolver(nn.Module):
             raise ValueRangeError(
                 f"landmarks: found fewer than {_FEWEST} in each of {count} frames, expected a face in some"
             )
-        # A frame leans on the one before, so frames come one after the other.
         states, state = [], self.start()
         first = int(enough.nonzero()[0, 0])
+        # A frame leans on the one before, so frames come one after the other.
         for t in range(first, count):
-            state = self.step(
-                state,
-                landmarks[t],
-                None if rotation is None else rotation[t],
-                None if translation is None else translation[t],
-                None if confidence is None else confidence[t],
-            )
+            given = (None if x is None else x[t] for x in (rotation, translation, confidence))
+            state = self.step(state, landmarks[t], *given)
             states.append(state)
-        states = [states[0]] * first + states
-        weights = torch.stack([state.weights for state in states])
-        turned, moved = (torch.stack([getattr(s, name) for s in states]) for name in ("rotation", "translation"))
-        errors = self.reprojection_errors(landmarks, weights, turned, moved)
-        return VideoSolution(weights, turned, moved, errors, enough)
+        return [states[0]] * first + states, enough
 
     def start(self) -> VideoState:
         """The state before the first frame."""
-        return VideoState(None, self.points.rest.new_zeros(1, 0, len(self.names)))
+        return VideoState(None, None, self.points.rest.new_zeros(1, 0, len(self.names)))
 
     def step(
         self,
@@ -282,82 +299,90 @@ class VideoSolver(nn.Module):
             ShapeError: an argument is not as above.
             ValueRangeError: the first frame shows fewer than six landmarks, or a landmark is infinite.
         """
-        batch = [None if x is None else x[None] for x in (rotation, translation, confidence)]
-        self._check(landmarks[None], *batch)
-        dtype = landmarks.dtype
-        found, (rotation, translation, confidence) = (
-            landmarks[None].double(),
-            (None if x is None else x.double() for x in batch),
-        )
+        given = [None if x is None else x[None] for x in (rotation, translation, confidence)]
+        self._check(landmarks[None], *given)
+        found = landmarks[None].double()
+        rotation, translation, confidence = (None if x is None else x.double() for x in given)
         seen = torch.isfinite(found).all(-1)
         enough = int(seen.sum()) >= _FEWEST
         if state.head is None and not enough:
             raise ValueRangeError(
                 f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_FEWEST} to begin with"
             )
-        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence)
-        known = (
-            rotation is not None
-            and translation is not None
-            and bool(torch.isfinite(rotation).all() & torch.isfinite(translation).all())
-        )
-        if not known:
+        if rotation is None or translation is None or not _finite(rotation, translation):
             rotation, translation = self._pose_of(state, found)
-        assert rotation is not None
-        assert translation is not None
-        begin = state.head or HeadState(found.new_zeros(1, len(self.names)), rotation, translation)
-        extra = self._constant
-        window = state.window.double()
-        if self.dynamics is not None and window.shape[1] >= self.dynamics.window:
-            extra = extra + self.dynamics_strength * self.dynamics.energy(window)
-        terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, extra)
-        start = HeadState(begin.weights.detach().double(), rotation.detach(), translation.detach())
-        head = self.solve(terms, start)
-        longest = 0 if self.dynamics is None else self.dynamics.window
-        window = torch.cat([window, head.weights[:, None]], dim=1)[:, -longest:] if longest else window
-        given = HeadState(head.weights.to(dtype), head.rotation.to(dtype), head.translation.to(dtype))
-        return VideoState(given, window, enough)
+        expected = self._expected(state, rotation, translation)
+        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence)
+        terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
+        # After a gap the tracked pose is nearer than where the head was left.
+        near = (
+            expected.mean
+            if state.solved and state.belief is not None
+            else HeadState(expected.mean.weights, rotation, translation)
+        )
+        begin = expected.mean.weights if state.belief is not None or state.head is None else state.head.weights
+        head = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
+        if self.dynamics is None:
+            return VideoState(head, None, state.window, enough)
+        belief = expected.updated(head, self.seen(terms, head))
+        window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
+        return VideoState(head, belief, window, enough)
+
+    def _expected(self, state: VideoState, rotation: Tensor, translation: Tensor) -> Expectation:
+        """What the frames before tell of the next."""
+        belief = state.belief
+        if belief is None or self.dynamics is None:
+            mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
+            return Expectation(mean, self._loose[None])
+        if state.window.shape[1] < self.dynamics.window:
+            steps = torch.zeros_like(belief.mean.weights)
+            variance = torch.full_like(steps, _LOOSE_STEP**2)
+        else:
+            mean, variance = self.dynamics(state.window.to(self.dynamics.center.dtype))
+            steps, variance = mean.double() - state.window[:, -1], variance.double() / self.dynamics_strength
+        return belief.predicted(steps, variance, self._motion).expectation()
 
     def solve(self, terms: FrameTerms, start: HeadState) -> HeadState:
-        """Weights (B,N) and poses of B frames on their own, from a start, float64."""
-        inputs = (terms.landmarks, terms.precision, terms.rotation, terms.translation, terms.extra.H, terms.extra.f)
+        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
         with torch.no_grad():
             head = start
             for _ in range(_ROUNDS):
                 before, head = head, self._advanced(terms, head)
                 if float((head.weights - before.weights).abs().max()) < self.tolerance:
                     break
-        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
             return self._attached(terms, head)
         return head
 
     def _advanced(self, terms: FrameTerms, head: HeadState) -> HeadState:
-        """One Gauss-Newton step."""
+        """One Gauss-Newton step: a quadratic program, warm-started."""
         shapes = len(self.names)
         energy = self.energy(terms, head)
         begin = torch.nn.functional.pad(head.weights, (0, 6))
+        H = 0.5 * (energy.H + energy.H.transpose(1, 2))
         exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
-        found = box_qp(energy.H, energy.f, self._lower, self._upper, begin, exactness)
+        problem = BoxProblem.of(H, energy.f, self._lower, self._upper)
+        found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
         return head.moved(found[:, :shapes], found[:, shapes:])
 
     def energy(self, terms: FrameTerms, head: HeadState) -> Quadratic:
         """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
+        weights = self._constant if self.prior is None else self._constant + self.prior.energy(head.weights)
+        return self.seen(terms, head) + terms.expected.quadratic(head) + _beside_motion(weights)
+
+    def seen(self, terms: FrameTerms, head: HeadState) -> Quadratic:
+        """What landmarks and tracked poses tell, linearised at a state, over weights and motion from there, (B,N+6)."""
         rows = self.points.chosen(head.weights.detach(), head.rotation, head.translation, self.intrinsics)
         at = linearise(self.points, head, rows, self.intrinsics, terms.landmarks, terms.precision, self.contour_slide)
-        seen = at.quadratic(head.weights)
-        return seen + self._pose_term(terms, head, at) + _beside_motion(self._weight_terms(terms, head))
-
-    def _weight_terms(self, terms: FrameTerms, head: HeadState) -> Quadratic:
-        return terms.extra if self.prior is None else terms.extra + self.prior.energy(head.weights)
-
-    def _pose_term(self, terms: FrameTerms, head: HeadState, at: Linearised) -> Quadratic:
-        """The pull to the tracked pose."""
+        told = at.quadratic(head.weights)
+        if self.pose_trust == 0:
+            return told
         shapes = len(self.names)
         by_motion = at.jacobian[..., shapes:].flatten(1, 2)
-        precision = self.pose_trust * (by_motion.transpose(1, 2) @ by_motion) + self._loose
+        precision = self.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
         away = head.motion_from(terms.rotation, terms.translation)
         H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
-        return Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
+        return told + Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
 
     def _attached(self, terms: FrameTerms, head: HeadState) -> HeadState:
         """The converged state as a differentiable function of the terms."""
@@ -393,7 +418,7 @@ class VideoSolver(nn.Module):
     def _pose_of(self, state: VideoState, landmarks: Tensor) -> tuple[Tensor, Tensor]:
         """Of the frame before, or by all landmarks."""
         if state.head is not None:
-            return state.head.rotation.double(), state.head.translation.double()
+            return state.head.rotation, state.head.translation
         pose = solve_pnp(self.points.rest[:LANDMARKS], landmarks, self.intrinsics, self.landmark_weights)
         return pose.rotation, pose.translation
 
@@ -424,6 +449,10 @@ def _beside_motion(weights: Quadratic) -> Quadratic:
         H=torch.nn.functional.pad(weights.H, (0, 6, 0, 6)),
         f=torch.nn.functional.pad(weights.f, (0, 6)),
     )
+
+
+def _finite(*tensors: Tensor) -> bool:
+    return all(bool(torch.isfinite(x).all()) for x in tensors)
 
 
 def _default_weights() -> Tensor:
