@@ -15,7 +15,8 @@ from torchface.rendering.point_light import FARTHEST
 _DARKEST = 0.01  # linear; below, noise of the camera and not its coding decides
 _LEAST_WIDTH = 3.0 / 255  # sRGB; a few steps of the file are no outlier
 _WIDTH = 2.5  # medians of the residuals; some 3.7 deviations of normal noise in three channels
-_STARTS, _KEPT, _APART = 128, 3, 30.0  # directions tried, refined, and degrees between those
+_STARTS, _KEPT, _APART = 100, 3, 30.0  # directions tried, refined, and degrees between those
+_FEW = 700  # vertices that are enough to tell a good direction from a bad one
 _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 1.6  # radii of what was seen; a lamp cannot stand in the face
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
@@ -59,7 +60,7 @@ class LampFit:
 
 def find_lamp(seen: SeenSkin) -> LampFit:
     """The lamp that explains best what was seen; see ``estimate_light``."""
-    starts, width = _starts(seen)
+    starts, width = _starts(seen.thinned(_FEW))
     found = [_refined(seen, start, width) for start in starts]  # a few; each casts its own shadows
     best = min(found, key=lambda one: one.cost)
     # Once more with what is left as the measure of what is an outlier.
@@ -126,9 +127,10 @@ def _tangents(direction: Tensor) -> Tensor:
 def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None) -> LampFit:
     """The best strengths for a lamp, by reweighted least squares; without a width the residuals themselves give it."""
     lit = seen.lit_by(lamp.position(seen.centre)).double()
-    falling, gloss = (part * lit for part in _reflected(seen, lamp.direction, torch.tensor(lamp.nearness)))
-    columns = torch.stack([seen.albedo, seen.albedo * falling[:, None], gloss[:, None].expand(-1, 3)])
-    wanted, slope, trust = seen.colors, _slope(seen.colors), torch.ones_like(falling)
+    reflected = _reflected(seen, lamp)
+    diffuse, gloss = seen.albedo * (lit * reflected.falling)[:, None], (lit * reflected.gloss)[:, None].expand(-1, 3)
+    columns = torch.stack([seen.albedo, diffuse, gloss])
+    wanted, slope, trust = seen.colors, _slope(seen.colors), torch.ones_like(lit)
     coded = to_srgb(seen.colors)
     for _ in range(_ROUNDS):
         weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
@@ -143,12 +145,44 @@ def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None) -> LampFit:
     return LampFit(lamp, strengths, lit, columns, residuals, trust, cost)
 
 
-def _reflected(seen: SeenSkin, direction: Tensor, nearness: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine of the falling light and Blinn's highlight at each vertex, as if nothing threw a shadow, (Q,) each."""
-    toward = torch.nn.functional.normalize(direction - nearness * (seen.points - seen.centre), dim=-1)
-    half = torch.nn.functional.normalize(toward - torch.nn.functional.normalize(seen.points, dim=-1), dim=-1)
-    falling = (seen.normals * toward).sum(-1).clamp(min=0)
-    return falling, (seen.normals * half).sum(-1).clamp(min=0) ** _SHININESS * (falling > 0)
+@dataclass(frozen=True, eq=False)
+class _Reflection:
+    """Cosine of the falling light and Blinn's highlight at Q vertices, as if nothing threw a shadow, (Q,) each.
+
+    ``falling_moved`` and ``gloss_moved``, (Q,3), are their derivatives by the two angles across the lamp's direction
+    and by its nearness in units of that of the usual distance.
+    """
+
+    falling: Tensor
+    gloss: Tensor
+    falling_moved: Tensor
+    gloss_moved: Tensor
+
+
+def _reflected(seen: SeenSkin, lamp: Lamp) -> _Reflection:
+    aside = seen.points - seen.centre
+    way = lamp.direction - lamp.nearness * aside
+    length = way.norm(dim=1, keepdim=True)
+    toward = way / length
+    between = toward - torch.nn.functional.normalize(seen.points, dim=1)
+    width = between.norm(dim=1, keepdim=True).clamp(min=1e-9)
+    half = between / width
+    cosine, shine = (seen.normals * toward).sum(1), (seen.normals * half).sum(1).clamp(min=0)
+    faces = (cosine > 0).double()
+
+    def moved(slope: Tensor) -> Tensor:
+        """By the lamp's place, where ``slope`` (Q,3) is by the unit vector toward it."""
+        across = (slope - (slope * toward).sum(1, keepdim=True) * toward) / length
+        return torch.cat([across @ _tangents(lamp.direction).T, -(across * aside).sum(1, keepdim=True) / _USUAL], dim=1)
+
+    tilt = (seen.normals - shine[:, None] * half) / width
+    steep = faces * _SHININESS * shine ** (_SHININESS - 1)
+    return _Reflection(
+        cosine.clamp(min=0),
+        faces * shine**_SHININESS,
+        moved(seen.normals) * faces[:, None],
+        moved(tilt) * steep[:, None],
+    )
 
 
 def _strengths(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
@@ -171,22 +205,15 @@ def _strengths(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
 
 def _normal_equations(seen: SeenSkin, fit: LampFit) -> tuple[Tensor, Tensor]:
     """H (3,3) and g (3,) of the lamp's place, with the strengths' directions projected out (variable projection)."""
-    place = torch.zeros(3, dtype=torch.float64)
-
-    def shaded(moved: Tensor) -> Tensor:
-        direction = fit.lamp.direction + moved[:2] @ _tangents(fit.lamp.direction)
-        falling, gloss = _reflected(seen, direction, fit.lamp.nearness + moved[2] / _USUAL)
-        bare = seen.albedo * (fit.strengths[0] + fit.strengths[1] * (falling * fit.lit)[:, None])
-        return bare + fit.strengths[2] * (gloss * fit.lit)[:, None]
-
-    J = torch.func.jacfwd(shaded)(place)  # (Q,3,3): vertex, channel, place
+    reflected = _reflected(seen, fit.lamp)
     slope = _slope((fit.strengths[:, None] * fit.columns).sum(0))
     root = (seen.valid * (seen.area * fit.trust)[:, None]).sqrt()
     H, g = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for c in range(3):  # channels: each has strengths of its own to project out
         scaled = root[:, c] / slope[:, c]
         basis = torch.linalg.qr((scaled * fit.columns[fit.strengths[:, c] > 0, :, c]).T)[0]
-        part = scaled[:, None] * J[:, c]
+        diffuse = (fit.strengths[1, c] * seen.albedo[:, c])[:, None] * reflected.falling_moved
+        part = (scaled * fit.lit)[:, None] * (diffuse + fit.strengths[2, c] * reflected.gloss_moved)
         part = part - basis @ (basis.T @ part)
         H, g = H + part.T @ part, g + part.T @ (root[:, c] * fit.residuals[:, c])
     return H, g

@@ -65,6 +65,21 @@ class SeenSkin:
             lit[rows] = lit_by(position, caster, self.points[rows], self.normals[rows])
         return lit
 
+    def thinned(self, most: int) -> SeenSkin:
+        """At most so many of the vertices, evenly through all of them."""
+        rows = torch.arange(0, len(self.points), max(1, -(-len(self.points) // most)))
+        return replace(
+            self,
+            points=self.points[rows],
+            normals=self.normals[rows],
+            albedo=self.albedo[rows],
+            colors=self.colors[rows],
+            valid=self.valid[rows],
+            area=self.area[rows],
+            frame=self.frame[rows],
+            vertex=self.vertex[rows],
+        )
+
 
 def seen_skin(
     frames: Tensor,
