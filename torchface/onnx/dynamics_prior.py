@@ -55,7 +55,7 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
     # Slopes and curvatures share a row of (O-1)·N; places go before them in a row of O·N.
     squares = (model.feature_scale[1:] if orders > 1 else noise.scale).flatten()
     # The newest frame itself is the step's start.
-    own = model.coefficients[:-1].clone()
+    own = model.coefficients.clone()
     own[-1] += 1.0
     scale = model.target_scale * model.trust[model.home]
     around = torch.block_diag(*[noise.together.T] * (orders - 1)) if orders > 1 else None
@@ -65,7 +65,6 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         "to_motion": model.basis.T,
         "feature_scale": model.feature_scale,
         "coefficients": own,
-        "bias": model.coefficients[-1] + model.center,
         "inverse_lengths": processes.inverse_lengths[:, None],
         "inducing": processes.inducing.transpose(1, 2),
         "inducing_lengths": processes.inducing.square().sum(-1)[:, None],
@@ -94,8 +93,7 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         "moving_row": (-1, (orders - 1) * count),
     }.items():
         build.constant(name, ids)
-    offset = op("Sub", "windows", "center")
-    motion = op("MatMul", "to_motion", offset)
+    motion = op("MatMul", "to_motion", op("Sub", "windows", "center"))
     features = op("Reshape", op("Div", motion, "feature_scale"), "row")
     scaled = op("Mul", features, "inverse_lengths")
     lengths = op("ReduceSum", op("Mul", scaled, scaled), "last_axis", keepdims=1)
@@ -119,7 +117,7 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         total = op("Add", op("Mul", energy, "own_share"), op("Mul", spread, "shared_share"))
         variance = op("Add", variance, op("MatMul", total, "to_noise"))
     op("Sqrt", variance, output="deviation")
-    steps = op("Add", op("ReduceSum", op("Mul", offset, "coefficients"), "frame_axis", keepdims=0), "bias")
+    steps = op("ReduceSum", op("Mul", "windows", "coefficients"), "frame_axis", keepdims=0)
     added = op("ReduceSum", op("MatMul", told, "weights"), "group_axis", keepdims=0)
     op("Clip", op("Add", steps, added), "low", "high", output="mean")
     return build.model(

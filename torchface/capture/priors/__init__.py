@@ -5,6 +5,7 @@ from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.motion import face_regions, resampled, windows_of
 from torchface.capture.priors.parzen import ParzenDensity, automatic_bandwidth
 from torchface.capture.priors.shape_prior import ReciprocalPrior, ShapePrior, face_halves
+from torchface.capture.priors.student import StudentDensity
 
 __all__ = [
     "DynamicsPrior",
@@ -13,6 +14,7 @@ __all__ = [
     "ParzenDensity",
     "ReciprocalPrior",
     "ShapePrior",
+    "StudentDensity",
     "automatic_bandwidth",
     "face_halves",
     "face_regions",

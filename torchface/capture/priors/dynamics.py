@@ -51,10 +51,10 @@ class DynamicsSettings:
 class DynamicsPrior(nn.Module):
     r"""Where weights will be in the next frame, and how surely.
 
-    .. math:: w_{n+1} = w_n + A(x - \bar x) + b + s \, f_g(x) + \varepsilon(x), \qquad f_g \sim GP(0, k_g)
+    .. math:: w_{n+1} = w_n + A x + s \, f_g(x) + \varepsilon(x), \qquad f_g \sim GP(0, k_g)
 
-    for a window x of the last J frames. Each shape goes on by its own last frames (A is diagonal in the shapes); the
-    processes, one for each group of shapes, add what depends on the other shapes of the group and on the pose; the
+    for a window x of the last J frames. Each shape goes on by its own last steps (A is diagonal in the shapes, and 0 for
+    a window that rests); the processes, one for each group of shapes, add what depends on the other shapes of the group and on the pose; the
     noise grows with how much the window moves. The mean stays within the range of weights.
 
     ``prior(windows)`` gives mean and variance; :meth:`energy` the quadratic for a solver.
@@ -65,8 +65,8 @@ class DynamicsPrior(nn.Module):
         groups: rows of ``names``, one tuple a process; every shape in one group.
         processes: of the G groups, over place, slope and curvature of all shapes.
         noise: of the next frame.
-        center: :math:`\bar x`, (N,).
-        coefficients: A, (J,N), and last b, (J+1,N).
+        center: the takes' mean, against which places count, (N,).
+        coefficients: A, (J,N).
         feature_scale: usual sizes of place, slope and curvature, (O,N).
         target_scale: s, (N,).
         trust: by what the mean of each process is multiplied, (G,).
@@ -113,7 +113,7 @@ class DynamicsPrior(nn.Module):
         basis = motion_basis(window).to(center.dtype)
         shapes = {
             "center": (center, (count,)),
-            "coefficients": (coefficients, (window + 1, count)),
+            "coefficients": (coefficients, (window, count)),
             "feature_scale": (feature_scale, (basis.shape[1], count)),
             "target_scale": (target_scale, (count,)),
             "trust": (trust, (len(groups),)),
@@ -201,10 +201,9 @@ class DynamicsPrior(nn.Module):
                 f"windows: found {tuple(windows.shape)}, expected (B,{self.window},{len(self.names)}) or more frames"
             )
         windows = windows[:, -self.window :]
-        offset = windows - self.center
-        motion = torch.einsum("bjn,jo->bon", offset, self.basis)
+        motion = torch.einsum("bjn,jo->bon", windows - self.center, self.basis)
         told, own = self.processes((motion / self.feature_scale).flatten(1))
-        steps = (offset * self.coefficients[:-1]).sum(1) + self.coefficients[-1]
+        steps = (windows * self.coefficients).sum(1)
         scale = self.target_scale * self.trust[self.home]
         mean = windows[:, -1] + steps + scale * told
         variance = scale.square() * own[:, self.home] + self.noise(motion[:, 1:])
@@ -282,7 +281,7 @@ class DynamicsPrior(nn.Module):
             processes,
             noise,
             center=torch.zeros(n),
-            coefficients=torch.zeros(window + 1, n),
+            coefficients=torch.zeros(window, n),
             feature_scale=torch.ones(orders, n),
             target_scale=torch.ones(n),
             trust=torch.ones(g),

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _FOLDS = 4  # of a single take
 _STEP = 0.1  # of Adam, in logarithms
-_RIDGE = 1e-3  # of the coefficients, in squared weights
+_RIDGE = 1e-6  # of the coefficients, in squared weights
+_COMMON = 0.02  # how much of what is common to the shapes each one's own coefficients are learned with
 _SMALLEST = 1e-3  # a usual size below which a shape counts as one that never moves
 
 
@@ -60,10 +61,9 @@ class _Part:
     windows: Tensor
     following: Tensor
 
-    def steps(self, center: Tensor, coefficients: Tensor) -> Tensor:
+    def steps(self, coefficients: Tensor) -> Tensor:
         """What the shapes' own frames do not tell of the step to the next frame, (B,N)."""
-        own = ((self.windows - center) * coefficients[:-1]).sum(1) + coefficients[-1]
-        return self.following - self.windows[:, -1] - own
+        return self.following - self.windows[:, -1] - (self.windows * coefficients).sum(1)
 
 
 def learn(
@@ -88,10 +88,10 @@ def learn(
     basis = motion_basis(window)
     motions = [torch.einsum("bjn,jo->bon", part.windows - center, basis) for part in parts]
     feature_scale = torch.cat(motions).std(0).clamp(min=_SMALLEST)
-    coefficients, left_out = _own_coefficients(parts, center)
-    target_scale = torch.cat([part.steps(center, coefficients) for part in parts]).std(0).clamp(min=_SMALLEST)
-    steps = torch.cat([part.steps(center, coefficients) for part in parts]) / target_scale
-    unseen = [part.steps(center, own) / target_scale for part, own in zip(parts, left_out, strict=True)]
+    coefficients, left_out = _own_coefficients(parts)
+    target_scale = torch.cat([part.steps(coefficients) for part in parts]).std(0).clamp(min=_SMALLEST)
+    steps = torch.cat([part.steps(coefficients) for part in parts]) / target_scale
+    unseen = [part.steps(own) / target_scale for part, own in zip(parts, left_out, strict=True)]
     inputs = [(motion / feature_scale).flatten(1) for motion in motions]
     everything = torch.cat(inputs)
     order = torch.randperm(len(everything), generator=generator)
@@ -238,20 +238,36 @@ def cross_validated(
     return CrossValidated(whole, trust, trust * mean, trust**2 * torch.cat(variances))
 
 
-def _own_coefficients(parts: Sequence[_Part], center: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Each shape's step from its own frames by least squares, (J+1,N): from all parts, and from all but each."""
+def _own_coefficients(parts: Sequence[_Part]) -> tuple[Tensor, list[Tensor]]:
+    """Each shape's step from its own frames, (J,N): by least squares from all parts, and from all but each.
+
+    A window that rests is to go on resting wherever it does, so the step is a sum of the steps before: a shape that
+    the takes never raised must not be drawn back to where they left it. What is common to all shapes is learned from
+    all, and each differs from it as far as its own frames tell.
+    """
     squares, products = [], []
     for part in parts:
-        rows = torch.cat([part.windows - center, torch.ones_like(part.following)[:, None]], dim=1)
-        squares.append(torch.einsum("bin,bjn->nij", rows, rows))
-        products.append(torch.einsum("bin,bn->ni", rows, part.following - part.windows[:, -1]))
-    ridge = _RIDGE * torch.eye(squares[0].shape[1], dtype=torch.float64)
-    square, product = sum(squares, torch.zeros_like(squares[0])), sum(products, torch.zeros_like(products[0]))
+        before = part.windows.diff(dim=1)
+        squares.append(torch.einsum("bin,bjn->nij", before, before))
+        products.append(torch.einsum("bin,bn->ni", before, part.following - part.windows[:, -1]))
+    square, product = torch.stack(squares).sum(0), torch.stack(products).sum(0)
     solved = [
-        torch.linalg.solve(a + ridge, b).T
-        for a, b in [(square, product)] + [(square - a, product - b) for a, b in zip(squares, products, strict=True)]
+        _from_steps(square - a, product - b)
+        for a, b in [(torch.zeros_like(square), torch.zeros_like(product)), *zip(squares, products, strict=True)]
     ]
     return solved[0], solved[1:]
+
+
+def _from_steps(square: Tensor, product: Tensor) -> Tensor:
+    """Coefficients (J,N) of frames, of normal equations (N,J-1,J-1), (N,J-1) of the steps between them."""
+    count, steps = product.shape
+    ridge = _RIDGE * torch.eye(steps, dtype=torch.float64)
+    usual = square.mean(0) + ridge
+    common = torch.linalg.solve(usual, product.mean(0))
+    own = torch.linalg.solve(square + _COMMON * usual, product + _COMMON * (usual @ common))
+    zero = torch.zeros(count, 1, dtype=torch.float64)
+    padded = torch.cat([zero, own, zero], dim=1)
+    return (padded[:, :-1] - padded[:, 1:]).T
 
 
 def _parts(takes: Sequence[Tensor], window: int, input_noise: float, generator: torch.Generator) -> list[_Part]:
