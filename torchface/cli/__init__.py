@@ -31,6 +31,7 @@ from torchface.cli.render import render
 from torchface.cli.retarget import retarget
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
+from torchface.cli.track import track
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
 from torchface.errors import TorchfaceError
@@ -43,6 +44,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "transfer": transfer,
     "attach": attach,
     "solve": solve,
+    "track": track,
     "retarget": retarget,
     "evaluate": evaluate,
     "render": render,

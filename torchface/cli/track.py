@@ -1,0 +1,135 @@
+"""``torchface track``: a face in a video, or before a camera, as weights of the actor's rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as Remaining
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import console
+
+
+def track(
+    video: Annotated[Positional[Path | None], arg(metavar="VIDEO")] = None,
+    *,
+    rig: Path,
+    out: Path | None = None,
+    landmarks: str = "face_landmarks",
+    appearance: str | None = None,
+    prior: str | None = None,
+    dynamics: str | None = None,
+    camera: Path | None = None,
+    texture: Path | None = None,
+    face: int = 0,
+    whole_take: bool = False,
+    part: str | None = None,
+    no_overlay: bool = False,
+    live: str | None = None,
+    stream: str = "udp://127.0.0.1:11111",
+    seconds: float | None = None,
+    quiet: bool = False,
+) -> None:
+    """Track a face in a video and solve it for the weights of the actor's rig; no markers are needed.
+
+    Landmarks, the camera and where the head is, then weights. Writes into OUT: weights.csv by the rig's names,
+    live_link.csv for Unreal (head rotation included), landmarks.csv, animation.glb, overlay.mp4, summary.json and the
+    report index.html. Killed and started again, it goes on where it was; what depends on nothing that has changed is
+    kept.
+
+    With --live it does so from a webcam as the face moves, and sends each frame as Live Link Face does.
+
+    Args:
+        video: A file: .avi, .mkv, .webm, .mp4 or .mov, of one size and an even frame rate.
+        rig: The actor's own rig, with 68 annotated landmarks: .glb, or ICT-FaceKit's FaceXModel folder.
+        out: Folder for everything; needed but with --live, where curves are kept only if it is given.
+        landmarks: Model that finds the 68 landmarks, by name or folder; see `python -m train.landmarks`.
+        appearance: Model of the actor's own looks that refines them.
+        prior: What weights faces have, learned for the rig's shapes; see `python -m train.priors`.
+        dynamics: How weights go on from frame to frame, learned for the rig's shapes.
+        camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
+        texture: A picture to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
+        face: Which of several faces to follow, from 0, the largest first.
+        whole_take: Solve all frames at once: smooth curves, gaps bridged.
+        part: Keep this region of the rig only, such as face.
+        no_overlay: Draw no overlay video.
+        live: A camera's number, such as 0, or a video file that is played in its own time.
+        stream: Where --live sends to; Unreal listens on port 11111.
+        seconds: After which --live ends; until Ctrl-C if absent.
+        quiet: Show no progress.
+    """
+    from torchface.errors import ValueRangeError
+    from torchface.workflows.track import TrackSettings
+
+    if (video is None) == (live is None):
+        found = "neither" if video is None else "both"
+        raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
+    settings = TrackSettings(
+        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, not no_overlay
+    )
+    if live is not None:
+        _live(live, rig, stream, out, settings, seconds, quiet)
+        return
+    if out is None or video is None:
+        raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
+    _file(video, rig, out, settings, quiet)
+
+
+def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> None:
+    from torchface.workflows.track import TrackSettings, track_video
+    from torchface.workflows.track_page import write_track_page
+
+    assert isinstance(settings, TrackSettings)
+    with _bars(quiet) as progress:
+        tasks: dict[str, TaskID] = {}
+        first: dict[str, int] = {}
+
+        def told(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what], first[what] = progress.add_task(what, total=total, rate=""), done
+            elapsed = progress.tasks[tasks[what]].elapsed
+            rate = f"{(done - first[what]) / elapsed:.0f} frames a second" if elapsed else ""
+            progress.update(tasks[what], completed=done, total=total, rate=rate)
+
+        tracked = track_video(video, rig, out, settings, told)
+        report = progress.add_task("report", total=1, rate="")
+        page = write_track_page(tracked, out, settings.texture)
+        progress.update(report, completed=1)
+    for line in tracked.lines():
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    for path in (*tracked.products.values(), page):
+        print(path)
+
+
+def _live(
+    camera: str, rig: Path, address: str, out: Path | None, settings: object, seconds: float | None, quiet: bool
+) -> None:
+    from torchface.workflows.live_track import track_live
+    from torchface.workflows.track import TrackSettings
+
+    assert isinstance(settings, TrackSettings)
+    with _bars(quiet) as progress:
+        task = progress.add_task(f"sending to {address}", total=None, rate="")
+
+        def told(done: int, rate: float) -> None:
+            progress.update(task, completed=done, rate=f"{rate:.0f} frames a second")
+
+        report = track_live(camera, rig, address, out, settings, seconds, told)
+    for line in report.lines():
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if report.path is not None:
+        print(report.path)
+
+
+def _bars(quiet: bool) -> Progress:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        Remaining(),
+    )
+    return Progress(*columns, console=console, disable=quiet)

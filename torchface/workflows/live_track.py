@@ -1,0 +1,274 @@
+"""A face before a camera, solved frame by frame as it moves, and sent on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.video import VideoSolver
+from torchface.capture.video.pose import PoseTracker
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.geometry.calibration import CameraCalibration
+from torchface.geometry.distortion import undistort
+from torchface.io.live_link_stream import LiveLinkSender, parse_address
+from torchface.io.video import VideoFile, open_video
+from torchface.io.video_decoding import opencv
+from torchface.landmarks.tracking import LandmarkTracker
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.workflows.head_rotations import head_angles, rotation_columns
+from torchface.workflows.track import TrackSettings, camera_of, landmark_noise, load_actor
+from torchface.workflows.track_files import save_curves
+from torchface.workflows.track_models import TrackModels, load_track_models
+
+_FEWEST = 6
+_EYES = 6
+_USUAL_RATE = 30.0
+_PATIENCE = 5.0
+_DEFAULT = TrackSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One frame as it was solved.
+
+    Args:
+        weights: (N,).
+        rotation: of the head, rig to camera, (3,3).
+        landmarks: (68,2), pixels; NaN where the face is lost.
+    """
+
+    weights: Tensor
+    rotation: Tensor
+    landmarks: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class LiveReport:
+    """What was sent.
+
+    Args:
+        weights: (T,N).
+        found: frames with a face, (T,) bool.
+        latency: from a frame's arrival to its packet on the way, (T,), milliseconds.
+        dropped: frames that came while another was solved.
+        fps: frames a second, as they came.
+        path: of the curves, where they were kept.
+    """
+
+    weights: Tensor
+    found: Tensor
+    latency: Tensor
+    dropped: int
+    fps: float
+    path: Path | None = None
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        count = len(self.weights)
+        return [
+            f"{count} frames sent at {self.fps:.1f} a second, a face in {int(self.found.sum())}",
+            f"{float(self.latency.median()):.1f} ms from frame to packet (99th percentile "
+            f"{float(self.latency.quantile(0.99)):.1f} ms), {self.dropped} frames came too early and were left out",
+        ]
+
+
+class LiveSolver:
+    """Landmarks, pose and weights one frame at a time.
+
+    Args:
+        rig: the actor's, with its 68 landmarks.
+        models: what tracks and solves.
+        calibration: of the camera.
+        face: which of several, the largest first.
+    """
+
+    def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
+        self.names = rig.names
+        self._tracker = LandmarkTracker(models.trees, models.appearance, face=face)
+        self._calibration = calibration
+        self._models, self._rig = models, rig
+        self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
+        self._solver: VideoSolver | None = None
+
+    def step(self, frame: Tensor) -> LiveFrame:
+        """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0."""
+        seen = self._tracker.step(frame)
+        landmarks = undistort(seen.landmarks, self._calibration)
+        pose = self._poses.step(landmarks, seen.confidence)
+        enough = int(torch.isfinite(landmarks).all(1).sum()) >= _FEWEST
+        if self._solver is None and not enough:
+            return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
+        if self._solver is None:  # the first face tells how large it is, and so how noisy its landmarks are
+            noise = landmark_noise(landmarks[None], self._models)
+            rig, models = self._rig, self._models
+            self._solver = VideoSolver(rig, None, self._calibration.intrinsics, models.prior, models.dynamics, noise)
+            self._state = self._solver.start()
+        self._state = self._solver.step(
+            self._state, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
+        )
+        return LiveFrame(self._state.weights.detach(), self._state.rotation.detach(), seen.landmarks)
+
+
+def track_live(
+    camera: str,
+    rig: Path,
+    address: str,
+    out: Path | None = None,
+    settings: TrackSettings = _DEFAULT,
+    seconds: float | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> LiveReport:
+    """Solves what a camera sees and sends it in Live Link Face's packets, until it ends or is interrupted.
+
+    Args:
+        camera: a device's number, or a video file, which is played in its own time.
+        rig: the actor's.
+        address: ``udp://HOST:PORT``.
+        out: a folder for the curves of what was sent; none are kept without.
+        settings: models, calibration, face.
+        seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
+        progress: told how many frames are sent, and how many a second.
+
+    Raises:
+        ValueRangeError: the address is none, the rig lacks landmarks, or no frame came.
+        FileFormatError: the camera or the video cannot be opened.
+    """
+    parse_address(address)
+    actor = load_actor(rig, settings.part)
+    models = load_track_models(actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics)
+    source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
+    with source:
+        calibration = camera_of(source.film, settings.camera)
+        solver = LiveSolver(actor, models, calibration, settings.face)
+        rows: list[LiveFrame] = []
+        latency: list[float] = []
+        begin = time.perf_counter()
+        with LiveLinkSender(address, actor.names, source.film.fps) as sender:
+            try:
+                for came, frame in source.frames():
+                    solved = solver.step(frame)
+                    angles = head_angles(solved.rotation.double()).nan_to_num(0.0)
+                    sender.send(solved.weights, torch.cat([angles, angles.new_zeros(_EYES)]))
+                    now = time.perf_counter()
+                    latency.append(1000 * (now - came))
+                    rows.append(solved)
+                    if progress is not None:
+                        progress(len(rows), len(rows) / max(now - begin, 1e-9))
+                    if seconds is not None and now - begin >= seconds:
+                        break
+            except KeyboardInterrupt:  # how people end what has no end of its own
+                pass
+        took = time.perf_counter() - begin
+    if not rows:
+        raise ValueRangeError(f"camera {camera}: found no frame, expected at least one")
+    weights = torch.stack([row.weights for row in rows]).float()
+    found = torch.stack([torch.isfinite(row.landmarks).all(1).any() for row in rows])
+    path = None
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        turned = torch.stack([row.rotation for row in rows])
+        still = torch.where(torch.isfinite(turned), turned, torch.eye(3).to(turned) * turned.new_tensor([1.0, -1, -1]))
+        fps = source.film.fps
+        take = Take(fps, weights=Track(actor.names, weights[..., None]), extras={"columns": rotation_columns(still)})
+        path = save_curves(take, out)["weights"]
+    return LiveReport(weights, found, torch.tensor(latency), source.dropped, len(rows) / took, path)
+
+
+class PlayedVideo:
+    """A video file whose frames come in their own time, as a camera's would; those that come too early are dropped.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileFormatError: it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.film: VideoFile = open_video(path)
+        self.dropped = 0
+
+    def frames(self) -> Iterator[tuple[float, Tensor]]:
+        """When each frame was due, and the frame, uint8 (3,H,W)."""
+        begin = time.perf_counter()
+        for number, frame in enumerate(self.film.color_frames()):
+            due = begin + number / self.film.fps
+            early = due - time.perf_counter()
+            if early > 0:
+                time.sleep(early)
+            elif -early > 1 / self.film.fps:  # a camera would have shown the next one by now
+                self.dropped += 1
+                continue
+            yield due, frame
+
+    def __enter__(self) -> PlayedVideo:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        return None
+
+
+class Camera:
+    """A camera at this machine; a thread takes its frames, and the newest one is given.
+
+    Args:
+        number: of the device, from 0.
+
+    Raises:
+        FileFormatError: there is none, or it gives no picture.
+    """
+
+    def __init__(self, number: int) -> None:
+        cv2 = opencv()
+        self._capture = cv2.VideoCapture(number)
+        good, frame = self._capture.read() if self._capture.isOpened() else (False, None)
+        if not good or frame is None:
+            self._capture.release()
+            raise FileFormatError(f"camera {number}: cannot be opened, expected the number of a device, from 0")
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        height, width = frame.shape[:2]
+        self.film = VideoFile(Path(f"camera {number}"), rate if 1 <= rate <= 1000 else _USUAL_RATE, width, height, 1)
+        self.dropped = 0
+        self._newest: tuple[float, object] | None = None
+        self._change = threading.Condition()
+        self._open = True
+        self._thread = threading.Thread(target=self._take, daemon=True)
+        self._thread.start()
+
+    def frames(self) -> Iterator[tuple[float, Tensor]]:
+        """When each frame came, and the frame, uint8 (3,H,W); until the camera gives no more."""
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._newest is not None or not self._open, _PATIENCE)
+                newest, self._newest = self._newest, None
+            if newest is None:
+                return
+            came, frame = newest
+            pixels = torch.from_numpy(frame)  # type: ignore[arg-type]
+            yield came, pixels.flip(-1).permute(2, 0, 1).contiguous()
+
+    def _take(self) -> None:
+        while self._open:
+            good, frame = self._capture.read()
+            with self._change:
+                if not good:
+                    self._open = False
+                else:
+                    self.dropped += self._newest is not None
+                    self._newest = (time.perf_counter(), frame)
+                self._change.notify()
+
+    def __enter__(self) -> Camera:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open = False
+        self._thread.join(_PATIENCE)
+        self._capture.release()
