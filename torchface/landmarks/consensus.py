@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video_decoding import opencv
-from torchface.landmarks.ibug import box_around
+from torchface.landmarks.ibug import MIRROR_68
 from torchface.landmarks.trees import LandmarkTrees, similarity_to, start_shapes
 
 _AROUND = 0.6  # of the box's side that is shown to the trees on every side
 _OUTLYING = 0.02  # of the box's side: starts that end so far from the others count half
-_HALF = 0.02
+_HALF = 0.03
 _LARGEST_SIDE = 4096
 
 
@@ -26,7 +26,8 @@ class ConsensusSettings:
     """From where trees start.
 
     Args:
-        starts: how many, in pairs that mirror each other; their mean is steadier than any of them.
+        starts: how many, an even number; half of them on the mirrored picture. Their mean is steadier than any of
+            them, and knows no side.
         side: pixels a side that the box is given in the picture that the trees see.
         shift: standard deviation of the starts' place, of the box.
         zoom: standard deviation of the logarithm of their size.
@@ -42,9 +43,9 @@ class ConsensusSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.starts <= 4096 and 16 <= self.side <= 1024):
+        if not (2 <= self.starts <= 4096 and self.starts % 2 == 0 and 16 <= self.side <= 1024):
             raise ValueRangeError(
-                f"consensus: found {self.starts} starts, side {self.side}; expected 1 to 4096, 16 to 1024"
+                f"consensus: found {self.starts} starts, side {self.side}; expected 2 to 4096 and even, 16 to 1024"
             )
         if not all(0 <= value < 45 for value in (self.shift, self.zoom, self.turn)):
             raise ValueRangeError(f"consensus: found {self}, expected deviations from 0")
@@ -63,7 +64,7 @@ class Consensus(NamedTuple):
 
     @property
     def confidence(self) -> Tensor:
-        """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.02 of the box's side."""
+        """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.03 of the box's side."""
         return 1 / (1 + (self.spread / _HALF).square())
 
 
@@ -77,7 +78,7 @@ def consensus(
     :math:`d_{kl}` its distance from the starts' median.
 
     Args:
-        trees: what finds landmarks.
+        trees: find iBUG's 68.
         image: grey, uint8 (H,W).
         box: x, y, width, height of the face, (4,) pixels; it may reach out of the picture.
         tilt: of the face, radians, clockwise as the picture is seen.
@@ -90,6 +91,8 @@ def consensus(
     settings = settings or ConsensusSettings()
     if image.ndim != 2 or image.dtype != torch.uint8:
         raise ShapeError(f"image: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W)")
+    if len(trees.mean) != len(MIRROR_68):
+        raise ShapeError(f"trees: found a model of {len(trees.mean)} landmarks, expected iBUG's {len(MIRROR_68)}")
     if box.shape != (4,):
         raise ShapeError(f"box: found {tuple(box.shape)}, expected (4,)")
     side = math.sqrt(max(float(box[2] * box[3]), 0.0)) if bool(torch.isfinite(box).all()) else 0.0
@@ -99,7 +102,10 @@ def consensus(
     seen = torch.from_numpy(picture)[None, None].to(trees.mean) / 255
     middle = ((box[:2] + box[2:] / 2).to(trees.mean) + 0.5 - corner.to(trees.mean)) * scale.to(trees.mean) - 0.5
     starts = _starts(trees.mean, middle, settings, tilt)
-    found = trees.refine(seen.expand(len(starts), -1, -1, -1), starts)
+    pictures = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (seen, seen.flip(-1))])
+    last = seen.shape[-1] - 1
+    found = trees.refine(pictures, torch.cat([starts, _mirrored(starts, last)]))
+    found = torch.cat([found[: len(starts)], _mirrored(found[len(starts) :], last)])
     found = (found + 0.5) / scale.to(found) + corner.to(found) - 0.5
     median = found.median(0).values
     away = (found - median).norm(dim=-1, keepdim=True) / side
@@ -112,25 +118,6 @@ def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:
     """How far landmarks (L,2) are turned against the trees' mean shape, radians, clockwise as the picture is seen."""
     turn = similarity_to(trees.mean, landmarks[None].to(trees.mean))[0]
     return math.atan2(float(turn[1, 0]), float(turn[0, 0]))
-
-
-def refined(
-    trees: LandmarkTrees, image: Tensor, box: Tensor, tilt: float = 0.0, settings: ConsensusSettings | None = None,
-    turns: int = 2,
-) -> Consensus:  # fmt: skip
-    """As :func:`consensus`, then again from the box round what was found: for boxes that fit loosely.
-
-    Args:
-        trees, image, box, tilt, settings: as there; the trees find iBUG's 68.
-        turns: how often in all.
-    """
-    found = consensus(trees, image, box, tilt, settings)
-    for _ in range(turns - 1):  # each starts where the one before ended
-        again = box_around(found.landmarks)
-        if not bool(torch.isfinite(again).all()) or not 1 <= float(again[2]) <= _LARGEST_SIDE:
-            break
-        found = consensus(trees, image, again, tilt_of(trees, found.landmarks), settings)
-    return found
 
 
 def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.ndarray, Tensor, Tensor]:
@@ -155,12 +142,9 @@ def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.nd
 
 
 def _starts(mean: Tensor, middle: Tensor, settings: ConsensusSettings, tilt: float) -> Tensor:
-    """The mean shape (L,2) round a middle (2,), moved, turned and scaled: (K,L,2)."""
-    half = torch.randn((settings.starts + 1) // 2, 4, generator=torch.Generator().manual_seed(settings.seed))
-    drawn = half.clamp(-2, 2).to(mean)
-    drawn = torch.cat([drawn, -drawn])[: settings.starts]
-    if settings.starts == 1:
-        drawn = torch.zeros_like(drawn)
+    """The mean shape (L,2) round a middle (2,), moved, turned and scaled: (K/2,L,2)."""
+    drawn = torch.randn(settings.starts // 2, 4, generator=torch.Generator().manual_seed(settings.seed)).clamp(-2, 2)
+    drawn = (drawn - drawn.mean(0)).to(mean)
     angle = tilt + math.radians(settings.turn) * drawn[:, 3]
     zoom = (settings.zoom * drawn[:, 2]).exp()
     turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * zoom[:, None, None]
@@ -169,3 +153,10 @@ def _starts(mean: Tensor, middle: Tensor, settings: ConsensusSettings, tilt: flo
     shape = start_shapes(mean, square)[0]
     centre = shape.mean(0)
     return centre + (shape - centre) @ turn.transpose(1, 2) + (settings.shift * side * drawn[:, :2])[:, None]
+
+
+def _mirrored(shapes: Tensor, last: int) -> Tensor:
+    """Shapes (K,L,2) in the mirrored picture, whose last column is ``last``."""
+    across = shapes[:, list(MIRROR_68)].clone()
+    across[..., 0] = last - across[..., 0]
+    return across
