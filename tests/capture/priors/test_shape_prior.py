@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, multivariate_t
 from sklearn.cluster import estimate_bandwidth
 from sklearn.mixture import GaussianMixture as TheirMixture
 from torch import Tensor
@@ -15,6 +17,7 @@ from torchface.capture.priors import (
     ParzenDensity,
     ReciprocalPrior,
     ShapePrior,
+    StudentDensity,
     automatic_bandwidth,
     face_halves,
 )
@@ -54,13 +57,31 @@ def test_the_bandwidth_is_scikit_learns() -> None:
     assert automatic_bandwidth(x) == pytest.approx(estimate_bandwidth(x.numpy()), rel=0.02)
 
 
-@pytest.fixture(params=["parzen", "mixture"])
-def density(request: pytest.FixtureRequest) -> ParzenDensity | GaussianMixture:
+def test_heavy_tails_are_scipys() -> None:
+    generator = torch.Generator().manual_seed(2)
+    shape = torch.tensor([[0.04, 0.03, 0.0], [0.03, 0.05, 0.01], [0.0, 0.01, 0.02]], dtype=torch.float64)
+    true = multivariate_t(shape=shape.numpy(), df=5.0, seed=1)
+    x = torch.from_numpy(true.rvs(20_000))
+    density = StudentDensity.fit(x, freedom=5.0, floor=1e-9)
+    found = torch.linalg.inv(density.factor.double() @ density.factor.double().T)
+    torch.testing.assert_close(found, shape, rtol=0.05, atol=1e-3)
+    ours = density.double().log_density(x[:50])
+    theirs = multivariate_t(shape=found.numpy(), df=5.0).logpdf(x[:50].numpy())
+    np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-3)
+    far = torch.randn(1, 3, generator=generator, dtype=torch.float64) * 10
+    pulls = [(density.bound(y)[0] @ y[0]).norm() for y in (far, 2 * far)]
+    assert pulls[1] < 0.7 * pulls[0]  # a Gaussian's would double
+
+
+@pytest.fixture(params=["parzen", "mixture", "student"])
+def density(request: pytest.FixtureRequest) -> ParzenDensity | GaussianMixture | StudentDensity:
     x = clusters()
+    if request.param == "student":
+        return StudentDensity.fit(x, freedom=4.0)
     return ParzenDensity.fit(x) if request.param == "parzen" else GaussianMixture.fit(x, 3)
 
 
-def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture) -> None:
+def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture | StudentDensity) -> None:
     density = density.double()
     at = clusters(5, seed=3).requires_grad_()
     (slope,) = torch.autograd.grad(-density.log_density(at).sum(), at)
@@ -77,7 +98,7 @@ def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture) ->
 
 def test_halves_are_independent() -> None:
     takes = [clusters(200, seed=i) for i in range(3)]
-    prior = ShapePrior.fit(takes, NAMES).double()
+    prior = ShapePrior.fit_mixtures(takes, NAMES).double()
     assert prior.groups == face_halves(NAMES) == ((0, 1), (2, 3, 4))
     here = takes[0][:4]
     there = here.clone()
@@ -87,8 +108,9 @@ def test_halves_are_independent() -> None:
     assert not energy.H[:, :2, 2:].any()
 
 
-def test_a_solve_with_the_prior_never_gets_worse() -> None:
-    prior = ShapePrior.fit([clusters(200, seed=i) for i in range(3)], NAMES).double()
+@pytest.mark.parametrize("fit", [ShapePrior.fit, ShapePrior.fit_mixtures])
+def test_a_solve_with_the_prior_never_gets_worse(fit: Callable[..., ShapePrior]) -> None:
+    prior = fit([clusters(200, seed=i) for i in range(3)], NAMES).double()
     w = torch.rand(20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     before = prior.log_density(w)
     for _ in range(10):
@@ -109,10 +131,10 @@ def test_the_papers_form_is_flat_near_the_data_and_guarded_far_from_it() -> None
     assert bool(torch.isfinite(prior.energy(torch.full((1, 5), 30.0, dtype=torch.float64)).H).all())
 
 
-@pytest.mark.parametrize("kind", [ShapePrior, ReciprocalPrior])
-def test_config_and_state_rebuild_it(kind: type[ShapePrior]) -> None:
-    prior = kind.fit([clusters(100), clusters(100, seed=1)], NAMES)
-    other = kind.from_config(prior.config)
+@pytest.mark.parametrize("fit", [ShapePrior.fit, ShapePrior.fit_mixtures, ReciprocalPrior.fit])
+def test_config_and_state_rebuild_it(fit: Callable[..., ShapePrior]) -> None:
+    prior = fit([clusters(100), clusters(100, seed=1)], NAMES)
+    other = type(prior).from_config(prior.config)
     other.load_state_dict(prior.state_dict())
     w = clusters(4, seed=2).float()
     assert torch.equal(other.log_density(w), prior.log_density(w))
@@ -128,7 +150,7 @@ def test_bad_input() -> None:
         ShapePrior.fit([torch.full((5, 5), torch.nan)], NAMES)
     with pytest.raises(ValueRangeError, match="all samples the same"):
         ParzenDensity.fit(torch.ones(9, 2))
-    with pytest.raises(FileFormatError, match="expected one of parzen, mixture"):
+    with pytest.raises(FileFormatError, match="expected one of parzen, mixture, student"):
         ShapePrior.from_config({"names": ["a"], "groups": [[0]], "densities": [{"kind": "os.system"}], "strength": 1.0})
     with pytest.raises(FileFormatError, match="at most"):
         GaussianMixture.from_config({"components": 10**6, "dimensions": 10**5})

@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.silhouette import level_curves, outermost
+from torchface.geometry.silhouette import LevelCurves, level_curves, outermost
 from torchface.rig import BlendshapeRig
 
 LANDMARKS = 68
 JAW = 17
 """How many of the 68 landmarks trace the face's contour; they come first."""
+
+_SPACING = 3.0  # millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class FacePoints:
         wing, top, bottom = float(x[marks[[31, 35]]].max()), float(y[marks[27]]), float(y[marks[33]])
         nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
         faces = rig.neutral.faces
-        curves = level_curves(rig.vertices, faces[~nose[faces].any(1)], marks[:JAW])
+        curves = _thinned(level_curves(rig.vertices, faces[~nose[faces].any(1)], marks[:JAW]), rig.vertices)
         used, place = torch.cat([marks.cpu(), curves.vertices.flatten()]).unique(return_inverse=True)
         values = stacked[:, used.to(marks.device)].double().cpu().transpose(0, 1)
         local = replace(curves, vertices=place[LANDMARKS:].reshape(curves.vertices.shape))
@@ -114,3 +116,22 @@ class FacePoints:
         best = outermost(pixels, self.valid, across[:, None] * self.side[:, None])
         slid = self.rows[torch.arange(JAW, device=weights.device), best]
         return torch.cat([torch.where(best > 0, slid, rows[:, :JAW]), rows[:, JAW:]], dim=1)
+
+
+def _thinned(curves: LevelCurves, vertices: Tensor) -> LevelCurves:
+    """The curves with points no closer than a few millimetres; round as a face is, its edge moves by hundredths."""
+    points = curves.interpolate(vertices.detach().double().cpu())
+    kept = torch.zeros_like(curves.valid)
+    for i, (line, valid) in enumerate(zip(points, curves.valid, strict=True)):  # curves are few, of own lengths
+        rows = valid.nonzero()[1:, 0]
+        order = rows[(line[rows] - line[0]).norm(dim=-1).argsort()]
+        cells = ((line[order] - line[0]).norm(dim=-1) / _SPACING).long()
+        first = torch.ones_like(cells, dtype=torch.bool)
+        first[1:] = cells[1:] != cells[:-1]
+        kept[i, order[first]] = True
+    kept[:, 0] = True
+    count = int(kept.sum(1).max())
+    # Stable, so that the start stays first.
+    place = kept.long().argsort(dim=1, descending=True, stable=True)[:, :count]
+    ends = curves.vertices.gather(1, place[..., None].expand(-1, -1, 2))
+    return LevelCurves(ends, curves.share.gather(1, place), kept.gather(1, place), curves.side)
