@@ -31,14 +31,17 @@ class PoseFilterSettings:
         moving: the same of the translation, millimetres a frame².
         fading: what is left of an acceleration after a frame; 1 is constant acceleration. Heads turn back soon, so
             that a little less foretells better and does not run away in gaps.
+        calm: share of each motion's credit that goes to the next calmer one: what is most likely still jitters more
+            than eyes forgive, and a little calmer is hardly less exact.
         memory: frames after which a forecast counts 1/e.
         longest_gap: frames without a pose that are bridged by prediction; then the head counts as lost.
     """
 
-    noise: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    noise: tuple[float, ...] = (0.2, 0.6, 1.5, 4.0)
     turning: tuple[float, ...] = (1e-5, 3.3e-5, 1.1e-4, 3.6e-4, 1.2e-3, 4e-3)
     moving: tuple[float, ...] = (1e-3, 3.3e-3, 0.011, 0.036, 0.12, 0.4)
     fading: float = 0.92
+    calm: float = 0.3
     memory: float = 30.0
     longest_gap: int = 10
 
@@ -47,10 +50,10 @@ class PoseFilterSettings:
             values = getattr(self, name)
             if not values or not all(0 < value < float("inf") for value in values):
                 raise ValueRangeError(f"{name}: found {values}, expected positive deviations, one at least")
-        if self.longest_gap < 0 or not self.memory > 0 or not 0 <= self.fading <= 1:
+        if self.longest_gap < 0 or not self.memory > 0 or not (0 <= self.fading <= 1 and 0 <= self.calm <= 1):
             raise ValueRangeError(
-                f"pose filter: found longest_gap {self.longest_gap}, memory {self.memory} and fading {self.fading}, "
-                "expected a gap from 0, positive frames and 0 to 1"
+                f"pose filter: found longest_gap {self.longest_gap}, memory {self.memory}, fading {self.fading} and calm "
+                f"{self.calm}, expected a gap from 0, positive frames, 0 to 1 and 0 to 1"
             )
 
 
@@ -164,10 +167,21 @@ class PoseFilter:
         """Rotation (3,3) and translation (3,) as all models together have it; NaN where the head is lost."""
         if self.belief is None:
             return torch.full((3, 3), torch.nan, dtype=torch.float64), torch.full((3,), torch.nan, dtype=torch.float64)
-        share = torch.softmax(self.scores, dim=0)
+        share = self._shares()
         best = self.belief.rotation[int(share.argmax())]
         turns = rotation_vector(self.belief.rotation @ best.T)
         return rotation_matrix(share @ turns) @ best, share @ self.belief.place
+
+    def _shares(self) -> Tensor:
+        """How much each model counts, (M,)."""
+        settings = self.settings
+        likely = torch.softmax(self.scores, dim=0).reshape(len(settings.noise), len(settings.turning), -1)
+        calmer = likely
+        for axis in (1, 2):  # turning, then moving
+            first, rest = calmer.narrow(axis, 0, 1), calmer.narrow(axis, 1, calmer.shape[axis] - 1)
+            calmer = torch.cat([rest, torch.zeros_like(first)], dim=axis)
+            calmer.narrow(axis, 0, 1).add_(first)
+        return torch.lerp(likely, calmer, settings.calm).flatten()
 
     def _begin(self, rotation: Tensor, translation: Tensor, noise: Tensor) -> None:
         models = len(noise)
