@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import torchface
 from torchface.capture.video import VideoSolution, VideoSolver
 from torchface.capture.video.pose import HeadPoses, measure_poses, smooth_poses, track_pose
 from torchface.errors import AlignmentError, ValueRangeError
@@ -35,7 +36,7 @@ PIECE = 64
 Progress = Callable[[str, int, int], None]
 """Told what is being done, how many frames of it are done, and of how many."""
 
-_VERSION = "1"
+_VERSION = torchface.__version__  # another one may track and solve differently
 _NOISE, _NOISE_REFINED = 0.025, 0.015  # of the eyes' distance: what models of landmarks are measured to be off
 _LEAST_NOISE = 0.5
 
