@@ -98,7 +98,7 @@ def test_bounds_touch_and_lie_above(density: ParzenDensity | GaussianMixture | S
 
 def test_halves_are_independent() -> None:
     takes = [clusters(200, seed=i) for i in range(3)]
-    prior = ShapePrior.fit_mixtures(takes, NAMES).double()
+    prior = ShapePrior.fit(takes, NAMES, face_halves(NAMES)).double()
     assert prior.groups == face_halves(NAMES) == ((0, 1), (2, 3, 4))
     here = takes[0][:4]
     there = here.clone()
@@ -110,7 +110,7 @@ def test_halves_are_independent() -> None:
 
 @pytest.mark.parametrize("fit", [ShapePrior.fit, ShapePrior.fit_mixtures])
 def test_a_solve_with_the_prior_never_gets_worse(fit: Callable[..., ShapePrior]) -> None:
-    prior = fit([clusters(200, seed=i) for i in range(3)], NAMES).double()
+    prior = fit([clusters(60, seed=i) for i in range(2)], NAMES).double()
     w = torch.rand(20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     before = prior.log_density(w)
     for _ in range(10):
@@ -133,7 +133,7 @@ def test_the_papers_form_is_flat_near_the_data_and_guarded_far_from_it() -> None
 
 @pytest.mark.parametrize("fit", [ShapePrior.fit, ShapePrior.fit_mixtures, ReciprocalPrior.fit])
 def test_config_and_state_rebuild_it(fit: Callable[..., ShapePrior]) -> None:
-    prior = fit([clusters(100), clusters(100, seed=1)], NAMES)
+    prior = fit([clusters(40), clusters(40, seed=1)], NAMES)
     other = type(prior).from_config(prior.config)
     other.load_state_dict(prior.state_dict())
     w = clusters(4, seed=2).float()

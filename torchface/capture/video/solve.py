@@ -334,13 +334,17 @@ class VideoSolver(nn.Module):
         if belief is None or self.dynamics is None:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
             return Expectation(mean, self._loose[None])
-        if state.window.shape[1] < self.dynamics.window:
+        return self.predicted(state, belief).expectation()
+
+    def predicted(self, state: VideoState, belief: Belief) -> Belief:
+        """What a frame's belief leads to in the next."""
+        if self.dynamics is None or state.window.shape[1] < self.dynamics.window:
             steps = torch.zeros_like(belief.mean.weights)
             variance = torch.full_like(steps, _LOOSE_STEP**2)
         else:
             mean, variance = self.dynamics(state.window.to(self.dynamics.center.dtype))
             steps, variance = mean.double() - state.window[:, -1], variance.double() / self.dynamics_strength
-        return belief.predicted(steps, variance, self._motion).expectation()
+        return belief.predicted(steps, variance, self._motion)
 
     def solve(self, terms: FrameTerms, start: HeadState) -> HeadState:
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
