@@ -7,8 +7,11 @@ A folder of iBUG's kind holds pictures with a ``.pts`` beside each; a dlib ``.xm
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -22,11 +25,12 @@ from torchface.io.landmarks import load_landmark_points
 from torchface.io.landmarks_dlib import load_dlib_faces
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.ibug import box_around, relative_errors
-from torchface.synthetic.face_pictures import PictureSettings, face_pictures
+from torchface.synthetic.face_pictures import FacePicture, PictureSettings, face_pictures
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _LUMA = torch.tensor([0.299, 0.587, 0.114])
 _LARGEST_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
+_PART = 60  # pictures that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
 
 
@@ -41,6 +45,7 @@ class Settings:
         held_out: Faces of the data, the last ones, or rendered pictures of other people, that are kept for the test.
         seed: Draws people, poses and lights.
         licence: Under which the model may be used.
+        workers: Processes that render.
         trees: How trees are grown.
         pictures: What is rendered how widely.
     """
@@ -51,6 +56,7 @@ class Settings:
     held_out: int = 0
     seed: int = 1
     licence: str = "MIT"
+    workers: int = 1
     trees: TreeSettings = field(default_factory=TreeSettings)
     pictures: PictureSettings = field(default_factory=PictureSettings)
 
@@ -116,9 +122,10 @@ def split(settings: Settings, say: Callable[[str], None] | None = None) -> tuple
         raise TorchfaceError(f"data: found {len(real)} faces, expected more than the {kept} held out")
     learn, test = real[: len(real) - kept], real[len(real) - kept :]
     if settings.performers:
-        learn = learn + rendered_faces(settings.performers, settings.seed, settings.pictures, say)
+        learn = learn + rendered_faces(settings.performers, settings.seed, settings.pictures, say, settings.workers)
         if not settings.data:
-            test = rendered_faces(settings.held_out, settings.seed + 1_000_000, settings.pictures, say)
+            seed = settings.seed + 1_000_000
+            test = rendered_faces(settings.held_out, seed, settings.pictures, say, settings.workers)
     return learn, test
 
 
@@ -134,11 +141,11 @@ def load_faces(path: Path) -> Faces:
             if face.points.shape == (68, 2) and bool(torch.isfinite(face.points).all()):
                 found.append((_beside(path, face.image), face.points))
     elif path.is_dir():
-        for points in sorted(path.rglob("*.pts")):
-            pictures = [points.with_suffix(ending) for ending in _ENDINGS if points.with_suffix(ending).is_file()]
+        for file in sorted(path.rglob("*.pts")):
+            pictures = [file.with_suffix(ending) for ending in _ENDINGS if file.with_suffix(ending).is_file()]
             if not pictures:
-                raise FileFormatError(f"{points}: found no picture of the same name, expected one beside it")
-            found.append((pictures[0], load_landmark_points(points).ibug()))
+                raise FileFormatError(f"{file}: found no picture of the same name, expected one beside it")
+            found.append((pictures[0], load_landmark_points(file).ibug()))
     else:
         raise FileFormatError(f"{path}: found no folder and no .xml, expected iBUG's .pts files or dlib's XML")
     if not found:
@@ -153,11 +160,26 @@ def load_faces(path: Path) -> Faces:
 
 
 def rendered_faces(
-    count: int, seed: int, settings: PictureSettings | None = None, say: Callable[[str], None] | None = None
+    count: int,
+    seed: int,
+    settings: PictureSettings | None = None,
+    say: Callable[[str], None] | None = None,
+    workers: int = 1,
 ) -> Faces:
-    """Pictures of made-up people."""
-    progress = None if say is None else _every(100, "pictures", say)
-    pictures = list(face_pictures(count, seed, settings, progress))
+    """Pictures of made-up people; how many processes render them does not change them."""
+    parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]
+    progress = None if say is None else _every(1, f"parts of {_PART} pictures", say)
+    pictures: list[FacePicture] = []
+    with ExitStack() as stack:
+        rendered: Iterable[list[FacePicture]] = map(_rendered_part, parts)
+        if workers > 1:
+            # Spawned: what a process inherits of torch's threads may not survive a fork.
+            pool = ProcessPoolExecutor(workers, get_context("spawn"))
+            rendered = stack.enter_context(pool).map(_rendered_part, parts)
+        for number, part in enumerate(rendered):
+            pictures += part
+            if progress is not None:
+                progress(number + 1, len(parts))
     if not pictures:
         return NO_FACES
     return Faces(
@@ -165,6 +187,11 @@ def rendered_faces(
         torch.stack([picture.box for picture in pictures]),
         torch.stack([picture.landmarks for picture in pictures]),
     )
+
+
+def _rendered_part(part: tuple[int, PictureSettings | None, int, int]) -> list[FacePicture]:
+    seed, settings, first, count = part
+    return list(face_pictures(count, seed, settings, first=first))
 
 
 def evaluate(model: LandmarkTrees, faces: Faces) -> Tensor:

@@ -151,6 +151,6 @@ def test_time_of_a_full_model(tmp_path: Path) -> None:
         image = torch.randint(256, (480, 640), dtype=torch.uint8, generator=generator).numpy()
         inputs = {"image": image, "boxes": np.array([[200, 120, 180, 180]], np.float32)}
         spent = cpu_milliseconds(lambda _, session=session, inputs=inputs: session.run(None, inputs), 500)
-        print(f"\n10 cascades of 500 trees, depth 5, leaves on {components} components: {spent:.2f} ms a face (median), "
-              f"{report.size / 1e6:.1f} MB")  # fmt: skip
+        print(f"\n10 cascades of 500 trees, depth 5, leaves on {components} components: {spent:.2f} ms a face "
+              f"(median), {report.size / 1e6:.1f} MB")  # fmt: skip
         assert spent <= 1.5

@@ -190,7 +190,7 @@ def test_a_killed_training_goes_on_to_the_same_result(learned: LandmarkTrees, tm
     with pytest.raises(FileFormatError, match="other pictures or settings"):
         LandmarkTrees.fit(*blobs(60, 5), FEW, checkpoint=path)
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(FileFormatError, match="trees.safetensors"):
+    with pytest.raises(FileFormatError, match=r"trees\.safetensors"):
         LandmarkTrees.fit(*data, FEW, checkpoint=path)
 
 
@@ -255,7 +255,7 @@ def test_bad_input_is_named(learned: LandmarkTrees) -> None:
     images, boxes, points = blobs(3, 0)
     with pytest.raises(ShapeError, match="2 images"):
         LandmarkTrees.fit(images[:2], boxes, points, FEW)
-    with pytest.raises(ShapeError, match="image 1: found torch.float32"):
+    with pytest.raises(ShapeError, match=r"image 1: found torch\.float32"):
         LandmarkTrees.fit([images[0], images[1].float(), images[2]], boxes, points, FEW)
     with pytest.raises(ValueRangeError, match="box 2"):
         LandmarkTrees.fit(images, boxes * torch.tensor([[1.0], [1], [-1]]), points, FEW)
@@ -307,7 +307,7 @@ def test_the_shipped_model_finds_made_up_faces() -> None:
 
 @pytest.mark.real
 def test_the_shipped_model_finds_real_faces(data: Path) -> None:
-    """18 faces of four photographs and one more; boxes of their landmarks, and of the Haar cascade where it has them."""
+    """18 faces of four photographs, and one more; boxes of their landmarks, and of the Haar cascade if it has any."""
     model = zoo.get_model("face_landmarks")
     folder = data / "images" / "dlib_faces"
     faces = [
@@ -326,7 +326,8 @@ def test_the_shipped_model_finds_real_faces(data: Path) -> None:
         if len(seen) and away.min() < 0.25:
             detected.append(relative_errors(model(image, seen[away.argmin()][None]), truth))
     print(
-        f"\nreal faces: {100 * torch.cat(given).mean():.1f} %, from detected boxes {100 * torch.cat(detected).mean():.1f}"
+        f"\nreal faces: {100 * torch.cat(given).mean():.1f} %, "
+        f"from detected boxes {100 * torch.cat(detected).mean():.1f} %"
     )
     assert len(detected) >= 14
     assert torch.cat(given).median() < 0.09

@@ -42,7 +42,7 @@ class TreeSettings:
         shift: standard deviation of the starts' place, of the box.
         zoom: standard deviation of the logarithm of the starts' size.
         turn: standard deviation of the starts' tilt, degrees.
-        gamma: standard deviation of the logarithm of the exponent by which a start's pictures are made lighter or darker.
+        gamma: standard deviation of the logarithm of the exponent that makes a start's picture lighter or darker.
         noise: added to the grey values, standard deviation, in [0,1].
         seed: of everything drawn.
     """
@@ -68,7 +68,7 @@ class TreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Starts: which picture (N,), mirrored or not (N,), gamma (N,), where it should end (N,L,2), all pictures' pixels."""
+    """Starts: which picture (N,), mirrored or not (N,), gamma (N,), where to end (N,L,2); all pictures' pixels."""
 
     picture: Tensor
     flipped: Tensor
@@ -248,7 +248,7 @@ def _grow_cascade(
         grey[:, rows] = (read / read.std(1, correction=0, keepdim=True).clamp(min=FAINTEST)).T
     missing = torch.nan_to_num(samples.targets - shapes) @ torch.linalg.inv(turn).transpose(1, 2)
     missing = missing.flatten(1)
-    spread, axes = torch.linalg.eigh((missing.T @ missing).double())
+    _, axes = torch.linalg.eigh((missing.T @ missing).double())
     basis = axes.flip(1)[:, : model.sizes["components"]].T.float().half().float()
     model.bases[cascade] = basis
     residual = missing @ torch.linalg.pinv(basis.double()).float()

@@ -1,4 +1,4 @@
-"""What stands behind a face in a picture, and what a camera does to the picture: structure, blur, noise, compression."""
+"""What stands behind a face in a picture, and what a camera does to it: structure, blur, noise, compression."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class PictureSettings:
     pitch: float = 9.0
     roll: float = 9.0
     smallest: int = 90
-    largest: int = 240
+    largest: int = 280
     each: int = 3
     spread: float = 1.3
 
@@ -89,6 +89,7 @@ def face_pictures(
     seed: int,
     settings: PictureSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
+    first: int = 0,
 ) -> Iterator[FacePicture]:
     """Draws people, poses, expressions, lights and backgrounds, one picture at a time.
 
@@ -97,16 +98,18 @@ def face_pictures(
         seed: decides them; a picture does not depend on how many are asked for.
         settings: what is drawn how widely.
         progress: is told how many are done, and of how many.
+        first: number of the first picture; several calls make what one would.
     """
     settings = settings or PictureSettings()
     someone = None
-    for number in range(count):  # each has a surface of its own
-        generator = torch.Generator().manual_seed(1_000_003 * seed + number)
+    for number in range(first, first + count):  # each has a surface of its own
         if someone is None or number % settings.each == 0:
-            someone = _draw_person(settings, generator)
+            person = torch.Generator().manual_seed(1_000_003 * seed + 500_000_000_000 + number // settings.each)
+            someone = _draw_person(settings, person)
+        generator = torch.Generator().manual_seed(1_000_003 * seed + number)
         yield replace(_picture(someone, settings, generator), person=number // settings.each)
         if progress is not None:
-            progress(number + 1, count)
+            progress(number + 1 - first, count)
 
 
 def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Person:
@@ -137,7 +140,7 @@ def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Pers
     )
     return _Person(
         rig, hairdo, hair, hair_grey, texture, tint, (uniform(0.5, 2.2, generator), uniform(0.7, 1.1, generator)),
-        uniform(0.55, 0.95, generator), uniform(0.03, 0.9, generator), glasses,
+        uniform(0.7, 1.5, generator), uniform(0.03, 0.9, generator), glasses,
     )  # fmt: skip
 
 
@@ -166,16 +169,19 @@ def _draw_weights(names: tuple[str, ...], generator: torch.Generator) -> Tensor:
             table[name] = max(table[name], weight)
 
     gestures = list(GESTURES.values())
-    smile = uniform(0, 1, generator) < 0.35
+    smile = uniform(0, 1, generator) < 0.45
     for _ in range(int(uniform(0, 2.6, generator))):
         strength = uniform(0.2, 1.0, generator)
         kind = gestures[0] if smile else gestures[int(uniform(0, len(gestures), generator))]
         for name, weight in kind.items():
             add(name, strength * weight)
-    if smile and uniform(0, 1, generator) < 0.7:  # a smile with teeth
+    if smile and uniform(0, 1, generator) < 0.75:  # a smile with teeth
+        up, down, wide = uniform(0.15, 0.7, generator), uniform(0.1, 0.7, generator), uniform(0.0, 0.6, generator)
         for side in ("Left", "Right"):
-            add(f"mouthUpperUp{side}", uniform(0.2, 0.7, generator))
-            add(f"mouthLowerDown{side}", uniform(0.1, 0.6, generator))
+            add(f"mouthSmile{side}", uniform(0.4, 1.0, generator))
+            add(f"mouthUpperUp{side}", up)
+            add(f"mouthLowerDown{side}", down)
+            add(f"mouthStretch{side}", wide)
     for _ in range(int(uniform(0, 5, generator))):
         add(names[int(uniform(0, len(names), generator))], uniform(0, 0.7, generator))
     if uniform(0, 1, generator) < 0.4:

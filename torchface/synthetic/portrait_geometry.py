@@ -13,10 +13,9 @@ from torch import Tensor
 from torchface.geometry.operators import vertex_normals
 from torchface.synthetic.annotations import head_annotations
 from torchface.synthetic.identity import mean_vertices, ramp
-from torchface.synthetic.topology import topology
 
-_TEETH_DEEP = 5.0  # behind the lips, millimetres
-# The upper edge of the left brow from its inner end, where annotators put the landmarks; the head's own lie in its middle.
+_TEETH_DEEP = 3.5  # behind the lips, millimetres
+# The left brow's upper edge from its inner end: annotators mark it there, the head's own landmarks lie in its middle.
 _BROW_EDGE = ((10.0, 20.5, 92.0), (20.0, 24.0, 90.0), (31.0, 26.0, 87.0), (42.0, 24.5, 79.0), (51.5, 18.0, 67.0))
 
 
@@ -94,6 +93,12 @@ def hair_share(hairline: float) -> Tensor:
     return ramp(y - edge, -5.0, 7.0) * ~ear
 
 
+def _marks() -> Tensor:
+    marks = head_annotations().landmarks
+    assert marks is not None
+    return marks
+
+
 def _lumps(points: Tensor, generator: torch.Generator, waves: int = 12) -> Tensor:
     """A smooth random field of about unit size, (N,), of 20 to 70 mm."""
     heading = torch.nn.functional.normalize(torch.randn(waves, 3, generator=generator).double(), dim=-1)
@@ -130,7 +135,7 @@ def _curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[
 
 def _teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
     """The upper row, which stays with the skull, and the lower, which goes with the chin."""
-    marks = head_annotations().landmarks
+    marks = _marks()
     rest_points, moved_points = rest[marks], moved[marks]
     middle = rest_points[[62, 66]].mean(0)
     half = 0.42 * float((rest_points[54] - rest_points[48]).norm())
@@ -150,10 +155,9 @@ def _shoulders(rest: Tensor) -> tuple[Tensor, Tensor]:
     rows, columns = 14, 40
     turn = torch.linspace(0, 2 * math.pi, columns).double()
     up = torch.linspace(0.05, math.pi / 2, rows).double()[:, None]
-    chin = float(rest[head_annotations().landmarks[8], 1])
-    points = torch.stack([
-        215 * up.sin() * turn.sin(), chin - 175 + 125 * up.cos().expand(rows, columns), -25 + 110 * up.sin() * turn.cos()
-    ], -1)  # fmt: skip
+    chin = float(rest[_marks()[8], 1])
+    height = (chin - 175 + 125 * up.cos()).expand(rows, columns)
+    points = torch.stack([215 * up.sin() * turn.sin(), height, -25 + 110 * up.sin() * turn.cos()], -1)
     return points.view(-1, 3), _grid_faces(rows, columns)
 
 
@@ -163,7 +167,7 @@ def _contour_lines() -> tuple[Tensor, ...]:
 
     They lie in the plane through the landmark that holds the viewing axis and the line to the face's middle.
     """
-    p, marks, regions = mean_vertices(), head_annotations().landmarks, head_annotations().regions
+    p, marks, regions = mean_vertices(), _marks(), head_annotations().regions
     hidden = ("mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right", "ear_left", "ear_right")
     skin = ~torch.stack([regions[name] for name in hidden]).any(0)
     lines = []
@@ -176,7 +180,6 @@ def _contour_lines() -> tuple[Tensor, ...]:
         aside = (p[:, 0] - middle[0]) * ray[1] / length - (p[:, 1] - middle[1]) * ray[0] / length
         near = skin & (aside.abs() < 3.5) & (along > 0.45 * length) & (p[:, 2] > end[2]) & (along < 1.05 * length)
         lines.append(torch.cat([marks[row : row + 1], near.nonzero()[:, 0]]))
-    assert len(topology().mirror) == len(p)
     return tuple(lines)
 
 
@@ -198,7 +201,7 @@ def annotated_landmarks(pixels: Tensor) -> Tensor:
     Args:
         pixels: where a camera sees the head's vertices, (V,2).
     """
-    marks = head_annotations().landmarks
+    marks = _marks()
     seen = pixels[marks].clone()
     rows, weights = _brow_edge()
     seen[17:27] = (pixels[rows] * weights[..., None].to(pixels)).sum(1)
