@@ -53,9 +53,10 @@ class DynamicsPrior(nn.Module):
 
     .. math:: w_{n+1} = w_n + A x + s \, f_g(x) + \varepsilon(x), \qquad f_g \sim GP(0, k_g)
 
-    for a window x of the last J frames. Each shape goes on by its own last steps (A is diagonal in the shapes, and 0 for
-    a window that rests); the processes, one for each group of shapes, add what depends on the other shapes of the group and on the pose; the
-    noise grows with how much the window moves. The mean stays within the range of weights.
+    for a window x of the last J frames. Each shape goes on by its own last steps (A is diagonal in the shapes, and a
+    window that rests goes on resting); the processes, one for each group of shapes, add what depends on the other
+    shapes of the group and on the pose; the noise grows with how much the window moves. The mean stays within the
+    range of weights.
 
     ``prior(windows)`` gives mean and variance; :meth:`energy` the quadratic for a solver.
 

@@ -1,0 +1,384 @@
+"""``python -m train.priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
+
+From weight takes (Live Link Face, CSV), or from marker takes (C3D, TRC, CSV) with ``--rig`` and ``--attachment``: they
+are laid on the rig and solved first. ``--performances 12`` learns from made-up takes of the embedded performer
+instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's own names out of takes with ARKit's.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+
+from torchface import Attachment, BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface.capture.priors import (
+    DynamicsPrior,
+    DynamicsSettings,
+    GaussianMixture,
+    ParzenDensity,
+    ReciprocalPrior,
+    ShapePrior,
+    automatic_bandwidth,
+    face_halves,
+)
+from torchface.errors import ValueRangeError
+from torchface.synthetic import performer
+from train.prior_pictures import calibration_picture, choice_picture, curves_picture, save_figure
+from train.prior_takes import PriorTakes, made_up, read_takes, renamed, split
+from train.prior_trials import observed, one_step, solve_error, with_strength
+
+Kind = Literal["shape", "reciprocal", "dynamics", "both"]
+_WINDOWS = (2, 3, 4, 6, 8)
+_STRENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+_BANDWIDTHS = (0.5, 1.0, 2.0)  # times the automatic one
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        takes: Folder of takes.
+        performances: Learn from so many made-up takes of the embedded performer instead.
+        frames: Of each made-up take.
+        out: Folder for the model, its card and its pictures; two folders, OUT_shape and OUT_dynamics, for both kinds.
+        kind: shape (a mixture of Gaussians a half of the face), reciprocal (the paper's 1/P over a Parzen window),
+            dynamics, or both (shape and dynamics).
+        rig: The rig that the priors are for: its names, and marker takes are solved with it.
+        attachment: Where the markers of marker takes sit, as JSON.
+        part: Keep this region of the rig only, such as face.
+        names: The names that the priors are for; those of the rig if there is one, else those of the takes.
+        fps: Frames a second that the takes are brought to; as the first take has if absent.
+        held_out: How many takes, the last by name, are kept for the test; a third if absent.
+        window: Frames that the next one is predicted from; chosen if absent.
+        input_noise: Standard deviation of the weights in a window, for windows of solved weights.
+        strength: Of the shape prior; chosen by trial solves if absent.
+        bandwidth: Of the Parzen window (reciprocal); the automatic one, or what trials say is better, if absent.
+        pixel_noise: Of the points in the trial solves, in millimetres on the face.
+        inducing: How many windows stand for all others.
+        rounds: Of the ascent on the marginal likelihood.
+        seed: Draws made-up takes, windows and noise.
+        licence: Under which the model may be used; MIT for the performer, else that of the takes, if absent.
+        pictures: Folder for the pictures; OUT/pictures if absent.
+    """
+
+    takes: Path | None = None
+    performances: int = 0
+    frames: int = 1800
+    out: Path = Path("models/prior")
+    kind: Kind = "both"
+    rig: Path | None = None
+    attachment: Path | None = None
+    part: str | None = None
+    names: tuple[str, ...] = ()
+    fps: float | None = None
+    held_out: int | None = None
+    window: int | None = None
+    input_noise: float = 0.01
+    strength: float | None = None
+    bandwidth: float | None = None
+    pixel_noise: float = 0.7
+    inducing: int = 100
+    rounds: int = 50
+    seed: int = 0
+    licence: str | None = None
+    pictures: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What both kinds learn from.
+
+    Args:
+        learn: takes to learn from.
+        test: takes that are looked at once, for the card.
+        rig: on which trial solves are made.
+        silent: shapes that the takes say nothing of.
+    """
+
+    learn: PriorTakes
+    test: PriorTakes
+    rig: BlendshapeRig
+    silent: tuple[str, ...]
+
+
+def train(settings: Settings, say: Callable[[str], None] | None = None) -> dict[str, dict[str, float]]:
+    """Loads, names, splits, chooses, fits, evaluates, saves, draws.
+
+    Returns:
+        What was measured, by the folder's name.
+
+    Raises:
+        TorchfaceError: neither takes nor performances; too few takes, too short ones, ones with NaN or with different
+            shapes; marker takes without rig and attachment.
+    """
+    say = say or (lambda line: None)
+    material = _material(settings, say)
+    both = settings.kind == "both"
+    measured = {}
+    if settings.kind != "dynamics":
+        out = settings.out.with_name(f"{settings.out.name}_shape") if both else settings.out
+        measured[out.name] = _shape(settings, out, material, say)
+    if settings.kind in ("dynamics", "both"):
+        out = settings.out.with_name(f"{settings.out.name}_dynamics") if both else settings.out
+        measured[out.name] = _dynamics(settings, out, material, say)
+    return measured
+
+
+def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str], None]) -> dict[str, float]:
+    """A shape prior; its strength is chosen with the last of the takes to learn from, left out for that."""
+    learn, test, names = material.learn, material.test, material.learn.names
+    fitting, choosing = _for_choice(learn)
+    trial = observed(material.rig, names, choosing.weights, settings.pixel_noise, settings.seed)
+    points: dict[str, list[tuple[float, float]]] = {}
+    strength = 1.0 if settings.strength is None else settings.strength
+    width = settings.bandwidth
+    if settings.kind == "reciprocal":
+        automatic = _automatic(learn, settings.seed)
+        widths = {1.0: automatic} if width is None else {width: [width] * len(automatic)}
+        if width is None and trial is not None:
+            widths = {factor: [factor * one for one in automatic] for factor in _BANDWIDTHS}
+    else:
+        widths = {1.0: []}
+    least, chosen = float("inf"), next(iter(widths))
+    if trial is not None:
+        points["none"] = [(s, solve_error(trial, None)) for s in (_STRENGTHS[0], _STRENGTHS[-1])]
+        say("choosing the strength by trial solves")
+        for factor, own in widths.items():
+            prior = _fitted(settings.kind, fitting, own, settings.seed).double()
+            tried = _STRENGTHS if settings.strength is None else (settings.strength,)
+            label = f"{factor:g} times the automatic bandwidth" if own else "this prior"
+            points[label] = [(s, solve_error(trial, with_strength(prior, s).double())) for s in tried]
+            best = min(points[label], key=lambda point: point[1])
+            if best[1] < least:
+                least, chosen, strength = best[1], factor, best[0]
+    say("fitting the shape prior")
+    prior = with_strength(_fitted(settings.kind, learn, widths[chosen], settings.seed), strength)
+    metrics = {"strength": strength, **_densities(prior)}
+    together = torch.cat(test.weights)
+    if settings.kind != "reciprocal":
+        metrics["held out, log density a frame"] = float(prior.double().log_density(together).mean())
+        single = ShapePrior(names, prior.groups, [_gaussian(learn, group) for group in prior.groups])
+        metrics["held out, log density of one Gaussian a half"] = float(single.log_density(together).mean())
+    tested = observed(material.rig, names, test.weights, settings.pixel_noise, settings.seed + 1)
+    if tested is not None:
+        metrics |= {
+            "held out, error of a weight without a prior": solve_error(tested, None),
+            "held out, error of a weight": solve_error(tested, prior.double()),
+        }
+    prior = prior.float()
+    card = (
+        "Which weights faces have: "
+        + (
+            "a mixture of Gaussians with full covariances for each half of the face"
+            if settings.kind != "reciprocal"
+            else "the paper's 1/P over a Parzen window for each half of the face"
+        )
+        + ". Holds a solve from few points, such as 68 landmarks of one camera, to faces like those it has learned "
+        f"from. {_limits(settings, material)} The strength was chosen by solves of a take that was left out, from 68 "
+        f"points seen from straight ahead with {settings.pixel_noise:g} mm of noise; 1 is Bayes' rule. The test takes "
+        "took no part in that."
+    )
+    _save(prior, out, settings, material, metrics, card)
+    folder = settings.pictures or out / "pictures"
+    if points and settings.strength is None:
+        figure = choice_picture({"root mean square error of a weight, take left out": points}, "strength")
+        save_figure(figure, folder / "strength.png")
+    return metrics
+
+
+def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[str], None]) -> dict[str, float]:
+    """A dynamics prior; its window is chosen with the last of the takes to learn from, left out for that."""
+    learn, test = material.learn, material.test
+    how = DynamicsSettings(inducing=settings.inducing, rounds=settings.rounds, seed=settings.seed)
+
+    def fitted(takes: PriorTakes, window: int) -> DynamicsPrior:
+        return DynamicsPrior.fit(
+            takes.weights, takes.names, window, fps=takes.fps, input_noise=settings.input_noise, settings=how
+        )
+
+    window = settings.window
+    tried: dict[str, list[tuple[float, float]]] = {"negative log likelihood a weight": [], "one-step error": []}
+    if window is None:
+        fitting, choosing = _for_choice(learn)
+        shortest = min(len(take) for take in (*fitting.weights, *choosing.weights))
+        for candidate in _WINDOWS:
+            if shortest <= candidate + 8:
+                continue
+            say(f"trying a window of {candidate} frames")
+            found = one_step(fitted(fitting, candidate), choosing.weights, settings.input_noise).metrics()
+            for key, values in tried.items():
+                values.append((candidate, found[key]))
+        scores = tried["negative log likelihood a weight"]
+        if not scores:
+            raise ValueRangeError(
+                f"takes: the shortest has {shortest} frames, expected more than {_WINDOWS[0] + 8}, or a window"
+            )
+        window = int(min(scores, key=lambda point: point[1])[0])
+    say(f"fitting the dynamics prior with a window of {window} frames")
+    prior = fitted(learn, window)
+    trial = one_step(prior, test.weights, settings.input_noise)
+    metrics = {"window": float(window)} | {f"held out, {key}": value for key, value in trial.metrics().items()}
+    card = (
+        f"Where weights will be in the next frame, and how surely, from the last {window} frames at "
+        f"{learn.fps:g} frames a second: Gaussian processes, one for each region of the face, and a noise that grows "
+        "with the motion. Holds a solve to how faces move and bridges frames without landmarks. "
+        f"{_limits(settings, material)} Windows carried noise of {settings.input_noise:g} a weight, in learning and in "
+        "the test, as solved weights do. Errors are root mean squares in weights; the log likelihood leaves out its "
+        "constant. The window was chosen on a take that was left out; the test takes took no part in that. A video of "
+        "another frame rate needs a prior of that rate (--fps)."
+    )
+    _save(prior, out, settings, material, metrics, card)
+    folder = settings.pictures or out / "pictures"
+    save_figure(calibration_picture(trial), folder / "calibration.png")
+    save_figure(curves_picture(prior, test.weights[0]), folder / "curves.png")
+    if settings.window is None:
+        tables = {key: {"take left out": values} for key, values in tried.items()}
+        save_figure(choice_picture(tables, "window, frames"), folder / "window.png")
+    return metrics
+
+
+def _material(settings: Settings, say: Callable[[str], None]) -> Material:
+    """The takes under the names that the priors are for; what cannot work is refused before anything is learned."""
+    if (settings.takes is None) == (settings.performances <= 0):
+        raise ValueRangeError(
+            f"found takes={settings.takes} and performances={settings.performances}; expected a folder of takes, or a "
+            "number of performances"
+        )
+    rig = None if settings.rig is None else load_rig(settings.rig, part=settings.part)
+    if settings.takes is None:
+        takes = made_up(settings.performances, settings.frames, settings.seed, settings.fps)
+    else:
+        attachment = None if settings.attachment is None else Attachment.load(settings.attachment)
+        takes = read_takes(settings.takes, settings.fps, rig, attachment, say)
+    names: Sequence[str] = settings.names or (takes.names if rig is None else rig.names)
+    if rig is None:
+        rig = performer(texture=False)
+        if settings.takes is None and not settings.names:
+            names = rig.names
+    takes, silent = renamed(takes, names)
+    if silent:
+        say(f"the takes say nothing of {', '.join(silent)}; these stay at 0")
+    learn, test = split(takes, settings.held_out)
+    say(f"{sum(map(len, learn.weights))} frames of {len(learn.weights)} takes to learn from, "
+        f"{sum(map(len, test.weights))} of {len(test.weights)} to test on")  # fmt: skip
+    return Material(learn, test, rig, silent)
+
+
+def _for_choice(learn: PriorTakes) -> tuple[PriorTakes, PriorTakes]:
+    """The takes to learn from without the last one, and the last one; of a single take its first and last parts."""
+    if len(learn.weights) > 1:
+        return split(learn, 1)
+    first, last = learn.weights[0].tensor_split([3 * len(learn.weights[0]) // 4])
+    return replace(learn, weights=[first]), replace(learn, weights=[last])
+
+
+def _fitted(kind: Kind, takes: PriorTakes, widths: Sequence[float], seed: int) -> ShapePrior:
+    if kind != "reciprocal":
+        return ShapePrior.fit(takes.weights, takes.names, seed=seed)
+    together = torch.cat(takes.weights)
+    groups = face_halves(takes.names)
+    densities = [
+        ParzenDensity.fit(together[:, list(group)], width, seed) for group, width in zip(groups, widths, strict=True)
+    ]
+    return ReciprocalPrior(takes.names, groups, densities)
+
+
+def _automatic(takes: PriorTakes, seed: int) -> list[float]:
+    together = torch.cat(takes.weights)
+    return [automatic_bandwidth(together[:, list(group)], seed=seed) for group in face_halves(takes.names)]
+
+
+def _gaussian(takes: PriorTakes, group: Sequence[int]) -> GaussianMixture:
+    return GaussianMixture.fit(torch.cat(takes.weights)[:, list(group)], 1).double()
+
+
+def _densities(prior: ShapePrior) -> dict[str, float]:
+    """How many components each half has, and how wide a Parzen window's bells are."""
+    found = {}
+    for number, density in enumerate(prior.densities):
+        half = ("upper", "lower")[number] if len(prior.groups) == 2 else f"group {number}"
+        if isinstance(density, ParzenDensity):
+            found[f"centers, {half}"] = float(len(density.centers))
+            found[f"bandwidth, {half}"] = float(density.bandwidth)
+        elif isinstance(density, GaussianMixture):
+            found[f"components, {half}"] = float(len(density.means))
+    return found
+
+
+def _limits(settings: Settings, material: Material) -> str:
+    """What the card says about whom the takes show."""
+    silent = f" The takes say nothing of {', '.join(material.silent)}: these stay at 0." if material.silent else ""
+    if settings.takes is None:
+        return (
+            "It has learned from made-up takes only: twelve gestures with smooth ramps, blinks, glances and syllables "
+            "of an actor made by code. Good for trying the tools, for tests and for footage of that performer; real "
+            "faces combine and time their shapes in ways it has never seen, so learn another prior from real takes for "
+            f"them.{silent}"
+        )
+    return f"Good for faces that move as those of these takes do, with a rig of these names.{silent}"
+
+
+def _save(
+    prior: ShapePrior | DynamicsPrior,
+    out: Path,
+    settings: Settings,
+    material: Material,
+    metrics: dict[str, float],
+    card: str,
+) -> None:
+    """Writes the model with its effective settings, measured errors and card."""
+    effective = {key: value for key, value in asdict(settings).items() if value is not None}
+    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
+    effective["names"] = list(settings.names)
+    effective["out"] = out.name
+    kind = settings.kind if settings.kind != "both" else "dynamics" if isinstance(prior, DynamicsPrior) else "shape"
+    effective["kind"] = kind
+    learn, test = material.learn, material.test
+    frames = sum(map(len, learn.weights))
+    if settings.takes is None:
+        source = f"{len(learn.weights)} made-up takes of the embedded performer, {frames} frames; no person's."
+        flags = f"--performances {settings.performances} --frames {settings.frames}"
+    else:
+        solved = ", solved from markers" if learn.solved else ""
+        source = f"{len(learn.weights)} takes of {settings.takes.name}, {frames} frames{solved}."
+        flags = f"--takes {settings.takes.name}"
+    standard = Settings()
+    for name in ("rig", "attachment", "part", "fps", "held_out", "window", "input_noise", "strength", "bandwidth",
+                 "pixel_noise", "inducing", "rounds"):  # fmt: skip
+        value = getattr(settings, name)
+        if value != getattr(standard, name):
+            flags += f" --{name.replace('_', '-')} {value.name if isinstance(value, Path) else value}"
+    flags += f" --names {' '.join(settings.names)}" if settings.names else ""
+    zoo.save_model(
+        prior,
+        out,
+        licence=settings.licence or ("MIT" if settings.takes is None else "that of the takes"),
+        data=f"{source} {len(learn.names)} shapes; tested on {len(test.weights)} more takes.",
+        metrics=metrics,
+        recipe=f"python -m train.priors {flags} --kind {kind} --seed {settings.seed} --out models/{out.name}",
+        card=card,
+        settings=effective,
+    )
+
+
+def main() -> None:
+    """Parses flags, trains, prints."""
+    try:
+        measured = train(tyro.cli(Settings, description=__doc__), print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
+    for name, metrics in measured.items():
+        print(name)
+        for key, value in metrics.items():
+            print(f"  {key:50} {value:8.4f}")
+
+
+if __name__ == "__main__":
+    main()
