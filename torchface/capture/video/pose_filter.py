@@ -52,8 +52,8 @@ class PoseFilterSettings:
                 raise ValueRangeError(f"{name}: found {values}, expected positive deviations, one at least")
         if self.longest_gap < 0 or not self.memory > 0 or not (0 <= self.fading <= 1 and 0 <= self.calm <= 1):
             raise ValueRangeError(
-                f"pose filter: found longest_gap {self.longest_gap}, memory {self.memory}, fading {self.fading} and calm "
-                f"{self.calm}, expected a gap from 0, positive frames, 0 to 1 and 0 to 1"
+                f"pose filter: found longest_gap {self.longest_gap}, memory {self.memory}, fading {self.fading} and "
+                f"calm {self.calm}, expected a gap from 0, positive frames, 0 to 1 and 0 to 1"
             )
 
 
