@@ -20,7 +20,7 @@ _FEW = 700  # vertices that are enough to tell a good direction from a bad one
 _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 1.6  # radii of what was seen; a lamp cannot stand in the face
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
-_ROUNDS, _STEPS, _DONE = 5, 30, 1e-5
+_ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 30, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def find_lamp(seen: SeenSkin) -> LampFit:
     found = [_refined(seen, start, width) for start in starts]  # a few; each casts its own shadows
     best = min(found, key=lambda one: one.cost)
     # Once more with what is left as the measure of what is an outlier.
-    return _refined(seen, best.lamp, min(width, _width(best.residuals, seen)))
+    return _refined(seen, best, min(width, _width(best.residuals, seen)))
 
 
 def information(seen: SeenSkin, fit: LampFit) -> Tensor:
@@ -72,31 +72,31 @@ def information(seen: SeenSkin, fit: LampFit) -> Tensor:
     return _normal_equations(seen, fit)[0]
 
 
-def _starts(seen: SeenSkin) -> tuple[list[Lamp], float]:
+def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
     """The best of directions all round, some degrees apart, and the robust estimator's width at the very best."""
     number = torch.arange(_STARTS, dtype=torch.float64)
     z = 1 - 2 * (number + 0.5) / _STARTS
     turn = number * math.pi * (3 - math.sqrt(5))
     directions = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], dim=1)
     lamps = [Lamp(direction, 1 / _USUAL) for direction in directions]
-    tried = [_with_strengths(seen, lamp, None) for lamp in lamps]  # a lamp at a time: each casts its own shadows
+    tried = [_with_strengths(seen, lamp) for lamp in lamps]  # a lamp at a time: each casts its own shadows
     width = min(_width(one.residuals, seen) for one in tried)
     costs = torch.tensor([_cost(one.residuals, seen, width) for one in tried])
     chosen: list[int] = []
     for i in costs.argsort().tolist():
         if all(float(directions[i] @ directions[j]) < math.cos(math.radians(_APART)) for j in chosen):
             chosen.append(i)
-    return [lamps[i] for i in chosen[:_KEPT]], width
+    return [tried[i] for i in chosen[:_KEPT]], width
 
 
-def _refined(seen: SeenSkin, start: Lamp, width: float) -> LampFit:
+def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
     """Levenberg's steps over direction and nearness; the strengths are at their optimum all the time."""
     reach = float((seen.points - seen.centre).norm(dim=1).max())
-    now, damping = _with_strengths(seen, start, width), 1e-3
+    now, damping = _with_strengths(seen, start.lamp, width, start.strengths), 1e-3
     H, g = _normal_equations(seen, now)
     for _ in range(_STEPS):
         step = -torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-9).diag(), g)
-        then = _with_strengths(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / (_NEAREST * reach)), width)
+        then = _with_strengths(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / (_NEAREST * reach)), width, now.strengths)
         if then.cost >= now.cost:  # too far, or shadows that fell otherwise
             damping *= 8
             if damping > 1e4:
@@ -124,23 +124,31 @@ def _tangents(direction: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(direction, first)])
 
 
-def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None) -> LampFit:
-    """The best strengths for a lamp, by reweighted least squares; without a width the residuals themselves give it."""
+def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None = None, strengths: Tensor | None = None) -> LampFit:
+    """The best strengths for a lamp, by reweighted least squares from some strengths, else from plain least squares.
+
+    Without a width the residuals themselves give one, anew in each round: from afar, most look like outliers.
+    """
     lit = seen.lit_by(lamp.position(seen.centre)).double()
     reflected = _reflected(seen, lamp)
     diffuse, gloss = seen.albedo * (lit * reflected.falling)[:, None], (lit * reflected.gloss)[:, None].expand(-1, 3)
     columns = torch.stack([seen.albedo, diffuse, gloss])
-    wanted, slope, trust = seen.colors, _slope(seen.colors), torch.ones_like(lit)
     coded = to_srgb(seen.colors)
-    for _ in range(_ROUNDS):
-        weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
-        strengths = _strengths(columns, wanted, weight)
+    if strengths is None:
+        strengths = _strengths(columns, seen.colors, seen.area[:, None] * seen.valid / _slope(seen.colors).square())
+
+    def compared(strengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         shaded = (strengths[:, None] * columns).sum(0)
-        slope = _slope(shaded)
         residuals = seen.valid * (to_srgb(shaded) - coded)
-        wanted = shaded - residuals * slope
         spread = _width(residuals, seen) if width is None else width
-        trust = (1 + residuals.square().sum(1) / spread**2).pow(-2)
+        return shaded, residuals, (1 + residuals.square().sum(1) / spread**2).pow(-2)
+
+    shaded, residuals, trust = compared(strengths)
+    for _ in range(_ROUNDS if width is None else _ROUNDS_NEAR):
+        slope = _slope(shaded)
+        weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
+        strengths = _strengths(columns, shaded - residuals * slope, weight)
+        shaded, residuals, trust = compared(strengths)
     cost = math.nan if width is None else _cost(residuals, seen, width)
     return LampFit(lamp, strengths, lit, columns, residuals, trust, cost)
 
