@@ -22,7 +22,7 @@ FEWEST = 60
 
 _SQUARELY = 0.25  # cosine; what is seen more obliquely is mixed with what stands behind
 _BLACK, _BLOWN = 0.02, 0.985  # sRGB; beyond, a value only says that the light was less, or more
-_SAME = 0.6 / 255  # sRGB; an albedo nearer to the frame than this was taken from it
+_SAME = 1.5 / 255  # sRGB, median; noise and coding alone part a true albedo under even light from the frame by more
 _MOST_AREA = 4.0  # of the mean; one large triangle shall not speak for all
 
 
