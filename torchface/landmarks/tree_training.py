@@ -280,29 +280,37 @@ def _grow_tree(
     if 0 < settings.split_samples < count:
         some = settings.split_samples
         chosen = torch.randint(count, (some,), generator=generator)
-    seen, wanted = grey[:, chosen], residual[chosen]
+    seen, wanted = grey[:, chosen].flatten(), residual[chosen]
     node = torch.zeros(some, dtype=torch.int64)
-    every = torch.zeros(count, dtype=torch.int64)
-    for level in range(settings.depth):  # all nodes of a level at once
+    every, column, flat = torch.zeros(count, dtype=torch.int64), torch.arange(count), grey.view(-1)
+    for level in range(settings.depth):
         nodes, start = 2**level, 2**level - 1
-        tests = settings.test_splits
+        tests = (nodes, settings.test_splits)
         drawn = torch.rand(tests, generator=generator, dtype=torch.float64) * likely[-1]
         pair = torch.searchsorted(likely, drawn, right=True).clamp(max=features**2 - 1)
         first, second = pair // features, pair % features
-        difference = seen[first] - seen[second]  # (tests, samples)
-        # A threshold is what a sample has, so that no test is idle; a half, as it is stored.
-        picked = torch.randint(some, (tests,), generator=generator)
-        threshold = difference[torch.arange(tests), picked].half().float()
-        right = (difference > threshold[:, None]).float()
-        best = _best_tests(right, wanted, node, nodes)
-        chosen_first, chosen_second, chosen_threshold = first[best], second[best], threshold[best]
-        model.first[cascade, tree, start : start + nodes] = chosen_first
-        model.second[cascade, tree, start : start + nodes] = chosen_second
-        model.thresholds[cascade, tree, start : start + nodes] = chosen_threshold
-        node = 2 * node + right[best[node], torch.arange(some)].long()
-        flat, column = grey.view(-1), torch.arange(count)
-        apart = flat[chosen_first[every] * count + column] - flat[chosen_second[every] * count + column]
-        every = 2 * every + (apart > chosen_threshold[every]).long()
+        picked = torch.rand(tests, generator=generator)
+        rows = node.argsort(stable=True).split(torch.bincount(node, minlength=nodes).tolist())
+        best, threshold, right = torch.zeros(nodes, dtype=torch.int64), torch.zeros(nodes), torch.zeros_like(node)
+        for one, members in enumerate(rows):  # a node at a time: they hold different numbers of samples
+            if not len(members):
+                continue
+            difference = seen[(first[one] * some)[:, None] + members] - seen[(second[one] * some)[:, None] + members]
+            # A threshold is what a sample of the node has, so that no test is idle; a half, as it is stored.
+            sample = (picked[one] * len(members)).long()
+            limits = difference.gather(1, sample[:, None])[:, 0].half().float()
+            sides = (difference > limits[:, None]).float()
+            best[one] = best_test(sides, wanted[members])
+            threshold[one] = limits[best[one]]
+            right[members] = sides[best[one]].long()
+        pair = pair.gather(1, best[:, None])[:, 0]
+        first, second = pair // features, pair % features
+        model.first[cascade, tree, start : start + nodes] = first
+        model.second[cascade, tree, start : start + nodes] = second
+        model.thresholds[cascade, tree, start : start + nodes] = threshold
+        node = 2 * node + right
+        apart = flat[first[every] * count + column] - flat[second[every] * count + column]
+        every = 2 * every + (apart > threshold[every]).long()
     leaves = 2**settings.depth
     number = torch.bincount(every, minlength=leaves).clamp(min=1)
     value = torch.zeros(leaves, residual.shape[1]).index_add_(0, every, residual) / number[:, None]
@@ -314,8 +322,8 @@ def _grow_tree(
     residual -= (scale * stored.float())[every]
 
 
-def _best_tests(right: Tensor, wanted: Tensor, node: Tensor, nodes: int) -> Tensor:
-    r"""For each node the test (nodes,) that lowers the squared error most.
+def best_test(right: Tensor, wanted: Tensor) -> Tensor:
+    r"""The test that lowers the squared error of a node most.
 
     It is the one with the largest :math:`\lVert s_l \rVert^2 / n_l + \lVert s_r \rVert^2 / n_r`, s the sums of what is
     wanted on its two sides.
@@ -323,20 +331,11 @@ def _best_tests(right: Tensor, wanted: Tensor, node: Tensor, nodes: int) -> Tens
     Args:
         right: whether a test sends a sample right, 0 or 1, (tests,n).
         wanted: (n,K).
-        node: of each sample, (n,).
-        nodes: how many.
     """
-    # Samples sorted by node make a node's sums one product of matrices.
-    order = node.argsort(stable=True)
-    sizes = torch.bincount(node, minlength=nodes).tolist()
-    right, wanted = right[:, order], wanted[order]
-    best = []
-    for one, rows in zip(right.split(sizes, 1), wanted.split(sizes), strict=True):  # a node at a time: sizes differ
-        sums, number = one @ rows, one.sum(1)
-        other, rest = rows.sum(0) - sums, one.shape[1] - number
-        gain = sums.square().sum(1) / number.clamp(min=1) + other.square().sum(1) / rest.clamp(min=1)
-        best.append(gain.argmax())
-    return torch.stack(best)
+    sums, number = right @ wanted, right.sum(1)
+    other, rest = wanted.sum(0) - sums, right.shape[1] - number
+    gain = sums.square().sum(1) / number.clamp(min=1) + other.square().sum(1) / rest.clamp(min=1)
+    return gain.argmax()
 
 
 def _signature(
