@@ -18,6 +18,7 @@ from rich.table import Table
 
 from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
+from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
 from torchface.cli.evaluate import evaluate
 from torchface.cli.export import EXPORTS
@@ -47,6 +48,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "track": track,
     "retarget": retarget,
     "evaluate": evaluate,
+    "calibrate": calibrate,
     "render": render,
     "info": info,
     "view": view,

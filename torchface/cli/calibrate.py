@@ -1,0 +1,45 @@
+"""``torchface calibrate``: a camera's focal length and lens distortion from pictures of a checkerboard."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import console, steps
+from torchface.errors import ValueRangeError
+
+
+def calibrate(
+    images: Annotated[Positional[tuple[Path, ...]], arg(metavar="IMAGE...")],
+    out: Path = Path("camera.toml"),
+    corners: str = "9x6",
+    square: float = 25.0,
+    quiet: bool = False,
+) -> None:
+    """Calibrate a camera from pictures of a checkerboard, or a video of one, and write it as .toml.
+
+    Hold the board at ten or more places: tilted this way and that, near, far, and in the corners of the image. Beside
+    OUT lies a picture of the corners found and of the same views without distortion, in which the board is straight.
+
+    Args:
+        images: Image files of one size, five at least that differ, or one video.
+        out: The .toml to write.
+        corners: Inner corners of the board, where four squares meet, columns x rows.
+        square: A square's side, millimetres.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.calibrate import Board
+    from torchface.workflows.calibrate import calibrate as run
+
+    match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", corners.strip())
+    if match is None:
+        raise ValueRangeError(f"--corners: found {corners!r}, expected columns x rows such as 9x6")
+    with steps(quiet) as step:
+        report = run(images, Board(int(match[1]), int(match[2]), square), out, step)
+    for line in report.lines():
+        console.print(line, highlight=False, markup=False)
+    for path in (report.picture, out):
+        print(path)
