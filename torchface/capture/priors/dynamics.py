@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_process import GaussianProcesses
-from torchface.capture.priors.motion import face_regions, motion_basis
+from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.capture.priors.shape_prior import require_same_names
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
@@ -207,7 +207,7 @@ class DynamicsPrior(nn.Module):
         steps = (windows * self.coefficients).sum(1)
         scale = self.target_scale * self.trust[self.home]
         mean = windows[:, -1] + steps + scale * told
-        variance = scale.square() * own[:, self.home] + self.noise(motion[:, 1:])
+        variance = scale.square() * own[:, self.home] + self.noise(moving_parts(windows, motion))
         return mean.clamp(self.limits[0], self.limits[1]), variance
 
     def energy(self, windows: Tensor) -> Quadratic:
@@ -273,7 +273,7 @@ class DynamicsPrior(nn.Module):
             torch.zeros(g, points, points),
             torch.zeros(g, points, n),
         )
-        shares = torch.ones(orders - 1, n)
+        shares = torch.ones(0 if window == 1 else min(window, 3), n)
         noise = MotionNoise(torch.ones(n), shares, shares.clone(), shares.clone(), torch.zeros(n, n))
         return cls(
             names,

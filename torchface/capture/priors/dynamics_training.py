@@ -20,7 +20,7 @@ from torchface.capture.priors.gaussian_process import (
     posterior,
     whitening_of,
 )
-from torchface.capture.priors.motion import motion_basis, windows_of
+from torchface.capture.priors.motion import motion_basis, moving_parts, windows_of
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import MissingExtraError, ShapeError, ValueRangeError
 
@@ -113,11 +113,12 @@ def learn(
     for group, one, row in zip(groups, chosen, weights, strict=True):
         told[:, list(group)], known[:, list(group)] = one.mean, one.variance[:, None]
         row[:, list(group)] = one.posterior.weights
+    moving = torch.cat([moving_parts(part.windows, motion) for part, motion in zip(parts, motions, strict=True)])
     noise = MotionNoise.fit(
-        torch.cat(motions)[:, 1:],
+        moving,
         (torch.cat(unseen) - told) * target_scale,
         known * target_scale.square(),
-        feature_scale[1:],
+        moving.std(0).clamp(min=_SMALLEST),
         groups,
         settings.floor,
     )

@@ -44,6 +44,21 @@ def motion_basis(window: int) -> Tensor:
     return basis * triangle.diagonal().sign()
 
 
+def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
+    """What tells how much a window moves: slope, curvature, and the last step by itself, which lags least.
+
+    Args:
+        windows: (B,J,N).
+        motion: the same along the columns of :func:`motion_basis`, (B,O,N).
+
+    Returns:
+        (B,K,N); K is 3, 2 for a window of two frames, 0 for a window of one.
+    """
+    if windows.shape[1] < 2:
+        return motion[:, 1:]
+    return torch.cat([motion[:, 1:], windows[:, -1:] - windows[:, -2:-1]], dim=1)
+
+
 def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Every window of a take, and the frame that follows it.
 

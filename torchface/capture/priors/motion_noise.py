@@ -14,16 +14,16 @@ _USUAL = -2.5  # of the logarithm of a share of the energy
 class MotionNoise(nn.Module):
     r"""A variance that grows with how much a window moves.
 
-    .. math:: \beta_i^{-1}(x) = a_i + \sum_{o \ge 1} \big(b_{io}\, x_{oi}^2 + c_{io}\, s_{oi}^2 \operatorname{mean}_{k
+    .. math:: \beta_i^{-1}(x) = a_i + \sum_o \big(b_{io}\, x_{oi}^2 + c_{io}\, s_{oi}^2 \operatorname{mean}_{k
         \in g(i)} x_{ok}^2 / s_{ok}^2\big)
 
-    over a window's slope and curvature x: the shape's own, and those of the shapes that it moves with.
+    over a window's slope, curvature and last step x: the shape's own, and those of the shapes that it moves with.
 
     Args:
         rest: :math:`a`, the variance at rest, (N,).
-        own: :math:`b`, (O-1,N).
-        shared: :math:`c`, (O-1,N).
-        scale: :math:`s`, usual sizes of slopes and curvatures, (O-1,N).
+        own: :math:`b`, (K,N).
+        shared: :math:`c`, (K,N).
+        scale: :math:`s`, usual sizes of the K kinds of motion, (K,N).
         together: (N,N), rows of :math:`1/|g(i)|` where k is in i's group.
 
     Source: Engle 1982 (autoregressive conditional heteroscedasticity), in place of the one noise of equation 54.
@@ -61,10 +61,10 @@ class MotionNoise(nn.Module):
         """The likeliest coefficients for errors of predictions on takes left out, in float64.
 
         Args:
-            motion: slopes and curvatures of the windows, (B,O-1,N).
+            motion: of the windows, see :func:`moving_parts`, (B,K,N).
             errors: (B,N).
             known: variance that the errors have besides, (B,N).
-            scale: usual sizes of slopes and curvatures, (O-1,N).
+            scale: usual sizes of the K kinds of motion, (K,N).
             groups: shapes that move together.
             floor: the least standard deviation.
         """
@@ -94,7 +94,7 @@ class MotionNoise(nn.Module):
         return cls(rest.detach().exp() + floor**2, own, shared, scale, together)
 
     def forward(self, motion: Tensor) -> Tensor:
-        """The variance (B,N) after windows with these slopes and curvatures, (B,O-1,N)."""
+        """The variance (B,N) after windows that move like this, (B,K,N)."""
         squared = motion.square()
         around = (squared / self.scale.square()) @ self.together.T * self.scale.square()
         return self.rest + (self.own * squared + self.shared * around).sum(1)
