@@ -19,6 +19,7 @@ from torchface.landmarks.shape_modes import PlanarPose, planar_pose
 COUNT = 68
 _MARGIN = 0.3
 _MOST_SAMPLES = 8
+_ASTRAY = 4.0  # times the lowest energy: steps that have come to this lead nowhere
 _STILL = 0.02  # pixels of a level: a face whose landmarks move by less has arrived
 _LUMA = (0.299, 0.587, 0.114)
 
@@ -267,23 +268,35 @@ class AppearanceModel(nn.Module):
         return FaceCrop(dense_features(pictures, self.settings.features), pose)
 
     def _refine_level(self, level: AppearanceLevel, images: Tensor, landmarks: Tensor) -> Tensor:
-        resolution = float(level.scale)
-        crop = self.crop(images, landmarks, resolution)
-        found = crop.pose.undo(landmarks)
+        """The best landmarks, by residual and shape, of those that the steps lead to; the start is one of them."""
+        crop = self.crop(images, landmarks, float(level.scale))
+        found = best = crop.pose.undo(landmarks)
+        lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
-        still = torch.zeros(len(found), dtype=torch.bool, device=found.device)
-        for _ in range(self.settings.iterations):
+        still = torch.zeros_like(lowest, dtype=torch.bool)
+        for turn in range(self.settings.iterations + 1):
             residual = level.residual(level.sample(crop.features, self._points(found)))
-            _, state = self._shape(found)
-            step = level.step(residual, state, precision)
-            moved = torch.einsum("bq,qlc->blc", step, self.motions)
-            warp = self._linear_parts(found)
-            before, found = found, self._onto_modes(found - torch.einsum("blij,blj->bli", warp, moved))
-            still |= (found - before).flatten(1).abs().amax(1) < _STILL
-            found = torch.where(still[:, None, None], before, found)
-            if still.all():
+            state = self._shape(found)[1]
+            energy = residual.left.square().sum((1, 2)) / level.noise + (precision * state.square()).sum(1)
+            better = energy < lowest
+            best = torch.where(better[:, None, None], found, best)
+            lowest = torch.where(better, energy, lowest)
+            still = still | ~(energy < _ASTRAY * lowest)
+            if turn == self.settings.iterations or still.all():
                 break
-        return crop.pose.apply(found)
+            moved = torch.einsum("bq,qlc->blc", level.step(residual, state, precision), self.motions)
+            warp = self._linear_parts(found)
+            ahead = self._onto_modes(found - torch.einsum("blij,blj->bli", warp, moved))
+            still = still | ~self._plausible(ahead, level)
+            ahead = torch.where(still[:, None, None], found, ahead)
+            still = still | ((ahead - found).flatten(1).abs().amax(1) < _STILL)
+            found = ahead
+        return crop.pose.apply(best)
+
+    def _plausible(self, landmarks: Tensor, level: AppearanceLevel) -> Tensor:
+        """Whether landmarks (B,68,2) in a crop are finite, and of about the size that faces have in it, (B,)."""
+        size = planar_pose(self.mean_shape, landmarks).scale / level.scale
+        return torch.isfinite(landmarks).flatten(1).all(1) & (size > 0.5) & (size < 2)
 
     def _points(self, landmarks: Tensor) -> Tensor:
         return with_forehead(landmarks, self.settings.jaw_margin)
