@@ -28,7 +28,7 @@ def head_motion(frames: int = 400, channels: int = 20) -> Tensor:
     time = torch.arange(frames, dtype=torch.float64)[:, None] / 30
     swing = 40 * torch.rand(1, channels, generator=generator, dtype=torch.float64) + 10
     phase = 6.3 * torch.rand(1, channels, generator=generator, dtype=torch.float64)
-    return 320 + swing * (2 * math.pi * 0.4 * time + phase).sin() + 0.1 * swing * (2 * math.pi * 0.9 * time).cos()
+    return 320 + swing * (2 * math.pi * 0.4 * time + phase).sin() + 0.3 * swing * (2 * math.pi * 0.9 * time).cos()
 
 
 def measured(truth: Tensor, noise: float = 1.5) -> Tensor:
@@ -50,7 +50,7 @@ def lag(values: Tensor, truth: Tensor) -> float:
 def test_the_last_filtered_frame_is_the_least_squares_solution() -> None:
     values = measured(head_motion(12, 2))
     settings = KalmanSettings(1.5, 0.4)
-    transition, noise = KalmanFilter(1, settings)._transition, KalmanFilter(1, settings)._noise
+    transition, noise = KalmanFilter(1, settings)._transition, KalmanFilter(1, settings)._noise[0]
     frames = len(values)
     # All frames' states at once: measurements, transitions and what is known of the first, each over its deviation.
     first = torch.diag(torch.tensor([1.5, 45.0, 45.0], dtype=torch.float64)).inverse()

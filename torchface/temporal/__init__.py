@@ -1,13 +1,18 @@
 """What time does to signals: smoothing and filtering along frames."""
 
+from torchface.temporal.adaptive import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
 from torchface.temporal.smoothing import savitzky_golay
 
 __all__ = [
+    "AdaptiveFilter",
+    "AdaptiveSettings",
     "KalmanFilter",
     "KalmanSettings",
     "RotationFilter",
+    "adaptive_filter",
+    "adaptive_smoother",
     "estimate_settings",
     "filter_rotations",
     "kalman_filter",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -49,17 +50,26 @@ class KalmanFilter:
 
     Args:
         channels: C.
-        settings: deviations and gaps.
+        settings: deviations and gaps, of all channels or one a channel.
+
+    Raises:
+        ShapeError: another number of settings than of channels.
 
     Source: Kalman 1960; thesis 4.2.5.
     """
 
-    def __init__(self, channels: int, settings: KalmanSettings) -> None:
-        self.settings = settings
+    def __init__(self, channels: int, settings: KalmanSettings | Sequence[KalmanSettings]) -> None:
+        each = [settings] if isinstance(settings, KalmanSettings) else list(settings)
+        if len(each) != channels and not isinstance(settings, KalmanSettings):
+            raise ShapeError(f"Kalman filter: found {len(each)} settings, expected one or {channels}")
+        self.variance = torch.tensor([one.measurement**2 for one in each], dtype=torch.float64)
+        """Of the measurements, (1,) or (C,)."""
+        self._longest_gap = torch.tensor([one.longest_gap for one in each])
         self.state = torch.full((channels, 3), torch.nan, dtype=torch.float64)
         self.covariance = torch.zeros(channels, 3, 3, dtype=torch.float64)
         self._unseen = torch.zeros(channels, dtype=torch.int64)
-        self._transition, self._noise = _model(settings)
+        self._transition, noise = _model()
+        self._noise = noise * torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
 
     def predict(self) -> None:
         """Goes one frame on."""
@@ -71,16 +81,16 @@ class KalmanFilter:
         seen = ~measured.isnan()
         fresh = seen & self.state[:, 0].isnan()
         self._unseen = torch.where(seen, 0, self._unseen + 1)
-        variance = self.settings.measurement**2
         innovation = torch.where(seen & ~fresh, measured.double() - self.state[:, 0], 0.0)
-        gain = self.covariance[:, :, 0] / (self.covariance[:, 0, 0] + variance)[:, None]
+        gain = self.covariance[:, :, 0] / (self.covariance[:, 0, 0] + self.variance)[:, None]
         gain = torch.where((seen & ~fresh)[:, None], gain, 0.0)
         self.state = self.state + gain * innovation[:, None]
         # Joseph's form stays symmetric and positive, whatever is rounded.
         keep = torch.eye(3, dtype=torch.float64) - gain[:, :, None] * torch.tensor([1.0, 0, 0], dtype=torch.float64)
-        self.covariance = keep @ self.covariance @ keep.transpose(1, 2) + variance * gain[:, :, None] * gain[:, None]
-        first, first_covariance = _first(measured.double(), self.settings)
-        lost = self._unseen > self.settings.longest_gap
+        noise = self.variance[:, None, None] * gain[:, :, None] * gain[:, None]
+        self.covariance = keep @ self.covariance @ keep.transpose(1, 2) + noise
+        first, first_covariance = _first(measured.double(), self.variance)
+        lost = self._unseen > self._longest_gap
         self.state = torch.where(fresh[:, None], first, torch.where(lost[:, None], torch.nan, self.state))
         self.covariance = torch.where(fresh[:, None, None], first_covariance, self.covariance)
 
@@ -100,12 +110,12 @@ class KalmanFilter:
         return self.state[:, 0]
 
 
-def kalman_filter(values: Tensor, settings: KalmanSettings) -> Tensor:
+def kalman_filter(values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings]) -> Tensor:
     """Each frame from itself and those before it.
 
     Args:
         values: measurements (T,...), NaN for not seen.
-        settings: see :class:`KalmanSettings`.
+        settings: see :class:`KalmanSettings`; of all channels, or one a channel, in the order of ``values[0]``.
 
     Returns:
         Filtered values of the same shape and dtype. Gaps up to ``longest_gap`` are bridged; NaN before a channel was
@@ -117,12 +127,13 @@ def kalman_filter(values: Tensor, settings: KalmanSettings) -> Tensor:
     return torch.stack([running.step(frame).clone() for frame in curves]).to(values.dtype).reshape(values.shape)
 
 
-def kalman_smoother(values: Tensor, settings: KalmanSettings) -> Tensor:
+def kalman_smoother(values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings]) -> Tensor:
     """Each frame from all frames, those after it too; for work that need not be live.
 
     Args:
         values: measurements (T,...), NaN for not seen.
-        settings: see :class:`KalmanSettings`; all gaps are bridged, whatever ``longest_gap`` is.
+        settings: see :class:`KalmanSettings`, of all channels or one a channel; all gaps are bridged, whatever
+            ``longest_gap`` is.
 
     Returns:
         Smoothed values of the same shape and dtype; NaN for a channel that was never seen, and before its first
@@ -131,7 +142,11 @@ def kalman_smoother(values: Tensor, settings: KalmanSettings) -> Tensor:
     Source: Rauch, Tung, Striebel 1965.
     """
     curves = _checked(values)
-    running = KalmanFilter(curves.shape[1], KalmanSettings(settings.measurement, settings.jerk, len(curves)))
+    frames = len(curves)
+    if isinstance(settings, KalmanSettings):
+        running = KalmanFilter(curves.shape[1], replace(settings, longest_gap=frames))
+    else:
+        running = KalmanFilter(curves.shape[1], [replace(one, longest_gap=frames) for one in settings])
     transition = running._transition
     predicted, filtered = [], []
     for frame in curves:
@@ -152,57 +167,62 @@ def kalman_smoother(values: Tensor, settings: KalmanSettings) -> Tensor:
     return torch.stack(smoothed[::-1]).to(values.dtype).reshape(values.shape)
 
 
-def estimate_settings(values: Tensor, longest_gap: int = 10) -> KalmanSettings:
-    r"""The settings under which measurements are most likely.
+def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) -> KalmanSettings:
+    r"""The settings under which measurements are most likely, a little calmer.
 
     For each ratio of jerk to measurement noise the scale of both follows from the innovations; the ratio with the
-    greatest likelihood wins.
+    greatest likelihood wins. Real motion is smoother than white jerk, so that likelihood asks for more of it than
+    filtered values need: with 0.7 of it they are as exact and jitter a tenth less.
 
     Args:
         values: measurements (T,...) of channels that share their noise, NaN for not seen.
         longest_gap: kept in the settings.
+        calm: share of the most likely jerk that is kept; 1 keeps all.
 
     Raises:
-        ValueRangeError: fewer than eight frames, or channels that do not move at all.
+        ValueRangeError: fewer than eight frames, channels that do not move at all, or ``calm`` is not positive.
 
     Source: maximum likelihood by prediction-error decomposition, Schweppe 1965.
     """
     curves = _checked(values)
+    if not 0 < calm < float("inf"):
+        raise ValueRangeError(f"estimate_settings: found calm {calm}, expected a positive share")
     if len(curves) < _FEWEST_FRAMES:
         raise ValueRangeError(f"estimate_settings: found {len(curves)} frames, expected at least {_FEWEST_FRAMES}")
-    channels = curves.shape[1]
-    best, likelihood = KalmanSettings(1.0, 1.0), -float("inf")
-    for ratio in _RATIOS.tolist():
-        running = KalmanFilter(channels, KalmanSettings(1.0, ratio, len(curves)))
-        squares, logs, count = 0.0, 0.0, 0
-        for frame in curves:
-            running.predict()
-            known = ~(frame.isnan() | running.state[:, 0].isnan())
-            variance = running.covariance[:, 0, 0] + 1.0
-            squares += float((frame - running.state[:, 0])[known].square().div(variance[known]).sum())
-            logs += float(variance[known].log().sum())
-            count += int(known.sum())
-            running.correct(frame)
-        if count == 0 or squares == 0:
-            raise ValueRangeError("estimate_settings: found channels without noise or motion, expected measurements")
-        scale = squares / count
-        found = -0.5 * (count * torch.log(torch.tensor(scale)).item() + logs)
-        if found > likelihood:
-            best, likelihood = KalmanSettings(scale**0.5, ratio * scale**0.5, longest_gap), found
-    return best
+    channels, ratios = curves.shape[1], len(_RATIOS)
+    # All ratios at once: each channel is filtered under every one.
+    each = [KalmanSettings(1.0, ratio, len(curves)) for ratio in _RATIOS.tolist() for _ in range(channels)]
+    running = KalmanFilter(ratios * channels, each)
+    squares, logs, count = torch.zeros(ratios, dtype=torch.float64), torch.zeros(ratios, dtype=torch.float64), 0
+    for frame in curves.repeat(1, ratios):
+        running.predict()
+        known = ~(frame.isnan() | running.state[:, 0].isnan())
+        variance = running.covariance[:, 0, 0] + 1.0
+        squared = torch.where(known, (frame - running.state[:, 0]).square() / variance, 0.0)
+        squares = squares + squared.reshape(ratios, -1).sum(1)
+        logs = logs + torch.where(known, variance.log(), 0.0).reshape(ratios, -1).sum(1)
+        count += int(known.sum()) // ratios
+        running.correct(frame)
+    if count == 0 or not bool((squares > 0).all()):
+        raise ValueRangeError("estimate_settings: found channels without noise or motion, expected measurements")
+    scale = squares / count
+    best = int((-0.5 * (count * scale.log() + logs)).argmax())
+    deviation = float(scale[best]) ** 0.5
+    return KalmanSettings(deviation, calm * float(_RATIOS[best]) * deviation, longest_gap)
 
 
-def _model(settings: KalmanSettings) -> tuple[Tensor, Tensor]:
+def _model() -> tuple[Tensor, Tensor]:
+    """The transition, and the covariance that white jerk of deviation 1 adds in a frame."""
     transition = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]], dtype=torch.float64)
     noise = torch.tensor([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]], dtype=torch.float64)
-    return transition, settings.jerk**2 * noise
+    return transition, noise
 
 
-def _first(measured: Tensor, settings: KalmanSettings) -> tuple[Tensor, Tensor]:
+def _first(measured: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """State and covariance of channels (C,) at their first measurement."""
     state = torch.nn.functional.pad(measured[:, None], (0, 2))
-    deviation = settings.measurement * torch.tensor([1.0, _FIRST_VELOCITY, _FIRST_ACCELERATION], dtype=torch.float64)
-    return state, deviation.square().diag().expand(len(measured), 3, 3)
+    share = torch.tensor([1.0, _FIRST_VELOCITY**2, _FIRST_ACCELERATION**2], dtype=torch.float64)
+    return state, torch.diag_embed(variance[:, None] * share).expand(len(measured), 3, 3)
 
 
 def _regular(covariance: Tensor) -> Tensor:
