@@ -18,7 +18,8 @@ _WIDTH = 2.5  # medians of the residuals; some 3.7 deviations of normal noise in
 _STARTS, _KEPT, _APART = 100, 3, 30.0  # directions tried, refined, and degrees between those
 _FEW = 700  # vertices that are enough to tell a good direction from a bad one
 _USUAL = 1000.0  # millimetres at which lamps are looked for first
-_NEAREST = 1.6  # radii of what was seen; a lamp cannot stand in the face
+_NEAREST = 250.0  # millimetres; nearer, a lamp would be in the picture, and soft light would pass for such a one
+_MOST_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
 _ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 30, 1e-5
 
@@ -41,21 +42,37 @@ class LampFit:
 
     Args:
         lamp: where it stands.
-        strengths: ambient, of the lamp, and of its gloss, linear, (3,3).
+        factors: of the columns, none negative, (3,3).
         lit: 1 where the lamp reaches, else 0, (Q,).
-        columns: what the strengths are factors of, (3,Q,3).
+        columns: how vertices look under ambient light, under the lamp without gloss, under the lamp with all the gloss
+            that skin has, (3,Q,3).
         residuals: shaded albedo minus frame, sRGB, (Q,3); 0 where blown out.
         trust: robust weight of each vertex, in (0,1], (Q,).
         cost: the objective.
     """
 
     lamp: Lamp
-    strengths: Tensor
+    factors: Tensor
     lit: Tensor
     columns: Tensor
     residuals: Tensor
     trust: Tensor
     cost: float
+
+    @property
+    def ambient(self) -> Tensor:
+        """Strength of the light from everywhere, linear, (3,)."""
+        return self.factors[0]
+
+    @property
+    def intensity(self) -> Tensor:
+        """Strength of the lamp, (3,)."""
+        return self.factors[1] + self.factors[2]
+
+    @property
+    def gloss(self) -> Tensor:
+        """Strength of its highlights, (3,)."""
+        return _MOST_GLOSS * self.factors[2]
 
 
 def find_lamp(seen: SeenSkin) -> LampFit:
@@ -79,7 +96,7 @@ def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
     turn = number * math.pi * (3 - math.sqrt(5))
     directions = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], dim=1)
     lamps = [Lamp(direction, 1 / _USUAL) for direction in directions]
-    tried = [_with_strengths(seen, lamp) for lamp in lamps]  # a lamp at a time: each casts its own shadows
+    tried = [_with_factors(seen, lamp) for lamp in lamps]  # a lamp at a time: each casts its own shadows
     width = min(_width(one.residuals, seen) for one in tried)
     costs = torch.tensor([_cost(one.residuals, seen, width) for one in tried])
     chosen: list[int] = []
@@ -91,12 +108,11 @@ def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
 
 def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
     """Levenberg's steps over direction and nearness; the strengths are at their optimum all the time."""
-    reach = float((seen.points - seen.centre).norm(dim=1).max())
-    now, damping = _with_strengths(seen, start.lamp, width, start.strengths), 1e-3
+    now, damping = _with_factors(seen, start.lamp, width, start.factors), 1e-3
     H, g = _normal_equations(seen, now)
     for _ in range(_STEPS):
         step = -torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-9).diag(), g)
-        then = _with_strengths(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / (_NEAREST * reach)), width, now.strengths)
+        then = _with_factors(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / _NEAREST), width, now.factors)
         if then.cost >= now.cost:  # too far, or shadows that fell otherwise
             damping *= 8
             if damping > 1e4:
@@ -124,33 +140,33 @@ def _tangents(direction: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(direction, first)])
 
 
-def _with_strengths(seen: SeenSkin, lamp: Lamp, width: float | None = None, strengths: Tensor | None = None) -> LampFit:
-    """The best strengths for a lamp, by reweighted least squares from some strengths, else from plain least squares.
+def _with_factors(seen: SeenSkin, lamp: Lamp, width: float | None = None, factors: Tensor | None = None) -> LampFit:
+    """The best factors for a lamp, by reweighted least squares from some, else from plain least squares.
 
     Without a width the residuals themselves give one, anew in each round: from afar, most look like outliers.
     """
     lit = seen.lit_by(lamp.position(seen.centre)).double()
     reflected = _reflected(seen, lamp)
     diffuse, gloss = seen.albedo * (lit * reflected.falling)[:, None], (lit * reflected.gloss)[:, None].expand(-1, 3)
-    columns = torch.stack([seen.albedo, diffuse, gloss])
+    columns = torch.stack([seen.albedo, diffuse, diffuse + _MOST_GLOSS * gloss])
     coded = to_srgb(seen.colors)
-    if strengths is None:
-        strengths = _strengths(columns, seen.colors, seen.area[:, None] * seen.valid / _slope(seen.colors).square())
+    if factors is None:
+        factors = _factors(columns, seen.colors, seen.area[:, None] * seen.valid / _slope(seen.colors).square())
 
-    def compared(strengths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        shaded = (strengths[:, None] * columns).sum(0)
+    def compared(factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        shaded = (factors[:, None] * columns).sum(0)
         residuals = seen.valid * (to_srgb(shaded) - coded)
         spread = _width(residuals, seen) if width is None else width
         return shaded, residuals, (1 + residuals.square().sum(1) / spread**2).pow(-2)
 
-    shaded, residuals, trust = compared(strengths)
+    shaded, residuals, trust = compared(factors)
     for _ in range(_ROUNDS if width is None else _ROUNDS_NEAR):
         slope = _slope(shaded)
         weight = (seen.area * trust)[:, None] * seen.valid / slope.square()
-        strengths = _strengths(columns, shaded - residuals * slope, weight)
-        shaded, residuals, trust = compared(strengths)
+        factors = _factors(columns, shaded - residuals * slope, weight)
+        shaded, residuals, trust = compared(factors)
     cost = math.nan if width is None else _cost(residuals, seen, width)
-    return LampFit(lamp, strengths, lit, columns, residuals, trust, cost)
+    return LampFit(lamp, factors, lit, columns, residuals, trust, cost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +209,7 @@ def _reflected(seen: SeenSkin, lamp: Lamp) -> _Reflection:
     )
 
 
-def _strengths(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
+def _factors(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
     """Non-negative factors (K,3) of columns (K,Q,3) with the least weighted square distance to ``wanted`` (Q,3).
 
     All 2^K sets of factors that are not zero are solved; the best of those without a negative factor is the answer.
@@ -214,14 +230,14 @@ def _strengths(columns: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
 def _normal_equations(seen: SeenSkin, fit: LampFit) -> tuple[Tensor, Tensor]:
     """H (3,3) and g (3,) of the lamp's place, with the strengths' directions projected out (variable projection)."""
     reflected = _reflected(seen, fit.lamp)
-    slope = _slope((fit.strengths[:, None] * fit.columns).sum(0))
+    slope = _slope((fit.factors[:, None] * fit.columns).sum(0))
     root = (seen.valid * (seen.area * fit.trust)[:, None]).sqrt()
     H, g = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for c in range(3):  # channels: each has strengths of its own to project out
         scaled = root[:, c] / slope[:, c]
-        basis = torch.linalg.qr((scaled * fit.columns[fit.strengths[:, c] > 0, :, c]).T)[0]
-        diffuse = (fit.strengths[1, c] * seen.albedo[:, c])[:, None] * reflected.falling_moved
-        part = (scaled * fit.lit)[:, None] * (diffuse + fit.strengths[2, c] * reflected.gloss_moved)
+        basis = torch.linalg.qr((scaled * fit.columns[fit.factors[:, c] > 0, :, c]).T)[0]
+        diffuse = (fit.intensity[c] * seen.albedo[:, c])[:, None] * reflected.falling_moved
+        part = (scaled * fit.lit)[:, None] * (diffuse + fit.gloss[c] * reflected.gloss_moved)
         part = part - basis @ (basis.T @ part)
         H, g = H + part.T @ part, g + part.T @ (root[:, c] * fit.residuals[:, c])
     return H, g

@@ -70,7 +70,7 @@ def estimate_light(
     over the vertices that the camera sees. s is 0 where the mesh stands between vertex and lamp, a the pixels that a
     vertex covers, g the sRGB coding (light adds up in linear values: colours are decoded first), :math:`\phi` Geman
     and McClure's function of a width taken from the residuals, so that highlights, foreign shadows and hair count
-    little. What the lamp's gloss adds (Blinn's highlight, one strength a channel) is estimated with the rest, or the
+    little. What the lamp's gloss adds (Blinn's highlight, at most 0.3 of the lamp) is estimated with the rest, or the
     broad part of it would pass for light, and left out of the answer. Directions all round are tried; from the best,
     Gauss-Newton moves the lamp while the strengths, linear and not negative, are eliminated (variable projection), and
     shadows are cast anew in each step. Only products of light
@@ -123,12 +123,12 @@ def _result(seen: SeenSkin, fit: LampFit, frames: int, vertices: int) -> LightFi
         masks.append(torch.zeros(frames, vertices, dtype=torch.bool))
         masks[-1][seen.frame, seen.vertex] = mask
     deviation = math.inf
-    if bool((fit.strengths[1] > 0).any()) and bool((fit.lit > 0).any()):
+    if bool((fit.intensity > 0).any()) and bool((fit.lit > 0).any()):
         noise = float((fit.trust * sizes.square()).sum() / (3 * fit.trust.sum()).clamp(min=1))
         H = information(seen, fit)
         covariance = noise * torch.linalg.pinv(H + 1e-12 * torch.eye(3, dtype=H.dtype))
         deviation = math.degrees(math.sqrt(max(float(covariance[:2, :2].trace()), 0.0)))
-    light = PointLight(fit.strengths[0].float(), fit.strengths[1].float(), position.float())
+    light = PointLight(fit.ambient.float(), fit.intensity.float(), position.float())
     return LightFit(light, fit.lamp.direction.float(), 1 / fit.lamp.nearness, deviation, errors, *masks)
 
 
