@@ -9,13 +9,11 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig
-from torchface.capture.energy import Quadratic
+from torchface.capture import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior, windows_of
-from torchface.optim import box_qp
 from torchface.shape_names import mapping
 
-_FRAMES = 150  # of each take
-_ROUNDS = 6
+_FOCAL, _DISTANCE = 900.0, 600.0  # pixels, millimetres
 _LEAST_SHAPES = 0.5  # of those that a rig must know for a trial
 
 
@@ -63,52 +61,67 @@ def one_step(prior: DynamicsPrior, takes: Sequence[Tensor], noise: float = 0.0, 
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """Held-out frames as one camera sees them: 68 points from straight ahead, in units of their noise.
+class Filmed:
+    """Held-out frames as one camera sees them.
 
     Args:
-        data: of each frame, the energy of the points.
+        rig: with the shapes of the takes.
+        intrinsics: of the camera, (3,3), pixels.
+        landmarks: (B,68,2), pixels, with noise.
+        rotation: of the head, which no solver is told, (B,3,3).
         truth: the frames' weights, (B,N).
-        noise: of a point's coordinate, millimetres.
     """
 
-    data: Quadratic
+    rig: BlendshapeRig
+    intrinsics: Tensor
+    landmarks: Tensor
+    rotation: Tensor
     truth: Tensor
-    noise: float
 
 
-def observed(
-    rig: BlendshapeRig, names: Sequence[str], takes: Sequence[Tensor], noise: float, seed: int = 0
-) -> Observed | None:
-    """Takes as a camera would see them on a rig; None where the rig has no landmarks or too few of the shapes."""
+def filmed(
+    rig: BlendshapeRig, names: Sequence[str], takes: Sequence[Tensor], pixel_noise: float, frames: int, seed: int = 0
+) -> Filmed | None:
+    """Takes on a rig whose head nods and turns before a camera of 640 by 480 pixels.
+
+    Args:
+        rig: whose landmarks are seen; its shapes need not have the takes' names.
+        names: of the takes' shapes.
+        takes: weights, (T,N).
+        pixel_noise: standard deviation of a landmark's coordinate.
+        frames: how many of each take, evenly spread.
+        seed: of the noise.
+
+    Returns:
+        None where the rig has no landmarks, or fewer than half of the shapes.
+    """
     annotations = rig.neutral.annotations
     landmarks = None if annotations is None else annotations.landmarks
     matrix = mapping(names, rig.names)
     if landmarks is None or float(matrix.any(0).float().mean()) < _LEAST_SHAPES:
         return None
-    basis = (matrix.T @ rig.deltas[:, landmarks, :2].flatten(1)).T.double() / noise
-    frames = [take[:: max(len(take) // _FRAMES, 1)].double() for take in takes]
-    truth = torch.cat(frames)
-    generator = torch.Generator().manual_seed(seed)
-    seen = truth @ basis.T + torch.randn(len(truth), len(basis), generator=generator, dtype=torch.float64)
-    return Observed(Quadratic(basis.T @ basis, -seen @ basis), truth, noise)
+    own = BlendshapeRig(rig.neutral, torch.einsum("rn,rvc->nvc", matrix, rig.deltas), names)
+    truth = torch.cat([take[:: max(len(take) // frames, 1)][:frames] for take in takes]).float()
+    points = own.vertices[landmarks] + torch.einsum("bn,nlc->blc", truth, own.deltas[:, landmarks])
+    center = own.vertices[landmarks].mean(0)
+    time = torch.arange(len(truth)) / 25
+    turns = torch.stack([0.12 * torch.sin(time), 0.25 * torch.sin(0.7 * time), 0.05 * torch.sin(1.3 * time)], dim=1)
+    skew = torch.zeros(len(truth), 3, 3)
+    for axis, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
+        skew[:, row, column], skew[:, column, row] = turns[:, axis], -turns[:, axis]
+    rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0])) @ torch.linalg.matrix_exp(skew)
+    seen = (points - center) @ rotation.transpose(1, 2) + torch.tensor([0.0, 0.0, _DISTANCE])
+    intrinsics = torch.tensor([[_FOCAL, 0.0, 320.0], [0.0, _FOCAL, 240.0], [0.0, 0.0, 1.0]])
+    pixels = _FOCAL * seen[..., :2] / seen[..., 2:] + torch.tensor([320.0, 240.0])
+    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(seed))
+    return Filmed(own, intrinsics, pixels + pixel_noise * noise, rotation, truth)
 
 
-def solved(observed: Observed, prior: ShapePrior | None) -> Tensor:
-    """Weights (B,N) by the points and a prior: a few rounds, each from the prior's quadratic at the last weights."""
-    count = observed.truth.shape[1]
-    weights = torch.full_like(observed.truth, 0.05)
-    ridge = 1e-3 * torch.eye(count, dtype=torch.float64)
-    for _ in range(_ROUNDS if prior is not None else 1):  # each round needs the weights of the one before
-        total = observed.data if prior is None else observed.data + prior.energy(weights)
-        H = total.H + ridge
-        weights = box_qp(H.expand(len(weights), count, count), total.f.expand(len(weights), count))
-    return weights
-
-
-def solve_error(observed: Observed, prior: ShapePrior | None) -> float:
-    """Root mean square error of solved weights."""
-    return _rms(solved(observed, prior) - observed.truth)
+def solve_error(film: Filmed, prior: ShapePrior | None, pixel_noise: float) -> float:
+    """Root mean square error of weights solved from the landmarks of each frame, the head's pose with them."""
+    # The landmarks were filmed as vertices, so they do not slide.
+    solver = VideoSolver(film.rig, None, film.intrinsics, prior, pixel_noise=pixel_noise, contour_slide=1.0)
+    return _rms(solver(film.landmarks).weights - film.truth)
 
 
 def with_strength(prior: ShapePrior, strength: float) -> ShapePrior:

@@ -31,7 +31,7 @@ from torchface.errors import ValueRangeError
 from torchface.synthetic import performer
 from train.prior_pictures import calibration_picture, choice_picture, curves_picture, save_figure
 from train.prior_takes import PriorTakes, made_up, read_takes, renamed, split
-from train.prior_trials import observed, one_step, solve_error, with_strength
+from train.prior_trials import filmed, one_step, solve_error, with_strength
 
 Kind = Literal["shape", "reciprocal", "dynamics", "both"]
 _WINDOWS = (2, 3, 4, 6, 8)
@@ -48,7 +48,7 @@ class Settings:
         performances: Learn from so many made-up takes of the embedded performer instead.
         frames: Of each made-up take.
         out: Folder for the model, its card and its pictures; two folders, OUT_shape and OUT_dynamics, for both kinds.
-        kind: shape (a mixture of Gaussians a half of the face), reciprocal (the paper's 1/P over a Parzen window),
+        kind: shape (a bell with heavy tails), reciprocal (the paper's 1/P over a Parzen window),
             dynamics, or both (shape and dynamics).
         rig: The rig that the priors are for: its names, and marker takes are solved with it.
         attachment: Where the markers of marker takes sit, as JSON.
@@ -60,7 +60,8 @@ class Settings:
         input_noise: Standard deviation of the weights in a window, for windows of solved weights.
         strength: Of the shape prior; chosen by trial solves if absent.
         bandwidth: Of the Parzen window (reciprocal); the automatic one, or what trials say is better, if absent.
-        pixel_noise: Of the points in the trial solves, in millimetres on the face.
+        pixel_noise: Of the landmarks in the trial solves, pixels.
+        trial_frames: How many frames of each take are solved in a trial.
         inducing: How many windows stand for all others.
         rounds: Of the ascent on the marginal likelihood.
         seed: Draws made-up takes, windows and noise.
@@ -83,7 +84,8 @@ class Settings:
     input_noise: float = 0.01
     strength: float | None = None
     bandwidth: float | None = None
-    pixel_noise: float = 0.7
+    pixel_noise: float = 1.0
+    trial_frames: int = 60
     inducing: int = 100
     rounds: int = 50
     seed: int = 0
@@ -135,7 +137,8 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
     """A shape prior; its strength is chosen with the last of the takes to learn from, left out for that."""
     learn, test, names = material.learn, material.test, material.learn.names
     fitting, choosing = _for_choice(learn)
-    trial = observed(material.rig, names, choosing.weights, settings.pixel_noise, settings.seed)
+    noise, count = settings.pixel_noise, settings.trial_frames
+    trial = filmed(material.rig, names, choosing.weights, noise, 2 * count, settings.seed)
     points: dict[str, list[tuple[float, float]]] = {}
     strength = 1.0 if settings.strength is None else settings.strength
     width = settings.bandwidth
@@ -148,13 +151,13 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
         widths = {1.0: []}
     least, chosen = float("inf"), next(iter(widths))
     if trial is not None:
-        points["none"] = [(s, solve_error(trial, None)) for s in (_STRENGTHS[0], _STRENGTHS[-1])]
+        points["none"] = [(s, solve_error(trial, None, noise)) for s in (_STRENGTHS[0], _STRENGTHS[-1])]
         say("choosing the strength by trial solves")
         for factor, own in widths.items():
-            prior = _fitted(settings.kind, fitting, own, settings.seed).double()
+            prior = _fitted(settings.kind, fitting, own, settings.seed)
             tried = _STRENGTHS if settings.strength is None else (settings.strength,)
             label = f"{factor:g} times the automatic bandwidth" if own else "this prior"
-            points[label] = [(s, solve_error(trial, with_strength(prior, s).double())) for s in tried]
+            points[label] = [(s, solve_error(trial, with_strength(prior, s), noise)) for s in tried]
             best = min(points[label], key=lambda point: point[1])
             if best[1] < least:
                 least, chosen, strength = best[1], factor, best[0]
@@ -165,25 +168,25 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
     if settings.kind != "reciprocal":
         metrics["held out, log density a frame"] = float(prior.double().log_density(together).mean())
         single = ShapePrior(names, prior.groups, [_gaussian(learn, group) for group in prior.groups])
-        metrics["held out, log density of one Gaussian a half"] = float(single.log_density(together).mean())
-    tested = observed(material.rig, names, test.weights, settings.pixel_noise, settings.seed + 1)
+        metrics["held out, log density of one Gaussian"] = float(single.log_density(together).mean())
+    tested = filmed(material.rig, names, test.weights, noise, count, settings.seed + 1)
     if tested is not None:
         metrics |= {
-            "held out, error of a weight without a prior": solve_error(tested, None),
-            "held out, error of a weight": solve_error(tested, prior.double()),
+            "held out, error of a weight without a prior": solve_error(tested, None, noise),
+            "held out, error of a weight": solve_error(tested, prior, noise),
         }
     prior = prior.float()
     card = (
         "Which weights faces have: "
         + (
-            "a mixture of Gaussians with full covariances for each half of the face"
+            "a bell with heavy tails about the face at rest, with what shapes do together"
             if settings.kind != "reciprocal"
             else "the paper's 1/P over a Parzen window for each half of the face"
         )
         + ". Holds a solve from few points, such as 68 landmarks of one camera, to faces like those it has learned "
         f"from. {_limits(settings, material)} The strength was chosen by solves of a take that was left out, from 68 "
-        f"points seen from straight ahead with {settings.pixel_noise:g} mm of noise; 1 is Bayes' rule. The test takes "
-        "took no part in that."
+        f"landmarks of one camera with {settings.pixel_noise:g} pixel of noise, the head's pose unknown; 1 is Bayes' "
+        "rule. The test takes took no part in that."
     )
     _save(prior, out, settings, material, metrics, card)
     folder = settings.pictures or out / "pictures"
@@ -215,7 +218,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[
             found = one_step(fitted(fitting, candidate), choosing.weights, settings.input_noise).metrics()
             for key, values in tried.items():
                 values.append((candidate, found[key]))
-        scores = tried["negative log likelihood a weight"]
+        scores = tried["one-step error"]
         if not scores:
             raise ValueRangeError(
                 f"takes: the shortest has {shortest} frames, expected more than {_WINDOWS[0] + 8}, or a window"
@@ -300,15 +303,13 @@ def _gaussian(takes: PriorTakes, group: Sequence[int]) -> GaussianMixture:
 
 
 def _densities(prior: ShapePrior) -> dict[str, float]:
-    """How many components each half has, and how wide a Parzen window's bells are."""
+    """How many bells a Parzen window has in each half, and how wide they are."""
     found = {}
     for number, density in enumerate(prior.densities):
         half = ("upper", "lower")[number] if len(prior.groups) == 2 else f"group {number}"
         if isinstance(density, ParzenDensity):
             found[f"centers, {half}"] = float(len(density.centers))
             found[f"bandwidth, {half}"] = float(density.bandwidth)
-        elif isinstance(density, GaussianMixture):
-            found[f"components, {half}"] = float(len(density.means))
     return found
 
 
@@ -351,7 +352,7 @@ def _save(
         flags = f"--takes {settings.takes.name}"
     standard = Settings()
     for name in ("rig", "attachment", "part", "fps", "held_out", "window", "input_noise", "strength", "bandwidth",
-                 "pixel_noise", "inducing", "rounds"):  # fmt: skip
+                 "pixel_noise", "trial_frames", "inducing", "rounds"):  # fmt: skip
         value = getattr(settings, name)
         if value != getattr(standard, name):
             flags += f" --{name.replace('_', '-')} {value.name if isinstance(value, Path) else value}"
