@@ -275,12 +275,10 @@ def _grow_tree(
 ) -> None:
     """Grows one tree on grey values (P,N) and takes what it says from the residual (N,K)."""
     features, count = grey.shape
-    some = count
-    chosen = torch.arange(count)
-    if 0 < settings.split_samples < count:
-        some = settings.split_samples
-        chosen = torch.randint(count, (some,), generator=generator)
-    seen, wanted = grey[:, chosen].flatten(), residual[chosen]
+    # Starts that follow each other are of different pictures: a run of them is as good as a draw, and is no copy.
+    some = min(settings.split_samples or count, count)
+    begin = int(torch.randint(count - some + 1, (), generator=generator))
+    wanted = residual[begin : begin + some]
     node = torch.zeros(some, dtype=torch.int64)
     every, column, flat = torch.zeros(count, dtype=torch.int64), torch.arange(count), grey.view(-1)
     for level in range(settings.depth):
@@ -295,7 +293,8 @@ def _grow_tree(
         for one, members in enumerate(rows):  # a node at a time: they hold different numbers of samples
             if not len(members):
                 continue
-            difference = seen[(first[one] * some)[:, None] + members] - seen[(second[one] * some)[:, None] + members]
+            place = begin + members
+            difference = flat[(first[one] * count)[:, None] + place] - flat[(second[one] * count)[:, None] + place]
             # A threshold is what a sample of the node has, so that no test is idle; a half, as it is stored.
             sample = (picked[one] * len(members)).long()
             limits = difference.gather(1, sample[:, None])[:, 0].half().float()
