@@ -52,7 +52,7 @@ def track(
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
         texture: A picture to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
-        whole_take: Solve all frames at once: smooth curves, gaps bridged.
+        whole_take: Smooth the head's pose over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
         no_overlay: Draw no overlay video.
         live: A camera's number, such as 0, or a video file that is played in its own time.

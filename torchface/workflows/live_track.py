@@ -113,7 +113,8 @@ class LiveSolver:
         self._state = self._solver.step(
             self._state, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
         )
-        return LiveFrame(self._state.weights.detach(), self._state.rotation.detach(), seen.landmarks)
+        weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
+        return LiveFrame(weights, rotation, seen.landmarks)
 
 
 def track_live(

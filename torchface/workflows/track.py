@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 import torchface
 from torchface.capture.video import VideoSolution, VideoSolver
 from torchface.capture.video.pose import HeadPoses, measure_poses, smooth_poses, track_pose
+from torchface.capture.video.whole_take import solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files import write_file
 from torchface.geometry.calibration import CameraCalibration, assumed_calibration
@@ -24,10 +25,20 @@ from torchface.io.paint import load_paint
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.face_box import find_faces
 from torchface.landmarks.tracking import LandmarkTracker
+from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
-from torchface.workflows.track_files import OVERLAY, SUMMARY, keep_solution, kept_solution, summary, write_curves
+from torchface.workflows.track_files import (
+    OVERLAY,
+    SUMMARY,
+    keep_light,
+    keep_solution,
+    kept_light,
+    kept_solution,
+    summary,
+    write_curves,
+)
 from torchface.workflows.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
-from torchface.workflows.track_overlay import write_overlay
+from torchface.workflows.track_overlay import video_light, write_overlay
 from torchface.workflows.track_result import FEWEST_STABLE, Tracked
 from torchface.workflows.track_state import TrackedFrames, TrackState, digest, file_digest
 
@@ -49,7 +60,7 @@ class TrackSettings:
         landmarks, appearance, prior, dynamics: models by name or folder.
         camera: a calibration; a focal length is assumed without.
         face: which of several, from 0, the largest first.
-        whole_take: weights of all frames at once, smooth over time.
+        whole_take: poses from all frames, those after each too; weights as well where there is a dynamics prior.
         part: keep this region of the rig only.
         texture: a picture to put on the face in the overlay, in the rig's texture coordinates.
         overlay: draw the overlay video.
@@ -120,7 +131,7 @@ def track_video(
         begin = time.perf_counter()
         noise = landmark_noise(pinhole, models)
         solver = VideoSolver(actor, None, calibration.intrinsics, models.prior, models.dynamics, noise)
-        solution = _solve(solver, pinhole, poses, frames.confidence, progress)
+        solution = _solve(solver, pinhole, poses, frames.confidence, settings.whole_take, progress)
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
@@ -130,6 +141,8 @@ def track_video(
         texture_key = "" if settings.texture is None else file_digest(settings.texture)
         overlay_key = digest(solve_key, texture_key)
         products["overlay"] = out / OVERLAY
+        if settings.texture is not None:
+            tracked = replace(tracked, light=_light(tracked, state, solve_key, progress))
         if not state.is_current(out / OVERLAY, overlay_key):
             begin = time.perf_counter()
             write_overlay(tracked, out / OVERLAY, settings.texture, progress)
@@ -234,6 +247,21 @@ def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, p
     return faces
 
 
+def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress | None) -> PointLight:
+    kept = kept_light(state, key)
+    if kept is not None:
+        return kept
+    if progress is not None:
+        progress("light", 0, 1)
+    begin = time.perf_counter()
+    found = video_light(tracked)
+    tracked.seconds["light"] = time.perf_counter() - begin
+    keep_light(state, key, found)
+    if progress is not None:
+        progress("light", 1, 1)
+    return found
+
+
 def _poses(
     rig: BlendshapeRig, landmarks: Tensor, calibration: CameraCalibration, whole_take: bool, path: Path
 ) -> HeadPoses:
@@ -251,9 +279,14 @@ def _solve(
     landmarks: Tensor,
     poses: HeadPoses,
     confidence: Tensor,
+    whole_take: bool,
     progress: Progress | None,
 ) -> VideoSolution:
     rotation, translation = poses.rotation.to(landmarks), poses.translation.to(landmarks)
+    if whole_take and solver.dynamics is not None:
+        if progress is not None:
+            progress("weights", 0, len(landmarks))
+        return solve_whole_take(solver, landmarks, rotation, translation, confidence)
     enough = torch.isfinite(landmarks).all(-1).sum(1) >= FEWEST_STABLE
     first = int(enough.nonzero()[0, 0])
     states, state = [], solver.start()
@@ -264,7 +297,8 @@ def _solve(
             progress("weights", t + 1, len(landmarks))
     states = [states[0]] * first + states
     weights, turned, moved = (
-        torch.stack([getattr(one, name) for one in states]) for name in ("weights", "rotation", "translation")
+        torch.stack([getattr(one, name) for one in states]).detach().to(landmarks)
+        for name in ("weights", "rotation", "translation")
     )
     errors = solver.reprojection_errors(landmarks, weights, turned, moved)
     return VideoSolution(weights, turned, moved, errors, enough)

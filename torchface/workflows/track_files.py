@@ -8,20 +8,21 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from torchface.capture.video import VideoSolution
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, TorchfaceError
 from torchface.files import read_file, write_file
 from torchface.io import save_animation
 from torchface.io.landmarks_csv import save_landmarks_csv
 from torchface.io.live_link import save_live_link
 from torchface.io.weights import save_weights_csv
 from torchface.landmarks.tracking import LANDMARK_NAMES
+from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 from torchface.workflows.head_rotations import rotation_columns
 from torchface.workflows.track_result import Tracked
 from torchface.workflows.track_state import TrackState
 
-SOLUTION, WEIGHTS, LIVE_LINK = "solution.safetensors", "weights.csv", "live_link.csv"
+SOLUTION, LIGHT, WEIGHTS, LIVE_LINK = "solution.safetensors", "light.safetensors", "weights.csv", "live_link.csv"
 LANDMARKS, ANIMATION, OVERLAY, SUMMARY = "landmarks.csv", "animation.glb", "overlay.mp4", "summary.json"
 
 _FORMAT = "torchface.track-summary/1"
@@ -29,6 +30,7 @@ _LARGEST_SOLUTION = 2**31
 
 
 def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
+    """Keeps a solution for a later run."""
     tensors = {
         name: getattr(solution, name).detach().float().contiguous()
         for name in ("weights", "rotation", "translation", "errors")
@@ -39,6 +41,7 @@ def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
 
 
 def kept_solution(state: TrackState, key: str, frames: int, shapes: int) -> VideoSolution | None:
+    """The solution of an earlier run, if it is whole and of these frames and shapes."""
     path = state.folder / SOLUTION
     if not state.is_current(path, key):
         return None
@@ -49,6 +52,27 @@ def kept_solution(state: TrackState, key: str, frames: int, shapes: int) -> Vide
         return VideoSolution(**found)
     except (SafetensorError, FileFormatError, KeyError, TypeError, ValueError):
         return None  # made anew
+
+
+def keep_light(state: TrackState, key: str, light: PointLight) -> None:
+    """Keeps a video's light for a later run."""
+    path = state.folder / LIGHT
+    tensors = {
+        name: getattr(light, name).detach().float().contiguous() for name in ("ambient", "intensity", "position")
+    }
+    write_file(path, save(tensors))
+    state.made(path, key)
+
+
+def kept_light(state: TrackState, key: str) -> PointLight | None:
+    """The light of an earlier run, if it is whole and of this video's solution."""
+    path = state.folder / LIGHT
+    if not state.is_current(path, key):
+        return None
+    try:
+        return PointLight(**load(read_file(path, _LARGEST_SOLUTION)))
+    except (SafetensorError, TorchfaceError, KeyError, TypeError, ValueError):
+        return None  # found anew
 
 
 def save_curves(take: Take, out: Path) -> dict[str, Path]:

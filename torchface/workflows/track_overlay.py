@@ -24,7 +24,7 @@ from torchface.workflows.track_result import Tracked
 
 CHUNK = 8
 _STRENGTH = 0.6
-_LIGHT_FRAMES = 4
+_LIGHT_FRAMES = 2
 _EVEN_SKIN = (0.80, 0.62, 0.53)
 _SKIN = (0.62, 0.74, 0.90)
 _FOUND, _SOLVED = (60, 230, 60), (250, 70, 60)
@@ -85,7 +85,7 @@ def paint_drawer(tracked: Tracked, texture: Path) -> Callable[[int, Tensor], Ten
     """
     rig = tracked.rig
     paint = FacePaint.of(rig.neutral, load_paint(texture))
-    light = video_light(tracked)
+    light = video_light(tracked) if tracked.light is None else tracked.light
     weights = tracked.solution.weights.detach().to(rig.deltas)
 
     def draw(t: int, frame: Tensor) -> Tensor:
