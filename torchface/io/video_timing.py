@@ -20,8 +20,8 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     """Refuses a video of variable frame rate: what is solved counts in frames of one length.
 
     Cameras of telephones jitter by some milliseconds and lose a frame now and then: that passes. What does not: a
-    rate that changes by more than a tenth, over fifteen frames, and holes of more than half a frame that are more
-    than one in a hundred frames.
+    rate that changes by more than a tenth, fifteen frames taken together, and holes in which more than one frame in a
+    hundred is missing.
 
     Args:
         path: for the message.
@@ -37,12 +37,13 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     usual = float(np.median(lasts))
     holes = np.abs(lasts / usual - 1) > _HOLE
     usual = float(lasts[~holes].mean())
+    missing = int(np.maximum(np.rint(np.abs(lasts[holes] / usual - 1)), 1).sum())
     window = min(_WINDOW, len(lasts))
-    means = np.convolve(lasts, np.full(window, 1 / window), mode="valid")
+    means = np.convolve(np.where(holes, usual, lasts), np.full(window, 1 / window), mode="valid")
     allowed = _RATE_CHANGE * usual + _ROUNDING
-    if holes.sum() > 1 + _HOLES * len(lasts):
-        what = f"{int(holes.sum())} of {len(lasts)} frames last more than half a frame longer or shorter"
-    elif np.abs(means - usual).max() > allowed:
+    if missing > 1 + _HOLES * len(lasts):
+        what = f"{int(holes.sum())} of {len(lasts)} last more than half a frame longer or shorter"
+    elif means.max() - means.min() > allowed:
         worst = int(np.abs(means - usual).argmax())
         what = f"from frame {worst} to {worst + window} they last {1000 * means[worst]:.1f} ms each"
     elif abs(float(lasts.mean()) - 1 / fps) > allowed:
