@@ -135,6 +135,8 @@ def overlay(
         return frame
     colors = paint.at(covered, _coarseness(covered, paint))
     painted = (colors[:, 3] > 1e-4).nonzero()[:, 0]
+    if len(painted) == 0:
+        return frame
     covered, colors = covered.select(painted), colors[painted]
     shade = _light_on(covered, light, _soft_shadow(covered, light))
     mixed = covered.blended(to_linear(picture), colors[:, :3] * shade, colors[:, 3])
