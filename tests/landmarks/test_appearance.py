@@ -14,6 +14,7 @@ from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.appearance_level import TextureResidual, sample_pixels
+from torchface.landmarks.ibug import box_around
 from torchface.landmarks.shape_modes import learn_shape_modes, planar_pose, procrustes_mean, similarity_modes
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
@@ -79,6 +80,15 @@ def test_extreme_faces_are_found_from_a_start_that_leans_to_rest(film: PortraitF
     assert (fit.error < fit.start_error).all()
 
 
+def test_extreme_faces_have_at_most_six_tenths_of_the_trees_error(film: PortraitFilm, model: AppearanceModel) -> None:
+    truth = film.landmarks[TRAINED:]
+    trees = zoo.get_model("face_landmarks")
+    with torch.no_grad():
+        start = trees(images(film), box_around(truth))
+    fit = model.refine(images(film), start)
+    assert mean_error(fit.landmarks, truth).mean() <= 0.6 * mean_error(start, truth).mean()
+
+
 def test_the_error_tells_a_good_fit_from_a_bad_one(film: PortraitFilm, model: AppearanceModel) -> None:
     truth = film.landmarks[TRAINED:]
     good = model.error(images(film), truth)
@@ -107,7 +117,8 @@ def test_a_larger_and_turned_picture_has_its_landmarks_where_they_were(
     turned = torch.nn.functional.interpolate(pictures, scale_factor=2.0, mode="bilinear").flip(2, 3)
     size = torch.tensor([turned.shape[3], turned.shape[2]])
     again = model(turned, size - 1 - (2 * start + 0.5))
-    torch.testing.assert_close((size - 1 - again - 0.5) / 2, found, atol=0.35, rtol=0)
+    apart = ((size - 1 - again - 0.5) / 2 - found).norm(dim=2)
+    assert apart.mean() < 0.15  # along the jaw, where nothing holds a landmark, single ones slide further
 
 
 def test_colour_and_light_do_not_matter(film: PortraitFilm, model: AppearanceModel) -> None:
@@ -283,6 +294,18 @@ def test_files_that_could_not_have_been_learned_are_refused(
     zoo.save_model(model, tmp_path / "actor", licence="MIT", data="a film", metrics={}, recipe="none")
     with pytest.raises(FileFormatError, match="config and state do not fit"):
         zoo.get_model(tmp_path / "actor")
+
+
+def test_a_start_beside_the_face_ends_at_something_finite(film: PortraitFilm, model: AppearanceModel) -> None:
+    """Noise, black, a start half outside: whatever comes out is where a face could be, and not better by mistake."""
+    start = film.landmarks[TRAINED : TRAINED + 3]
+    noise = torch.rand(3, 1, 300, 240, generator=torch.Generator().manual_seed(0))
+    noise[1] = 0.0
+    start = start + torch.tensor([0.0, 0, 150]).view(3, 1, 1)
+    fit = model.refine(noise, start)
+    assert torch.isfinite(fit.landmarks).all()
+    assert (fit.landmarks - start).norm(dim=2).mean(1).max() < 2 * eyes_apart(start).max()
+    assert (fit.error > 2.0).all()
 
 
 def test_a_face_that_is_lost_stays_lost(film: PortraitFilm, model: AppearanceModel) -> None:
