@@ -47,9 +47,10 @@ def lag(values: Tensor, truth: Tensor) -> float:
     return best - 5 + 0.5 * float((before - after) / (before - 2 * here + after))
 
 
-def test_the_last_filtered_frame_is_the_least_squares_solution() -> None:
+@pytest.mark.parametrize("fading", [1.0, 0.9])
+def test_the_last_filtered_frame_is_the_least_squares_solution(fading: float) -> None:
     values = measured(head_motion(12, 2))
-    settings = KalmanSettings(1.5, 0.4)
+    settings = KalmanSettings(1.5, 0.4, fading=fading)
     transition, noise = KalmanFilter(1, settings)._transition, KalmanFilter(1, settings)._noise[0]
     frames = len(values)
     # All frames' states at once: measurements, transitions and what is known of the first, each over its deviation.
@@ -142,6 +143,10 @@ def test_any_pattern_of_gaps(frames: int, channels: int, seed: int) -> None:
 def test_bad_input() -> None:
     with pytest.raises(ValueRangeError, match="positive deviations"):
         KalmanSettings(0.0, 1.0)
+    with pytest.raises(ValueRangeError, match="different fading"):
+        KalmanFilter(2, [KalmanSettings(1, 1), KalmanSettings(1, 1, fading=0.5)])
+    with pytest.raises(ShapeError, match="found 3 settings, expected one or 2"):
+        KalmanFilter(2, [KalmanSettings(1, 1)] * 3)
     with pytest.raises(ShapeError, match="a frame at least"):
         kalman_filter(torch.zeros(0, 2), KalmanSettings(1, 1))
     with pytest.raises(ValueRangeError, match="infinite"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ class AdaptiveSettings:
     Args:
         measurement: deviations of the measurements, in their unit.
         jerk: deviations of what the acceleration changes by in a frame, rising.
+        fading: see :class:`KalmanSettings`.
         calm: share of each motion's credit that goes to the next calmer one: what is most likely still jitters more
             than eyes forgive, and a little calmer is hardly less exact.
         memory: frames after which a forecast counts 1/e.
@@ -27,6 +28,7 @@ class AdaptiveSettings:
 
     measurement: tuple[float, ...] = (0.2, 0.6, 1.5, 4.0)
     jerk: tuple[float, ...] = (0.003, 0.01, 0.033, 0.11, 0.36, 1.2)
+    fading: float = 0.92
     calm: float = 0.3
     memory: float = 30.0
     longest_gap: int = 10
@@ -47,7 +49,7 @@ class AdaptiveSettings:
     def combinations(self) -> list[KalmanSettings]:
         """Every measurement with every jerk, jerks running faster."""
         pairs = itertools.product(self.measurement, self.jerk)
-        return [KalmanSettings(noise, jerk, self.longest_gap) for noise, jerk in pairs]
+        return [KalmanSettings(noise, jerk, self.longest_gap, self.fading) for noise, jerk in pairs]
 
 
 class AdaptiveFilter:
@@ -130,7 +132,7 @@ def adaptive_smoother(values: Tensor, settings: AdaptiveSettings | None = None) 
     _check(values)
     chosen = settings or AdaptiveSettings()
     points, dimensions = values.shape[1:]
-    endless = AdaptiveSettings(chosen.measurement, chosen.jerk, 0.0, 1e9, len(values))
+    endless = replace(chosen, calm=0.0, memory=float("inf"), longest_gap=len(values))
     running = AdaptiveFilter(points, dimensions, endless)
     for frame in values:  # a frame needs the one before
         running.step(frame)

@@ -1,0 +1,115 @@
+"""A filter that finds its settings while it runs: as good as one that was told them, whatever moves."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.temporal import (
+    AdaptiveFilter,
+    AdaptiveSettings,
+    KalmanSettings,
+    adaptive_filter,
+    adaptive_smoother,
+    estimate_settings,
+    kalman_filter,
+)
+
+
+def motion(size: float, frames: int = 240, points: int = 8) -> Tensor:
+    """Points that swing by ``size`` pixels, 30 frames a second, with a third as much twice as quick: (T,P,2)."""
+    generator = torch.Generator().manual_seed(0)
+    time = torch.arange(frames, dtype=torch.float64)[:, None, None] / 30
+    phase = 6.3 * torch.rand(1, points, 2, generator=generator, dtype=torch.float64)
+    return 300 + size * ((2 * math.pi * 0.4 * time + phase).sin() + 0.3 * (2 * math.pi * 0.9 * time).cos())
+
+
+def noisy(truth: Tensor, noise: float) -> Tensor:
+    return truth + noise * torch.randn(truth.shape, generator=torch.Generator().manual_seed(1), dtype=truth.dtype)
+
+
+def jitter(values: Tensor) -> float:
+    return float(values[20:].diff(n=2, dim=0).square().mean().sqrt())
+
+
+@pytest.mark.parametrize(
+    ("size", "noise", "most"), [(40.0, 1.5, 0.4), (4.0, 1.5, 0.25), (0.0, 1.5, 0.18), (40.0, 3.5, 0.35)]
+)
+def test_as_good_as_told_whatever_moves(size: float, noise: float, most: float) -> None:
+    truth = motion(size)
+    values = noisy(truth, noise)
+    found = adaptive_filter(values)
+    told = kalman_filter(values, estimate_settings(values))
+    assert jitter(found - truth) < most * jitter(values - truth)
+    error, best = ((each - truth)[30:].square().mean().sqrt() for each in (found, told))
+    assert error < 1.25 * best
+    smoothed = adaptive_smoother(values)
+    assert jitter(smoothed - truth) < 0.03 * jitter(values - truth)
+    assert (smoothed - truth)[30:].square().mean().sqrt() < 0.65 * error
+
+
+def test_each_point_for_itself() -> None:
+    truth = torch.cat([motion(40.0), motion(0.0)], dim=1)
+    values = truth + torch.cat([noisy(motion(0.0), 0.4), noisy(motion(0.0), 3.0)], dim=1) - 300
+    running = AdaptiveFilter(16, 2)
+    for frame in values:
+        running.step(frame)
+    combinations = running.settings.combinations()
+    likely = [combinations[m] for m in running.scores.argmax(0).tolist()]
+    assert {one.measurement for one in likely[:8]} <= {0.2, 0.6}
+    assert {one.measurement for one in likely[8:]} <= {1.5, 4.0}
+    assert min(one.jerk for one in likely[:8]) > max(one.jerk for one in likely[8:])
+
+
+def test_one_model_is_the_kalman_filter() -> None:
+    values = noisy(motion(10.0, 40, 3), 1.0)
+    values[10:14, 1] = torch.nan
+    alone = AdaptiveSettings((1.0,), (0.1,), longest_gap=2, fading=0.9)
+    torch.testing.assert_close(
+        adaptive_filter(values, alone), kalman_filter(values, KalmanSettings(1.0, 0.1, 2, 0.9)), equal_nan=True
+    )
+
+
+@settings(max_examples=15)
+@given(st.integers(1, 25), st.integers(0, 10**6), st.integers(0, 5))
+def test_any_pattern_of_gaps(frames: int, seed: int, longest: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randn(frames, 2, 2, generator=generator)
+    unseen = torch.rand(frames, 2, generator=generator) < 0.5
+    values[unseen] = torch.nan
+    chosen = AdaptiveSettings((0.5, 1.0), (0.1, 0.3), longest_gap=longest)
+    smoothed = adaptive_smoother(values, chosen)
+    filtered = adaptive_filter(values, chosen)
+    assert torch.isfinite(filtered[~unseen]).all()
+    assert torch.isfinite(smoothed[~unseen]).all()
+    for point in range(2):
+        run, begun = 0, False
+        for t in range(frames):
+            run = run + 1 if unseen[t, point] else 0
+            begun = begun or run == 0
+            assert bool(filtered[t, point].isnan().all()) == (not begun or run > longest)
+            if not begun:
+                assert smoothed[t, point].isnan().all()
+
+
+def test_bad_input() -> None:
+    with pytest.raises(ShapeError, match=r"found \(3, 2\), expected \(4, 2\)"):
+        AdaptiveFilter(4, 2).step(torch.zeros(3, 2))
+    with pytest.raises(ShapeError, match="expected \\(T,P,D\\)"):
+        adaptive_smoother(torch.zeros(3, 2))
+    with pytest.raises(ValueRangeError, match="infinite"):
+        adaptive_filter(torch.full((2, 1, 1), torch.inf))
+    with pytest.raises(ValueRangeError, match="rising"):
+        AdaptiveSettings(jerk=(1.0, 0.1))
+    with pytest.raises(ValueRangeError, match=r"fading 1\.5"):
+        AdaptiveSettings(fading=1.5)
+    with pytest.raises(ValueRangeError, match="calm 2"):
+        AdaptiveSettings(calm=2.0)
+    with pytest.raises(ValueRangeError, match="positive deviations"):
+        AdaptiveSettings(measurement=(-1.0,))
