@@ -28,7 +28,7 @@ TURN, SHIFT = 0.02, 4.0
 """How far a head moves from frame to frame: standard deviations in radians and millimetres."""
 
 _FEWEST = 6
-_ROUNDS = 30
+_ROUNDS, _SLIDING_ROUNDS = 30, 3
 # What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre.
 _LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
 # Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full.
@@ -116,6 +116,14 @@ class FrameTerms:
         return (*own, mean.weights, mean.rotation, mean.translation)
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Weights and poses of B frames, and which point of the rig each landmark is in them, (B,68)."""
+
+    head: HeadState
+    rows: Tensor
+
+
 class VideoSolver(nn.Module):
     r"""Solves 68 landmarks in one camera's frames for blendshape weights, and the head's pose with them.
 
@@ -178,7 +186,7 @@ class VideoSolver(nn.Module):
         dynamics_strength: float = 1.0,
         pose_trust: float = 0.0,
         contour_slide: float = CONTOUR_SLIDE,
-        tolerance: float = 1e-3,
+        tolerance: float = 3e-3,
     ) -> None:
         super().__init__()
         self.names = rig.names
@@ -320,11 +328,12 @@ class VideoSolver(nn.Module):
             if state.solved and state.belief is not None
             else HeadState(expected.mean.weights, rotation, translation)
         )
-        begin = expected.mean.weights if state.belief is not None or state.head is None else state.head.weights
-        head = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
+        begin = expected.mean.weights if state.head is None else state.head.weights
+        solved = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
+        head = solved.head
         if self.dynamics is None:
             return VideoState(head, None, state.window, enough)
-        belief = expected.updated(head, self.seen(terms, head))
+        belief = expected.updated(head, self.seen(terms, head, solved.rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
         return VideoState(head, belief, window, enough)
 
@@ -346,22 +355,28 @@ class VideoSolver(nn.Module):
             steps, variance = mean.double() - state.window[:, -1], variance.double() / self.dynamics_strength
         return belief.predicted(steps, variance, self._motion)
 
-    def solve(self, terms: FrameTerms, start: HeadState) -> HeadState:
+    def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
         with torch.no_grad():
-            head = start
-            for _ in range(_ROUNDS):
-                before, head = head, self._advanced(terms, head)
+            head, rows = start, self._chosen(start)
+            for turn in range(_ROUNDS):
+                # Which points the contour's landmarks are is settled first; later it could go back and forth.
+                if 0 < turn < _SLIDING_ROUNDS:
+                    rows = self._chosen(head)
+                before, head = head, self._advanced(terms, head, rows)
                 if float((head.weights - before.weights).abs().max()) < self.tolerance:
                     break
         if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
-            return self._attached(terms, head)
-        return head
+            head = self._attached(terms, head, rows)
+        return Solved(head, rows)
 
-    def _advanced(self, terms: FrameTerms, head: HeadState) -> HeadState:
+    def _chosen(self, head: HeadState) -> Tensor:
+        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics)
+
+    def _advanced(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """One Gauss-Newton step: a quadratic program, warm-started."""
         shapes = len(self.names)
-        energy = self.energy(terms, head)
+        energy = self.energy(terms, head, rows)
         begin = torch.nn.functional.pad(head.weights, (0, 6))
         H = 0.5 * (energy.H + energy.H.transpose(1, 2))
         exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
@@ -369,14 +384,13 @@ class VideoSolver(nn.Module):
         found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
         return head.moved(found[:, :shapes], found[:, shapes:])
 
-    def energy(self, terms: FrameTerms, head: HeadState) -> Quadratic:
+    def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
         weights = self._constant if self.prior is None else self._constant + self.prior.energy(head.weights)
-        return self.seen(terms, head) + terms.expected.quadratic(head) + _beside_motion(weights)
+        return self.seen(terms, head, rows) + terms.expected.quadratic(head) + _beside_motion(weights)
 
-    def seen(self, terms: FrameTerms, head: HeadState) -> Quadratic:
+    def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """What landmarks and tracked poses tell, linearised at a state, over weights and motion from there, (B,N+6)."""
-        rows = self.points.chosen(head.weights.detach(), head.rotation, head.translation, self.intrinsics)
         at = linearise(self.points, head, rows, self.intrinsics, terms.landmarks, terms.precision, self.contour_slide)
         told = at.quadratic(head.weights)
         if self.pose_trust == 0:
@@ -388,13 +402,13 @@ class VideoSolver(nn.Module):
         H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
         return told + Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
 
-    def _attached(self, terms: FrameTerms, head: HeadState) -> HeadState:
+    def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """The converged state as a differentiable function of the terms."""
         shapes = len(self.names)
 
         def gradient(x: Tensor) -> Tensor:
             near = head.moved(x[:, :shapes], x[:, shapes:])
-            energy = self.energy(terms, near)
+            energy = self.energy(terms, near, rows)
             here = torch.nn.functional.pad(near.weights, (0, 6))
             return (energy.H @ here[..., None])[..., 0] + energy.f
 

@@ -105,4 +105,4 @@ def _solved(solver: VideoSolver, states: list[VideoState], smoothed: Belief) -> 
         smoothed.mean.translation,
         expected,
     )
-    return solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation))
+    return solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation)).head
