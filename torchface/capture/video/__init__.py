@@ -1,5 +1,6 @@
 """Head pose and blendshape weights from one ordinary camera without markers."""
 
 from torchface.capture.video.solve import VideoSolution, VideoSolver, VideoState
+from torchface.capture.video.whole_take import solve_whole_take
 
-__all__ = ["VideoSolution", "VideoSolver", "VideoState"]
+__all__ = ["VideoSolution", "VideoSolver", "VideoState", "solve_whole_take"]
