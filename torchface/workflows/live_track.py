@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video import VideoSolver
+from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.capture.video.pose import PoseTracker
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.geometry.calibration import CameraCalibration
@@ -92,7 +93,7 @@ class LiveSolver:
     def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
         self.names = rig.names
         self._tracker = LandmarkTracker(models.trees, models.appearance, face=face)
-        self._calibration = calibration
+        self._calibration, self._filter = calibration, LandmarkFilter()
         self._models, self._rig = models, rig
         self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
         self._solver: VideoSolver | None = None
@@ -100,7 +101,7 @@ class LiveSolver:
     def step(self, frame: Tensor) -> LiveFrame:
         """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0."""
         seen = self._tracker.step(frame)
-        landmarks = undistort(seen.landmarks, self._calibration)
+        landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
         pose = self._poses.step(landmarks, seen.confidence)
         enough = int(torch.isfinite(landmarks).all(1).sum()) >= _FEWEST
         if self._solver is None and not enough:

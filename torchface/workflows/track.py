@@ -13,6 +13,7 @@ from torch import Tensor
 
 import torchface
 from torchface.capture.video import VideoSolution, VideoSolver
+from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.pose import HeadPoses, measure_poses, smooth_poses, track_pose
 from torchface.capture.video.whole_take import solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
@@ -115,8 +116,9 @@ def track_video(
         state.clear()
         raise ValueRangeError(f"{film.path}: found no face in any of its {len(frames)} frames, expected one")
     begin = time.perf_counter()
-    pinhole = undistort(frames.landmarks.double(), calibration).float()
-    poses = _poses(actor, pinhole, calibration, settings.whole_take, film.path)
+    steadied = smooth_landmarks if settings.whole_take else filter_landmarks
+    pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
+    poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, film.path)
     seconds["pose"] = time.perf_counter() - begin
     solve_key = digest(
         see_key,
@@ -263,13 +265,18 @@ def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress | N
 
 
 def _poses(
-    rig: BlendshapeRig, landmarks: Tensor, calibration: CameraCalibration, whole_take: bool, path: Path
+    rig: BlendshapeRig,
+    landmarks: Tensor,
+    confidence: Tensor,
+    calibration: CameraCalibration,
+    whole_take: bool,
+    path: Path,
 ) -> HeadPoses:
     points, intrinsics = rig.vertices[rig.neutral.landmarks], calibration.intrinsics
     try:
         if whole_take:
-            return smooth_poses(measure_poses(points, landmarks, intrinsics))
-        return track_pose(points, landmarks, intrinsics)
+            return smooth_poses(measure_poses(points, landmarks, intrinsics, confidence))
+        return track_pose(points, landmarks, intrinsics, confidence)
     except AlignmentError as error:
         raise AlignmentError(f"{path}: {error}") from error
 

@@ -31,7 +31,7 @@ class Tracked:
         video: the file.
         rig: the actor's.
         frames: what the tracker saw.
-        pinhole: its landmarks as a camera without distortion has them, (T,68,2), pixels.
+        pinhole: its landmarks as a camera without distortion has them, filtered along time, (T,68,2), pixels.
         poses: of the head, from the stable landmarks.
         solution: weights and refined poses.
         calibration: of the camera.
