@@ -12,9 +12,10 @@ from torchface.cli.progress import console, steps
 
 def fit(
     photographs: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTO...")],
-    landmarks: tuple[Path, ...],
     model: str,
     out: Path,
+    landmarks: tuple[Path, ...] = (),
+    landmark_model: str = "face_landmarks",
     template: Path | None = None,
     focal: float | None = None,
     inner_weight: float | None = None,
@@ -22,9 +23,10 @@ def fit(
     texture_size: int = 1024,
     quiet: bool = False,
 ) -> None:
-    """Make a person's rig from one or several photographs with landmarks, and write it as .glb.
+    """Make a person's rig from one or several photographs, and write it as .glb.
 
     A head model is fitted to 68 landmarks in each photograph: identity, expression, poses and focal length at once.
+    Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked at and corrected.
     All photographs show one person with one expression; profiles beside a front view tell how far things stand out.
     The photographs become the rig's texture. Beside OUT lies a picture for each photograph: it, the fit over it, and
     the landmarks, found green and fitted red.
@@ -32,13 +34,14 @@ def fit(
     Args:
         photographs: Image files.
         landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
-            one .xml of dlib's (imglab) that names the photographs.
+            one .xml of dlib's (imglab) that names the photographs; found if absent.
+        landmark_model: What finds them, a model of the zoo by name, or its folder.
         model: A head model of the zoo by name, or its folder.
         out: The .glb to write.
         template: The rig whose shapes the head is given, with the model's topology; the embedded performer if absent.
         focal: Focal length in pixels where it is known; estimated if absent.
         inner_weight: Weight of landmarks at brows, eyes, nose and mouth beside those of the face's contour.
-        face: Which face of a photograph, from 0, where an .xml holds several.
+        face: Which face of a photograph, from 0, where it shows several (the largest first) or an .xml holds several.
         texture_size: Texels a side of the rig's texture; 0 makes none.
         quiet: Show no progress.
     """
@@ -47,8 +50,10 @@ def fit(
 
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
     with steps(quiet) as step:
-        made = fit_photographs(photographs, landmarks, model, out, template, focal, settings, face, texture_size, step)
+        made = fit_photographs(
+            photographs, landmarks, model, out, template, focal, settings, face, texture_size, step, landmark_model
+        )
     for line in made.lines(photographs):
         console.print(line, highlight=False, markup=False)
-    for path in (*made.pictures, out):
+    for path in (*(picture.with_suffix(".pts") for picture in made.pictures[: len(made.found)]), *made.pictures, out):
         print(path)

@@ -14,7 +14,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Top
 from torchface.geometry.camera import Camera
 from torchface.io import load_rig, save_rig
 from torchface.io.images import load_image
-from torchface.io.landmarks import load_landmark_points
+from torchface.io.landmarks import load_landmark_points, save_pts
 from torchface.io.landmarks_dlib import load_dlib_faces
 from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_with_report
@@ -24,6 +24,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import Lighting, render, sample_texture
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
+from torchface.workflows.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
 from torchface.workflows.rig import check_out
 from torchface.workflows.skin import dressed_as, hidden_parts
 
@@ -41,17 +42,19 @@ class FittedHead:
         fit: see ``ImageFit``.
         pictures: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
         transfer_summary: on triangles without area; empty where there are none.
+        found: the landmarks that no file gave; empty where files gave them.
     """
 
     rig: BlendshapeRig
     fit: ImageFit
     pictures: tuple[Path, ...]
     transfer_summary: str
+    found: tuple[FoundLandmarks, ...] = ()
 
     def lines(self, photographs: Sequence[Path]) -> list[str]:
         """For people to read."""
         fit = self.fit
-        lines = []
+        lines = [line for one in self.found for line in one.lines()]
         for i, (path, camera, error) in enumerate(zip(photographs, fit.cameras, fit.errors.tolist(), strict=True)):
             eyes = (fit.landmarks[i, 36] - fit.landmarks[i, 45]).norm()
             lines.append(
@@ -79,22 +82,26 @@ def fit_photographs(
     face: int | None = None,
     texture_size: int = 1024,
     progress: Callable[[str], None] | None = None,
+    landmark_model: str | Path = DEFAULT_LANDMARKS,
 ) -> FittedHead:
     """Fits a head to photographs of one person with one expression and writes it as a rig.
 
     Args:
         photographs: image files.
-        landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all.
+        landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
+            where there are none they are found, and written as .pts beside ``out``.
         model: a head model by name or folder; see ``zoo.get_model``.
         out: the ``.glb`` to write; overlays are written beside it.
         template: a rig with the model's topology; the embedded performer where its topology is the model's.
         focal: length in pixels where it is known.
         settings: how landmarks are trusted.
-        face: which of several in an XML, from 0.
+        face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
         texture_size: texels a side; 0 makes no texture.
         progress: called with a line before each step.
+        landmark_model: finds landmarks where no file gives them; by name or folder.
 
     Raises:
+        NoFaceError: landmarks are to be found where no face is.
         FileFormatError: ``out`` is no ``.glb`` or cannot be written to, or a file is broken.
         NameMismatchError: landmarks do not tell which photograph or face they are of.
         TorchfaceError: landmarks or model are of no use; see ``fit_images``.
@@ -106,7 +113,13 @@ def fit_photographs(
     rig = matching_template(heads, template)
     say(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
-    marks = torch.stack(landmarks_of(photographs, landmarks, face))
+    found: list[FoundLandmarks] = []
+    if landmarks or not photographs:
+        marks = torch.stack(landmarks_of(photographs, landmarks, face))
+    else:
+        say(f"finding the landmarks of {len(photographs)} photographs")
+        found = find_in_photographs(photographs, images, landmark_model, face)
+        marks = torch.stack([one.trusted for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
     fit = fit_images(
         heads,
@@ -129,7 +142,9 @@ def fit_photographs(
     pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn
         save_picture(overlay(fit, i, image, marks[i]), path)
-    return FittedHead(transferred.rig, fit, pictures, transferred.report.summary())
+    for picture, one in zip(pictures, found, strict=False):  # to be corrected and given as --landmarks
+        save_pts(one.face.landmarks, picture.with_suffix(".pts"))
+    return FittedHead(transferred.rig, fit, pictures, transferred.report.summary(), tuple(found))
 
 
 def load_head_model(name_or_path: str | Path) -> HeadModel:
