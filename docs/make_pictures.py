@@ -7,13 +7,19 @@ from pathlib import Path
 
 import torch
 
+from torchface.capture.video.lighting import estimate_light
 from torchface.geometry.camera import look_at
 from torchface.io import load_image, load_rig, save_image
+from torchface.io.video import open_video
 from torchface.registration import register
 from torchface.rendering.compositing import caption, from_pillow, save_picture, sheet
+from torchface.rendering.overlay import FacePaint, overlay, relight
+from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.shading import render
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.face_paint import face_paint
+from torchface.synthetic.light_stage import LightStageSettings, film_under_light
 from torchface.synthetic.scanner import eyes_closed, scan_head
 from torchface.viz.faces import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
 from torchface.viz.registration import registration_sheet
@@ -92,6 +98,34 @@ def fit_picture() -> torch.Tensor:
     return sheet(cells, 6)
 
 
+def relight_picture() -> torch.Tensor:
+    """A film's frame, the same under the lamp's mirror image, and with face paint in the light that the frame told."""
+    rig = performer(draw_identities(1, torch.Generator().manual_seed(5))[0])
+    weights = torch.zeros(1, len(rig.names))
+    weights[0, rig.index(["mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight"])] = 0.55
+    lamp = PointLight(
+        torch.tensor([0.13, 0.15, 0.2]), torch.tensor([1.0, 0.88, 0.74]), torch.tensor([-520.0, -280, 150])
+    )
+    stage = LightStageSettings(width=600, height=360, samples=3, noise=0.006, span=300.0)
+    with tempfile.TemporaryDirectory() as folder:
+        film = film_under_light(
+            Path(folder) / "film.avi", rig, weights, lamp, 12.0, torch.Generator().manual_seed(2), stage
+        )
+        frame = next(iter(open_video(film.video.path).color_frames()))
+    vertices, camera, mesh = film.vertices[0], film.cameras[0], rig.neutral
+    light = estimate_light(frame, vertices, mesh.faces, vertex_albedo(mesh), camera).light
+    other = PointLight(light.ambient, light.intensity.flip(0), torch.tensor([480.0, -260, 250]))
+    relit = relight(frame, vertices, mesh, light, other, camera)
+    painted = overlay(frame, vertices, FacePaint.of(mesh, face_paint()), light, camera)
+    titles = ("film", "relit", "painted, in the film's light")
+    middle = round(float(camera.project(vertices.double())[:, 0].mean()))
+    cut = slice(middle - 120, middle + 120)
+    pictures = [
+        caption(one[:, :, cut].float() / 255, title) for one, title in zip((frame, relit, painted), titles, strict=True)
+    ]
+    return sheet(pictures, 3)
+
+
 def _half(image: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(image[None, :3], 2)[0]
 
@@ -102,6 +136,7 @@ def main() -> None:
     save_picture(performer_sheet(), HERE / "images" / "performer.jpg")
     save_picture(registration_picture(), HERE / "images" / "registration.jpg")
     save_picture(fit_picture(), HERE / "images" / "fit.jpg")
+    save_picture(relight_picture(), HERE / "images" / "relight.png")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_picture(from_pillow(image), HERE / "images" / "demo.jpg")
 

@@ -20,7 +20,7 @@ _NOT_SKIN = (
     "eyeball", "eye_socket", "eye_blend", "eye_occlusion", "eyelash", "lacrimal", "mouth_interior", "mouth_socket",
     "gums", "teeth", "tongue", "nostrils",
 )  # fmt: skip
-_MOST_GAIN = 8.0
+_MOST_GAIN = 10.0
 _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
 _BESIDE = 9  # rounds of blur; three pixels
 _LARGEST = 8192
@@ -157,7 +157,7 @@ def relight(
 
     .. math:: C' = C\; \frac{I'_a + I'_p \max(0, N \cdot L')\, s'}{I_a + I_p \max(0, N \cdot L)\, s}
 
-    in linear light, so that pores, beard and colour stay; no albedo is needed. At most eight times as bright: noise of
+    in linear light, so that pores, beard and colour stay; no albedo is needed. At most ten times as bright: noise of
     black shadows is no skin. Highlights of the old lamp stay where they were.
 
     Args:
@@ -190,8 +190,9 @@ def relight(
     linear = to_linear(picture)
     old, lit = linear.reshape(3, -1).T[covered.pixel], _soft_shadow(covered, light)
     reflected = (old + _FLOOR) / (_light_on(covered, light, lit) + _FLOOR)
-    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line: the skin beside it goes there.
-    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2
+    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line, and where the face ends, pixels
+    # hold some of what is behind: the skin beside it goes there.
+    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2 * (covered.share == 1)
     reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
     new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
     new = torch.minimum(new.clamp(min=0), _MOST_GAIN * old)
