@@ -26,3 +26,10 @@ def test_vectors_come_back() -> None:
     torch.testing.assert_close(rotation_vector(rotation_matrix(vectors)), vectors, rtol=0, atol=1e-7)
     expected = torch.from_numpy(Rotation.from_matrix(rotation_matrix(vectors).numpy()).as_rotvec())
     torch.testing.assert_close(rotation_vector(rotation_matrix(vectors))[:190], expected[:190], rtol=0, atol=1e-12)
+
+
+def test_gradients_where_there_is_no_angle() -> None:
+    zero = torch.zeros(3, dtype=torch.float64)
+    found = torch.autograd.functional.jacobian(rotation_matrix, zero)
+    torch.testing.assert_close(found, cross_matrix(torch.eye(3, dtype=torch.float64)).permute(1, 2, 0))
+    assert torch.autograd.gradcheck(rotation_matrix, torch.tensor([[0.3, -1.2, 0.5]]).double().requires_grad_())

@@ -79,15 +79,14 @@ def robust_pnp(
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
     limit = _limits(threshold, len(q), hypotheses)
     given = _given(start, len(q))
-    order = torch.rand(hypotheses, len(x), generator=torch.Generator().manual_seed(seed))
     size = max(1, _LARGEST // (hypotheses * 4 * len(x)))
     close = (_squared(x, q, K, given[:, None, :, :3], given[:, None, :, 3])[:, 0] < limit[:, None].square()) & (w > 0)
     sure = close.sum(1) >= _SURE * (w > 0).sum(1)
-    none = order[:0]
     found = RobustPose(Pose(*(given.new_full(shape, torch.nan) for shape in _shapes(len(q)))), close)
-    for draws, frames in ((none, sure.nonzero()[:, 0]), (order, (~sure).nonzero()[:, 0])):
-        for part in frames.split(size):
-            pose, inliers = _consensus(x, q[part], K, w[part], given[part], draws, limit[part])
+    for draws, frames in ((0, sure.nonzero()[:, 0]), (hypotheses, (~sure).nonzero()[:, 0])):
+        order = torch.rand(draws, len(x), generator=torch.Generator().manual_seed(seed))
+        for part in frames.split(size) if len(frames) else ():
+            pose, inliers = _consensus(x, q[part], K, w[part], given[part], order, limit[part])
             found.pose.rotation[part], found.pose.translation[part] = pose.rotation, pose.translation
             found.pose.errors[part], found.inliers[part] = pose.errors, inliers
     return found

@@ -22,14 +22,11 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
         >>> (rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])) @ torch.tensor([1.0, 0.0, 0.0])).round().tolist()
         [0.0, 1.0, 0.0]
     """
-    square = vectors.square().sum(-1)[..., None, None]
-    small = square < 1e-12
-    safe = torch.where(small, 1.0, square).sqrt()  # in this order: the root's slope at 0 is infinite
-    first = torch.where(small, 1 - square / 6, safe.sin() / safe)
-    # 2 sin²(θ/2)/θ² keeps the digits that 1 - cos θ loses.
-    second = torch.where(small, 0.5 - square / 24, 2 * (safe / 2).sin().square() / safe.square())
+    # sinc divides without a case of its own for no angle; 2 sin²(θ/2)/θ² keeps the digits that 1 - cos θ loses.
+    angle = vectors.norm(dim=-1)[..., None, None] / torch.pi
     cross = cross_matrix(vectors)
-    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + first * cross + second * (cross @ cross)
+    turned = torch.sinc(angle) * cross + 0.5 * torch.sinc(0.5 * angle).square() * (cross @ cross)
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + turned
 
 
 def rotation_vector(rotations: Tensor) -> Tensor:

@@ -107,7 +107,7 @@ class PoseTracker:
             ShapeError: not 68 landmarks.
         """
         self._filter.predict()
-        before = self._filter.pose()
+        before = self._filter.likeliest()
         start = Pose(before[0][None], before[1][None], torch.zeros(1))
         weights = None if confidence is None else confidence[None]
         measured = _measured(self.points, landmarks[None], self.intrinsics, self.settings, weights, start)

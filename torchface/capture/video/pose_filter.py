@@ -172,6 +172,13 @@ class PoseFilter:
         turns = rotation_vector(self.belief.rotation @ best.T)
         return rotation_matrix(share @ turns) @ best, share @ self.belief.place
 
+    def likeliest(self) -> tuple[Tensor, Tensor]:
+        """Rotation (3,3) and translation (3,) of the model that has foretold best; NaN where the head is lost."""
+        if self.belief is None:
+            return self.pose()
+        best = int(self.scores.argmax())
+        return self.belief.rotation[best], self.belief.place[best]
+
     def _shares(self) -> Tensor:
         """How much each model counts, (M,)."""
         settings = self.settings
