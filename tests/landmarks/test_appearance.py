@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.images import load_image
+from torchface.io.landmarks_dlib import load_dlib_faces
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.appearance_level import TextureResidual, sample_pixels
 from torchface.landmarks.ibug import box_around
@@ -353,3 +355,31 @@ def test_sizes_of_training_images_may_differ(film: PortraitFilm) -> None:
     model = AppearanceModel.fit(frames, film.landmarks[:6])
     fit = model.refine(images(film, slice(0, 6)), film.landmarks[:6])
     assert mean_error(fit.landmarks, film.landmarks[:6]).max() < 0.02
+
+
+@pytest.mark.real
+def test_a_dozen_photographs_help_with_faces_that_are_not_among_them(data: Path) -> None:
+    """Other people, poses and cameras than learned from: no job for such a model, and yet it must help, not harm."""
+    pictures, points = [], []
+    for face in load_dlib_faces(next((data / "images" / "dlib_faces").glob("*.xml"))):
+        box = box_around(face.points.float())
+        low = (box[:2] - 0.5 * box[2:]).clamp(min=0).long()
+        high = (box[:2] + 1.5 * box[2:]).long()
+        whole = load_image(data / "images" / "dlib_faces" / face.image)
+        pictures.append(whole[:, int(low[1]) : int(high[1]), int(low[0]) : int(high[0])])
+        points.append(face.points.float() - low)
+    truth = torch.stack(points)
+    assert len(truth) == 18
+    before, after = [], []
+    generator = torch.Generator().manual_seed(0)
+    for fold in range(3):
+        left_out = torch.arange(len(truth)) % 3 == fold
+        learned = [picture for picture, out in zip(pictures, left_out.tolist(), strict=True) if not out]
+        model = AppearanceModel.fit(learned, truth[~left_out])
+        for row in torch.nonzero(left_out)[:, 0].tolist():
+            one = truth[row : row + 1]
+            start = planar_pose(model.mean_shape, one).apply(model.mean_shape)
+            start = start + 0.04 * eyes_apart(one) * torch.randn(1, 1, 2, generator=generator)
+            before.append(mean_error(start, one))
+            after.append(mean_error(model(pictures[row][None], start), one))
+    assert torch.cat(after).mean() < 0.8 * torch.cat(before).mean()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
+from torchface.cli import main
 from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.io.landmarks import load_landmark_points
 from torchface.io.video import VideoFile, write_video
@@ -180,3 +181,21 @@ def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
     assert (found - film.landmarks[rows]).norm(dim=2).mean() < 1.0
     with pytest.raises(TorchfaceError, match="folds: found 1"):
         train(Settings(tmp_path / "frames", tmp_path / "actor", folds=1))
+
+
+def test_the_command_writes_proposals_of_the_zoos_tracker(
+    film: PortraitFilm, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "frames"
+    main(["annotate", str(video), "--out", str(out), "--count", "3", "--no-browser", "--quiet"])
+    paths = [Path(line) for line in capsys.readouterr().out.split()]
+    assert sorted(paths) == sorted(out.glob("*.pts"))
+    assert len(paths) == 3
+    for frame in load_annotated_frames(out):
+        truth = film.landmarks[int(frame.name[-6:])]
+        apart = (frame.landmarks - truth).norm(dim=1).mean()
+        assert apart < 0.15 * (truth[36] - truth[45]).norm()
+    with pytest.raises(SystemExit) as ended:
+        main(["annotate", str(video), "--out", str(tmp_path / "new"), "--landmarks", "head", "--no-browser", "--quiet"])
+    assert ended.value.code == 2
+    assert not (tmp_path / "new").exists()
