@@ -26,7 +26,7 @@ from torchface.capture.video.pose import (
 from torchface.capture.video.pose_filter import PoseFilterSettings
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.calibration import assumed_calibration
-from torchface.geometry.pnp import pixel_jacobian
+from torchface.geometry.pnp import pixel_jacobian, solve_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.io import load_rig, load_take
 from torchface.rig import BlendshapeRig
@@ -227,6 +227,24 @@ def test_expression_hardly_moves_the_stable_landmarks(
     others = [i for i in range(68) if i not in STABLE_LANDMARKS]
     assert float(most[list(STABLE_LANDMARKS)].max()) < 1.2
     assert float(most[others].min()) > 1.2
+
+
+@pytest.mark.real
+def test_expression_hardly_turns_the_head(
+    real_capture: tuple[BlendshapeRig, object, list[Tensor]], performances: list[Path]
+) -> None:
+    rig, _, weights = real_capture
+    ids = rig.neutral.landmarks
+    points = rig.vertices[ids].double()
+    speaking = points + torch.einsum("tn,nlc->tlc", weights[2][::15].double(), rig.deltas[:, ids].double())
+    rotation = UPRIGHT @ rotation_matrix(torch.tensor([0.1, 0.3, 0.05]).double())
+    pixels, _ = pixel_jacobian(speaking @ rotation.T + torch.tensor([0.0, 0, 550]).double(), K)
+
+    def off(found: Tensor) -> float:
+        return float(rotation_vector(found @ rotation.T).norm(dim=1).rad2deg().mean())
+
+    assert off(measure_poses(points, pixels, K).rotation) < 0.3
+    assert off(solve_pnp(points, pixels, K).rotation) > 1.0
 
 
 @pytest.mark.real
