@@ -150,9 +150,10 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
     else:
         widths = {1.0: []}
     least, chosen = float("inf"), next(iter(widths))
-    if trial is not None:
-        points["none"] = [(s, solve_error(trial, None, noise)) for s in (_STRENGTHS[0], _STRENGTHS[-1])]
+    if trial is not None and (settings.strength is None or len(widths) > 1):
         say("choosing the strength by trial solves")
+        without = solve_error(trial, None, noise)
+        points["none"] = [(_STRENGTHS[0], without), (_STRENGTHS[-1], without)]
         for factor, own in widths.items():
             prior = _fitted(settings.kind, fitting, own, settings.seed)
             tried = _STRENGTHS if settings.strength is None else (settings.strength,)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torchface.capture.priors.dynamics import DynamicsPrior, DynamicsSettings
 
 _FOLDS = 4  # of a single take
-_STEP = 0.1  # of Adam, in logarithms
+_STEP = 0.1  # of Adam
 _RIDGE = 1e-6  # of the coefficients, in squared weights
 _COMMON = 0.02  # how much of what is common to the shapes each one's own coefficients are learned with
 _SMALLEST = 1e-3  # a usual size below which a shape counts as one that never moves
@@ -148,7 +148,8 @@ def learn(
 def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, looked_at: Tensor, rounds: int) -> Kernel:
     """Hyperparameters that maximise the bound of the marginal likelihood with inducing points, all targets together.
 
-    One length for places, one for slopes, one for curvatures; by Adam on their logarithms.
+    One length for places, one for slopes, one for curvatures; by Adam on what gpytorch makes of them so that they stay
+    positive.
 
     Args:
         inputs: (B,O·N), scaled.
@@ -301,5 +302,6 @@ def _check(takes: Sequence[Tensor], names: tuple[str, ...], window: int, fps: fl
         )
     if len(takes) == 1 and len(takes[0]) < 2 * _FOLDS + window:
         raise ShapeError(
-            f"dynamics prior: found one take of {len(takes[0])} frames, expected at least {2 * _FOLDS + window}"
+            f"dynamics prior: found one take of {len(takes[0])} frames, expected at least {2 * _FOLDS + window} "
+            f"for a window of {window}"
         )

@@ -1,0 +1,151 @@
+"""The recipe end to end: made-up takes, weight takes, marker takes, another rig's names, bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import BlendshapeRig, Take, save_take, zoo
+from torchface.capture import DynamicsPrior, ShapePrior
+from torchface.capture.priors import ReciprocalPrior
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
+from torchface.shape_names import mapping
+from torchface.synthetic import performer
+from torchface.synthetic.marker_stage import place_markers
+from torchface.synthetic.performance import perform
+from torchface.take import Track
+from train.prior_takes import made_up, read_takes, renamed, split
+from train.priors import Settings, train
+
+ICT_LIKE = ("browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "eyeBlink_R", "jawOpen", "cheekRaiser_L")
+
+
+def saved(folder: Path, name: str, frames: int = 160, seed: int = 0, fps: float = 60.0) -> Take:
+    take = perform(frames, torch.Generator().manual_seed(seed), fps)
+    save_take(take, folder / f"{name}.csv")
+    return take
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("takes")
+    for seed in range(4):
+        saved(path, f"take_{seed}", seed=seed)
+    return path
+
+
+def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    settings = Settings(
+        takes=folder, out=tmp_path / "own", held_out=1, window=3, inducing=20, rounds=3, strength=0.3, trial_frames=4
+    )
+    measured = train(settings, lines.append)
+    assert set(measured) == {"own_shape", "own_dynamics"}
+    shape, dynamics = (zoo.get_model(tmp_path / name) for name in measured)
+    assert isinstance(shape, ShapePrior)
+    assert isinstance(dynamics, DynamicsPrior)
+    assert shape.names == dynamics.names
+    assert shape.strength == 0.3
+    assert (dynamics.window, dynamics.input_noise) == (3, 0.01)
+    assert dynamics.fps == pytest.approx(60.0, rel=1e-3)
+    found = measured["own_dynamics"]
+    assert found["held out, one-step error"] < found["held out, one-step error of extrapolation"]
+    solved = measured["own_shape"]
+    assert solved["held out, error of a weight"] < solved["held out, error of a weight without a prior"]
+    record = zoo.describe(tmp_path / "own_dynamics")
+    assert record.recipe.startswith("python -m train.priors --takes")
+    assert "--window 3" in record.recipe
+    assert record.licence == "that of the takes"
+    for picture in ("calibration", "curves"):
+        assert (tmp_path / "own_dynamics" / "pictures" / f"{picture}.png").stat().st_size > 5000
+    assert any("480 frames of 3 takes" in line for line in lines)
+
+
+def test_the_window_is_chosen_and_the_rate_is_the_one_asked_for(folder: Path, tmp_path: Path) -> None:
+    settings = Settings(takes=folder, out=tmp_path / "own", kind="dynamics", fps=30.0, inducing=10, rounds=1)
+    (found,) = train(settings).values()
+    prior = zoo.get_model(tmp_path / "own")
+    assert prior.fps == 30.0
+    assert prior.window == found["window"]
+    assert (tmp_path / "own" / "pictures" / "window.png").stat().st_size > 5000
+
+
+def test_the_papers_form_with_a_bandwidth(folder: Path, tmp_path: Path) -> None:
+    settings = Settings(
+        takes=folder, out=tmp_path / "own", kind="reciprocal", bandwidth=0.4, strength=0.1, trial_frames=2
+    )
+    (found,) = train(settings).values()
+    prior = zoo.get_model(tmp_path / "own")
+    assert isinstance(prior, ReciprocalPrior)
+    assert prior.strength == 0.1
+    assert found["bandwidth, lower"] == pytest.approx(0.4)
+
+
+def test_names_of_another_rig(folder: Path) -> None:
+    takes, silent = renamed(read_takes(folder), ICT_LIKE)
+    assert takes.names == ICT_LIKE
+    assert silent == ("cheekRaiser_L",)
+    own = read_takes(folder)
+    brow = own.weights[0][:, [name.lower() for name in own.names].index("browinnerup")]
+    for column in (0, 1):
+        torch.testing.assert_close(takes.weights[0][:, column], brow)
+    with pytest.raises(NameMismatchError, match="none of which the takes have"):
+        renamed(own, ["left", "right"])
+
+
+def test_marker_takes_are_solved(tmp_path: Path) -> None:
+    rig = performer(texture=False)
+    attachment = place_markers(rig, 60)
+    take = perform(40, torch.Generator().manual_seed(3))
+    truth = shapes(take, rig)
+    markers = attachment.on(rig.neutral.faces, rig(truth))
+    save_take(Take(60.0, markers=Track(attachment.labels or (), markers)), tmp_path / "take.csv")
+    found = read_takes(tmp_path, rig=rig, attachment=attachment)
+    assert found.solved == 1
+    assert found.names == rig.names
+    seen = [name for name in rig.names if not name.startswith("eyeLook")]
+    rows = [rig.names.index(name) for name in seen]
+    assert float((found.weights[0][:, rows] - truth[:, rows]).abs().mean()) < 0.03
+    with pytest.raises(NameMismatchError, match="found markers, expected weights, or the rig"):
+        read_takes(tmp_path)
+
+
+def shapes(take: Take, rig: BlendshapeRig) -> Tensor:
+    assert take.weights is not None
+    return take.weights.values[..., 0] @ mapping(take.weights.names, rig.names).T
+
+
+def test_takes_at_another_rate_are_brought_to_the_first(tmp_path: Path) -> None:
+    saved(tmp_path, "a", 120, fps=60.0)
+    saved(tmp_path, "b", 120, seed=1, fps=30.0)
+    found = read_takes(tmp_path)
+    assert found.fps == pytest.approx(60.0, rel=1e-3)
+    assert len(found.weights[1]) == pytest.approx(239, abs=2)
+
+
+def test_bad_input(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueRangeError, match="a folder of takes, or a number of performances"):
+        train(Settings())
+    with pytest.raises(FileFormatError, match="found no such folder"):
+        read_takes(tmp_path / "none")
+    with pytest.raises(FileFormatError, match="found no take"):
+        read_takes(tmp_path)
+    with pytest.raises(ShapeError, match="expected at least one to learn from"):
+        split(made_up(2, 30, 0), 2)
+    with pytest.raises(TorchfaceError, match="for a window of 40"):
+        train(Settings(performances=2, frames=30, kind="dynamics", window=40, out=tmp_path / "own"))
+    take = saved(tmp_path, "a", 20)
+    assert take.weights is not None
+    other = Track(("jawWide", *take.weights.names[1:]), take.weights.values)
+    save_take(Take(60.0, weights=other), tmp_path / "b.csv")
+    with pytest.raises(NameMismatchError, match=r"b\.csv: found other shapes than in a\.csv \(jawWide"):
+        read_takes(tmp_path)
+    broken = take.weights.values.clone()
+    broken[7, 3] = torch.nan
+    save_take(Take(60.0, weights=Track(("x", *take.weights.names[1:]), broken)), tmp_path / "b.csv")
+    with pytest.raises(ValueRangeError, match=r"b\.csv: found NaN or infinity in 1 of 20 frames \(the first is 7\)"):
+        read_takes(tmp_path)
+    assert not (tmp_path / "own").exists()
