@@ -14,6 +14,8 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Top
 from torchface.geometry.alignment import similarity_transform
 from torchface.geometry.camera import look_at
 from torchface.io.images import load_image, save_image
+from torchface.io.landmarks import load_landmark_points
+from torchface.landmarks import NoFaceError, TrackedFace
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
@@ -21,6 +23,7 @@ from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.identity import anatomy
 from torchface.workflows.fit import fit_photographs, landmarks_of, matching_template
+from torchface.workflows.found_landmarks import FoundLandmarks
 
 YAWS = (-35.0, 0.0, 35.0)
 SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
@@ -84,6 +87,50 @@ def test_the_command_makes_the_actors_rig(
     assert float(blue.float().mean()) < 0.01  # none of the background
     for i in range(3):
         assert load_image(tmp_path / f"rig_{i + 1}_p{i}.png").shape == (3, 480, 1440)
+
+
+def test_landmarks_that_no_file_gives_are_found(
+    studio: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rig.glb"
+    rest = ["--model", str(studio / "heads"), "--template", str(studio / "template.glb"), "--texture-size", "0"]
+    main(["fit", str(studio / "p1.png"), *rest, "--out", str(out), "--quiet"])
+    printed = capsys.readouterr()
+    assert "p1.png: landmarks found by face_landmarks in the face at" in printed.err
+    assert "confidence 0." in printed.err
+    written = tmp_path / "rig_1_p1.pts"
+    assert str(written) in printed.out
+    found, true = load_landmark_points(written).ibug(), load_landmark_points(studio / "p1.pts").ibug()
+    assert (found - true).norm(dim=1).mean() < 0.05 * (true[36] - true[45]).norm()
+    assert list(load_rig(out).names) == SHAPES
+
+
+def test_photographs_without_a_face_are_said(studio: Path, tmp_path: Path) -> None:
+    save_image(torch.full((3, 120, 160), 0.4), tmp_path / "wall.png")
+    template, out = studio / "template.glb", tmp_path / "rig.glb"
+    with pytest.raises(NoFaceError, match=r"wall\.png: found no face, expected one at least; .* with --landmarks"):
+        fit_photographs([tmp_path / "wall.png"], [], studio / "heads", out, template)
+    with pytest.raises(NoFaceError, match=r"p1\.png: found 1 face, expected more than 1"):
+        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, face=1)
+    with pytest.raises(NameMismatchError, match="a HeadModel, expected a LandmarkTrees"):
+        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, landmark_model=studio / "heads")
+    assert not out.exists()
+
+
+def test_unsure_landmarks_are_left_out(studio: Path) -> None:
+    points = torch.linspace(10, 60, 68)[:, None].expand(-1, 2).clone()
+    points[3] = torch.tensor([-4.0, 20.0])
+    confidence = torch.full((68,), 0.8)
+    confidence[60:] = 0.05
+    face = TrackedFace(points, torch.tensor([10.0, 10, 60, 60]), confidence)
+    boxes = torch.tensor([[200.0, 5, 80, 80], [10, 10, 60, 60]])
+    found = FoundLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
+    assert found.trusted.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
+    assert "lowest at the mouth with 0.50; 9 left out" in found.lines()[0]
+    assert found.lines()[1] == "  number 1 of 2 faces; others with --face 0: at (200, 5)"
+    unsure = TrackedFace(points, face.box, torch.full((68,), 0.1))
+    kept = FoundLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).trusted
+    assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
 
 
 def dlib_xml(path: Path, faces: list[tuple[str, int]]) -> Path:
