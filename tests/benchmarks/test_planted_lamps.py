@@ -105,7 +105,7 @@ def test_planted_lamps() -> None:
         ]
         print(f"{name:>13} {'brim' if brim else '    '}  {'   '.join(cells)}   {float(table[:, 3].median()):.2f}")
     for brim in (False, True):
-        ours, theirs = (torch.tensor(rows[name, brim]) for name in ("torchface", "least squares"))
-        assert float(ours[:, 0].max()) < 5
-        assert float(ours[:, 1].max()) < 5
-        assert float(theirs[:, 0].median()) > 3 * float(ours[:, 0].median())
+        robust, plain = (torch.tensor(rows[name, brim]) for name in ("torchface", "least squares"))
+        assert float(robust[:, 0].max()) < 5
+        assert float(robust[:, 1].max()) < 5
+        assert float(plain[:, 0].median()) > 3 * float(robust[:, 0].median())
