@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import socket
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,9 @@ from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
 from torchface.capture.priors import ShapePrior
 from torchface.cli import main
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.geometry.calibration import CameraCalibration
 from torchface.geometry.rotations import rotation_matrix
+from torchface.io.cameras import save_calibration
 from torchface.io.gltf.animation import read_gltf_weights
 from torchface.io.live_link_stream import decode_frame
 from torchface.io.video import open_video, write_video
@@ -33,8 +36,8 @@ from torchface.workflows.track_overlay import mesh_drawer, paint_drawer, undisto
 from torchface.workflows.track_page import write_track_page
 from torchface.workflows.track_state import FOLDER, TrackedFrames, TrackState
 
-FRAMES = 14
-PIECE = 5
+FRAMES = 11
+PIECE = 4
 QUICK = TrackSettings(overlay=False)
 
 
@@ -44,10 +47,21 @@ class Filmed:
 
     video: Path
     rig: Path
+    camera: Path
     actor: BlendshapeRig
     weights: torch.Tensor
     landmarks: torch.Tensor
     rotation: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Done:
+    """What tracking gave; what lay in its folder when it was killed, and how many frames were tracked after that."""
+
+    tracked: Tracked
+    out: Path
+    left: tuple[str, ...]
+    steps: int
 
 
 @pytest.fixture(scope="module")
@@ -65,32 +79,54 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
         folder / "film.avi", actor, weights, light, 30.0, torch.Generator().manual_seed(0), settings
     )
     save_rig(actor, folder / "rig.glb")
+    intrinsics = film.cameras[0].intrinsics
+    save_calibration(CameraCalibration(intrinsics, torch.zeros(5), 160, 120, 0.1), folder / "camera.toml")
     marks = actor.neutral.landmarks
     landmarks = torch.stack([
         camera.project(actor(weights[t : t + 1])[0, marks].double()) for t, camera in enumerate(film.cameras)
     ])  # fmt: skip
     rotation = torch.stack([camera.rotation for camera in film.cameras])
-    return Filmed(folder / "film.avi", folder / "rig.glb", actor, weights, landmarks.float(), rotation)
+    return Filmed(
+        folder / "film.avi", folder / "rig.glb", folder / "camera.toml", actor, weights, landmarks.float(), rotation
+    )
 
 
 @pytest.fixture(scope="module")
-def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> tuple[Tracked, Path]:
-    """The film tracked with everything, in pieces of a few frames."""
+def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """The film tracked with everything, in pieces of a few frames; killed in the third piece and started again."""
     out = tmp_path_factory.mktemp("tracked") / "out"
+    settings = TrackSettings(camera=filmed.camera)
+
+    def killed(what: str, frames: int, total: int) -> None:
+        if what == "landmarks" and frames == 2 * PIECE + 2:
+            raise KeyboardInterrupt
+
+    steps = 0
+    step = LandmarkTracker.step
+
+    def counted(self: LandmarkTracker, frame: torch.Tensor) -> TrackedFace:
+        nonlocal steps
+        steps += 1
+        return step(self, frame)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workflow, "PIECE", PIECE)
-        tracked = track_video(filmed.video, filmed.rig, out)
-    return tracked, out
+        with pytest.raises(KeyboardInterrupt):
+            track_video(filmed.video, filmed.rig, out, settings, killed)
+        left = tuple(path.name for path in out.iterdir())
+        patch.setattr(LandmarkTracker, "step", counted)
+        tracked = track_video(filmed.video, filmed.rig, out, settings)
+    return Done(tracked, out, left, steps)
 
 
-def test_a_filmed_performer_comes_back(done: tuple[Tracked, Path], filmed: Filmed) -> None:
-    tracked, _ = done
+def test_a_filmed_performer_comes_back(done: Done, filmed: Filmed) -> None:
+    tracked = done.tracked
     assert tracked.seen.all()
     off = (tracked.frames.landmarks - filmed.landmarks).norm(dim=2)[:, 17:]
     assert float(off.mean()) < 0.05 * float((filmed.landmarks[0, 36] - filmed.landmarks[0, 45]).norm())
     turned = tracked.solution.rotation.double() @ filmed.rotation.transpose(1, 2)
     angle = torch.rad2deg((((turned.diagonal(dim1=1, dim2=2).sum(1)) - 1) / 2).clamp(-1, 1).acos())
-    assert float(angle.mean()) < 6
+    assert float(angle.mean()) < 7  # landmarks of so small a face are off by 4 % of the distance of the eyes
     marks = filmed.actor.neutral.landmarks
     true = filmed.actor(filmed.weights)[:, marks]
     still = (true - filmed.actor.vertices[marks]).norm(dim=2).mean()
@@ -100,8 +136,8 @@ def test_a_filmed_performer_comes_back(done: tuple[Tracked, Path], filmed: Filme
     assert float(torch.corrcoef(torch.stack([tracked.solution.weights[:, jaw], filmed.weights[:, jaw]]))[0, 1]) > 0.9
 
 
-def test_every_file_tells_the_same(done: tuple[Tracked, Path]) -> None:
-    tracked, out = done
+def test_every_file_tells_the_same(done: Done) -> None:
+    tracked, out = done.tracked, done.out
     own = load_take(out / "weights.csv")
     assert own.fps == 30.0
     assert own.weights is not None
@@ -126,56 +162,46 @@ def test_every_file_tells_the_same(done: tuple[Tracked, Path]) -> None:
     assert len(list(drawn.frames())) == FRAMES
     told = json.loads((out / "summary.json").read_text())
     assert told["found"] == FRAMES
-    assert told["camera_assumed"] is True
+    assert told["camera_assumed"] is False
     assert not list(out.rglob("*.part*"))
 
 
-def test_the_report_shows_frames_curves_and_what_was_assumed(done: tuple[Tracked, Path], tmp_path: Path) -> None:
-    page = write_track_page(done[0], tmp_path).read_text()
+def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
+    page = write_track_page(done.tracked, tmp_path).read_text()
     for picture in ("frames.png", "error.png", "head.png", "weights1.png"):
         assert picture in page
         assert (tmp_path / picture).is_file()
-    assert "assumed a field of view of 60 degrees" in page
+    assert "calibrated, 0.10 px" in page
     assert "frames with a face" in page
 
 
-def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(
-    done: tuple[Tracked, Path], filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(workflow, "PIECE", PIECE)
-
-    def killed(what: str, done_frames: int, total: int) -> None:
-        if what == "landmarks" and done_frames == 2 * PIECE + 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        track_video(filmed.video, filmed.rig, tmp_path / "out", QUICK, killed)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [FOLDER]
-    steps = []
-    step = LandmarkTracker.step
-
-    def counted(self: LandmarkTracker, frame: torch.Tensor) -> TrackedFace:
-        steps.append(frame)
-        return step(self, frame)
-
-    monkeypatch.setattr(LandmarkTracker, "step", counted)
-    again = track_video(filmed.video, filmed.rig, tmp_path / "out", QUICK)
-    assert len(steps) == FRAMES - 2 * PIECE
-    assert again.reused == 2 * PIECE
-    assert torch.equal(again.frames.landmarks, done[0].frames.landmarks)
-    torch.testing.assert_close(again.solution.weights, done[0].solution.weights)
-    smooth = track_video(filmed.video, filmed.rig, tmp_path / "out", TrackSettings(overlay=False, whole_take=True))
-    assert len(steps) == FRAMES - 2 * PIECE  # landmarks stay, weights are solved anew
-    assert not torch.equal(smooth.solution.weights, again.solution.weights)
+def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
+    assert done.left == (FOLDER,)
+    assert done.steps == FRAMES - 2 * PIECE
+    assert done.tracked.reused == 2 * PIECE
+    tracker = LandmarkTracker(zoo.get_model("face_landmarks"))
+    whole: list[torch.Tensor] = []
+    for number, frame in enumerate(open_video(filmed.video).frames()):
+        if number and number % PIECE == 0:  # as a run that is not killed does
+            tracker.resume(seen.landmarks, seen.confidence)  # noqa: F821
+        seen = tracker.step(frame)
+        whole.append(seen.landmarks)
+    assert torch.equal(done.tracked.frames.landmarks, torch.stack(whole))
 
 
-def test_what_is_up_to_date_is_kept(done: tuple[Tracked, Path], filmed: Filmed) -> None:
-    _, out = done
+def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(done.out, out)
     made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
-    again = track_video(filmed.video, filmed.rig, out)
+    again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert "overlay" not in again.seconds
-    torch.testing.assert_close(again.solution.weights, done[0].solution.weights)
+    assert set(again.seconds) == {"pose"}
+    torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
+    smooth = track_video(
+        filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay=False, whole_take=True)
+    )
+    assert set(smooth.seconds) == {"pose", "weights"}  # landmarks stay
+    assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
 def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:
@@ -199,11 +225,11 @@ def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -
 
 
 def test_paint_stays_on_the_skin_and_landmarks_are_drawn_where_they_are(
-    done: tuple[Tracked, Path], filmed: Filmed, tmp_path: Path
+    done: Done, filmed: Filmed, tmp_path: Path
 ) -> None:
     from PIL import Image
 
-    tracked, _ = done
+    tracked = done.tracked
     frame = next(open_video(filmed.video).color_frames())
     Image.new("RGBA", (8, 8), (0, 0, 255, 255)).save(tmp_path / "blue.png")
     light = PointLight(torch.full((3,), 0.5), torch.full((3,), 0.5), torch.tensor([-500.0, -700.0, 100.0]))
@@ -254,16 +280,16 @@ def test_what_cannot_be_tracked_is_told_and_leaves_nothing(
     assert not out.exists()
 
 
-def test_models_that_do_not_fit_are_told(filmed: Filmed, tmp_path: Path) -> None:
+def test_models_that_do_not_fit_are_told(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
     with pytest.raises(NameMismatchError, match="--landmarks: found head, a HeadModel, expected a LandmarkTrees"):
-        load_track_models(filmed.actor, "head")
+        load_track_models(dome_rig, "head")
     with pytest.raises(NameMismatchError, match="--dynamics: found face_landmarks, a LandmarkTrees"):
-        load_track_models(filmed.actor, dynamics="face_landmarks")
+        load_track_models(dome_rig, dynamics="face_landmarks")
     takes = [torch.rand(60, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
-    prior = ShapePrior.fit(takes, ("jawOpen", "mouthLeft", "browDownLeft"))
+    prior = ShapePrior.fit(takes, ("jawLeft", "mouthLeft", "browDownLeft"))
     zoo.save_model(prior, tmp_path / "other", licence="MIT", data="none", metrics={}, recipe="none")
-    with pytest.raises(NameMismatchError, match=r"other: .*jawOpen"):
-        load_track_models(filmed.actor, prior=tmp_path / "other")
+    with pytest.raises(NameMismatchError, match=r"other: .*jawLeft"):
+        load_track_models(dome_rig, prior=tmp_path / "other")
 
 
 def test_a_take_shorter_than_the_window_is_told() -> None:
@@ -276,21 +302,19 @@ def test_a_take_shorter_than_the_window_is_told() -> None:
         check_length(8, models, Path("take.mp4"))
 
 
-def test_of_several_faces_one_is_followed(filmed: Filmed, tmp_path: Path) -> None:
+def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path: Path) -> None:
     frame = next(open_video(filmed.video).color_frames()).float()[None]
     small = torch.nn.functional.interpolate(frame, scale_factor=0.75, mode="bilinear", antialias=True)
-    wide = torch.full((4, 3, 120, 300), 110.0)
+    wide = torch.full((2, 3, 120, 300), 110.0)
     wide[..., :160] = frame
     wide[..., 15:105, 170:290] = small
     write_video([wide.round().to(torch.uint8)], tmp_path / "two.avi", 30.0)
-    for face, side in ((0, "left"), (1, "right")):
-        tracked = track_video(
-            tmp_path / "two.avi", filmed.rig, tmp_path / side, TrackSettings(face=face, overlay=False)
-        )
-        middle = float(tracked.frames.landmarks[..., 0].mean())
-        assert (middle < 160) == (side == "left")
-        assert tracked.faces == 2
-        assert "2 faces in the first frame" in " ".join(tracked.lines())
+    tracked = track_video(tmp_path / "two.avi", filmed.rig, tmp_path / "out", TrackSettings(face=1, overlay=False))
+    assert float(tracked.frames.landmarks[..., 0].min()) > 170
+    assert tracked.faces == 2
+    told = " ".join(tracked.lines())
+    assert "2 faces in the first frame" in told
+    assert "camera: none given; assumed a field of view of 60 degrees" in told
 
 
 def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -> None:
