@@ -49,7 +49,7 @@ def robust_pnp(
 ) -> RobustPose:
     r"""The poses in which a camera sees most points where they are seen, whatever the others do.
 
-    .. math:: \min_{R,t} \sum_i w_i \min\big( \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \tau^2 \big)
+    .. math:: \min_{R,t} \sum_i \min\big( w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \tau^2 \big)
 
     Random threes of points give hypotheses (RANSAC, scored by the sum above); the best few are refined on their
     inliers by Levenberg's method, and the inliers chosen anew until they stay the same. All frames and hypotheses at
@@ -60,7 +60,8 @@ def robust_pnp(
         pixels: q, (B,N,2); a NaN row counts as not seen.
         intrinsics: K, (3,3).
         threshold: :math:`\tau`, pixels, one for all or (B,); three deviations of good landmarks or so.
-        weights: w, non-negative, (B,N) or (N,); equal if absent. A point of weight 0 is never an inlier.
+        weights: w, non-negative, (B,N) or (N,); 1 if absent. Where points are not equally exact, inverse variances in
+            units of the others': a point of weight 1/4 may be off twice as far. One of weight 0 is never an inlier.
         start: poses to be tried first, such as those of the frames before; NaN where there is none. Where three
             quarters of the points seen agree with it, nothing else is tried.
         hypotheses: threes drawn a frame; 64 find a good one nearly always while half of the points are wrong.
@@ -80,7 +81,8 @@ def robust_pnp(
     limit = _limits(threshold, len(q), hypotheses)
     given = _given(start, len(q))
     size = max(1, _LARGEST // (hypotheses * 4 * len(x)))
-    close = (_squared(x, q, K, given[:, None, :, :3], given[:, None, :, 3])[:, 0] < limit[:, None].square()) & (w > 0)
+    before = _squared(x, q, K, given[:, None, :, :3], given[:, None, :, 3])[:, 0]
+    close = (before * w < limit[:, None].square()) & (w > 0)
     sure = close.sum(1) >= _SURE * (w > 0).sum(1)
     found = RobustPose(Pose(*(given.new_full(shape, torch.nan) for shape in _shapes(len(q)))), close)
     for draws, frames in ((0, sure.nonzero()[:, 0]), (hypotheses, (~sure).nonzero()[:, 0])):
@@ -119,7 +121,7 @@ def _consensus(
     best = _scores(x, q, K, w, turned, moved, limit).argmin(1)
     turned, moved = turned[row[:, 0], best], moved[row[:, 0], best]
     squared = _squared(x, q, K, turned[:, None], moved[:, None])[:, 0]
-    agreed = (squared < limit[:, None].square()) & (w > 0)
+    agreed = (squared * w < limit[:, None].square()) & (w > 0)
     found = agreed.sum(1) >= _FEWEST
     share = torch.where(agreed, w, 0.0)
     error = (torch.where(agreed, squared * w, 0.0).sum(1) / share.sum(1)).sqrt()
@@ -150,7 +152,7 @@ def _refined(
     before = torch.zeros(*shape, len(x), dtype=torch.bool)
     for _ in range(_ROUNDS):
         squared = _squared(x, q, K, rotation, translation)
-        agreed = (squared < limit[:, None, None].square()) & (w > 0)[:, None]
+        agreed = (squared * w[:, None] < limit[:, None, None].square()) & (w > 0)[:, None]
         going = ((agreed.sum(-1) >= _FEWEST) & (agreed != before).any(-1)).nonzero(as_tuple=True)
         if not len(going[0]):
             break
@@ -165,7 +167,9 @@ def _refined(
 def _scores(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, limit: Tensor) -> Tensor:
     """Truncated squared errors (B,H), summed over the points seen."""
     squared = _squared(x, q, K, rotation, translation)
-    return (torch.minimum(squared, limit[:, None, None].square()) * w[:, None]).sum(-1)
+    return (
+        torch.minimum((squared * w[:, None]).nan_to_num(torch.inf), limit[:, None, None].square()) * (w > 0)[:, None]
+    ).sum(-1)
 
 
 def _squared(x: Tensor, q: Tensor, K: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
