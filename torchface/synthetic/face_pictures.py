@@ -22,7 +22,7 @@ from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.identity import IDENTITY, draw_identities, mean_vertices, ramp
 from torchface.synthetic.performance import GESTURES
 from torchface.synthetic.performer import performer
-from torchface.synthetic.portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait
+from torchface.synthetic.portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait, widened
 
 _LUMA = torch.tensor([0.35, 0.5, 0.15])
 # What people in photographs have more or less of than the mean head, standard deviations: width, most of all.
@@ -70,7 +70,7 @@ class FacePicture:
 
 @dataclass(frozen=True, eq=False)
 class _Person:
-    """Someone's rig, hair, and what the skin's grey is multiplied by at each vertex (V,)."""
+    """Someone's rig, hair, by what skin is darker or lighter at each vertex (V,), and how much wider the face is."""
 
     rig: BlendshapeRig
     hairdo: Hairdo
@@ -82,6 +82,7 @@ class _Person:
     teeth: float
     clothes: float
     glasses: tuple[float, float, float] | None
+    width: float
 
 
 def face_pictures(
@@ -141,6 +142,7 @@ def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Pers
     return _Person(
         rig, hairdo, hair, hair_grey, texture, tint, (uniform(0.5, 2.2, generator), uniform(0.7, 1.1, generator)),
         uniform(0.7, 1.5, generator), uniform(0.03, 0.9, generator), glasses,
+        max(-0.05, min(0.22, 0.08 + 0.06 * float(torch.randn((), generator=generator)))),
     )  # fmt: skip
 
 
@@ -213,8 +215,8 @@ def _draw_camera(settings: PictureSettings, generator: torch.Generator) -> Camer
 
 def _picture(person: _Person, settings: PictureSettings, generator: torch.Generator) -> FacePicture:
     rig = person.rig
-    rest = rig.vertices
-    moved = rig(_draw_weights(rig.names, generator)[None])[0]
+    rest = widened(rig.vertices, person.width)
+    moved = widened(rig(_draw_weights(rig.names, generator)[None])[0], person.width)
     camera = _draw_camera(settings, generator)
     scene = portrait(rest, moved, rig.neutral.faces, person.hairdo, generator)
     origins, ways = camera.rays()

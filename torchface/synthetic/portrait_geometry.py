@@ -16,7 +16,7 @@ from torchface.synthetic.identity import mean_vertices, ramp
 
 _TEETH_DEEP = 3.5  # behind the lips, millimetres
 # The left brow's upper edge from its inner end: annotators mark it there, the head's own landmarks lie in its middle.
-_BROW_EDGE = ((10.0, 20.5, 92.0), (20.0, 24.0, 90.0), (31.0, 26.0, 87.0), (42.0, 24.5, 79.0), (51.5, 18.0, 67.0))
+_BROW_EDGE = ((11.0, 20.5, 92.0), (22.0, 24.0, 90.0), (34.0, 26.0, 85.0), (44.5, 24.0, 76.0), (54.0, 17.0, 62.0))
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,13 @@ def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generat
         torch.cat([piece[1] + start for piece, start in zip(pieces, first, strict=True)]),
         torch.cat([torch.full((len(piece[1]),), piece[2]) for piece in pieces]),
     )
+
+
+def widened(vertices: Tensor, share: float) -> Tensor:
+    """A head (V,3) whose cheeks, jaw and temples stand further out by a share; eyes, nose and mouth hardly move."""
+    wide = vertices.clone()
+    wide[..., 0] = vertices[..., 0] * (1 + share * ramp(vertices[..., 0].abs(), 15.0, 62.0))
+    return wide
 
 
 def hair_share(hairline: float) -> Tensor:
