@@ -50,15 +50,12 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
     build = GraphBuilder()
     op = build.op
     processes, noise = model.processes, model.noise
-    count, orders = len(model.names), model.basis.shape[1]
+    count, kinds = len(model.names), len(noise.own)
     groups, _, inputs = processes.inducing.shape
-    # Slopes and curvatures share a row of (O-1)·N; places go before them in a row of O·N.
-    squares = (model.feature_scale[1:] if orders > 1 else noise.scale).flatten()
     # The newest frame itself is the step's start.
     own = model.coefficients.clone()
     own[-1] += 1.0
     scale = model.target_scale * model.trust[model.home]
-    around = torch.block_diag(*[noise.together.T] * (orders - 1)) if orders > 1 else None
     members = torch.nn.functional.one_hot(model.home, groups).float().T
     constants: dict[str, Tensor | float] = {
         "center": model.center,
@@ -88,9 +85,7 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         "frame_axis": (1,),
         "last_axis": (2,),
         "group_axis": (0,),
-        "one": (1,),
-        "end": (orders,),
-        "moving_row": (-1, (orders - 1) * count),
+        "moving_row": (-1, kinds * count),
     }.items():
         build.constant(name, ids)
     motion = op("MatMul", "to_motion", op("Sub", "windows", "center"))
@@ -105,13 +100,17 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
     left = op("Sub", "signal_row", op("ReduceSum", op("Mul", known, known), "last_axis", keepdims=0))
     unsure = op("Add", op("Max", left, "zero"), op("ReduceSum", op("Mul", told, told), "last_axis", keepdims=0))
     variance = op("Add", op("MatMul", op("Transpose", unsure, perm=[1, 0]), "to_shapes"), "rest")
-    if around is not None:
+    if kinds:
+        # A window of one frame does not move. Slope and curvature of a constant are 0, so the centre may stay in.
+        step = torch.zeros(1, model.window)
+        step[0, -2:] = torch.tensor([-1.0, 1.0])
+        build.constant("to_moving", torch.cat([model.basis.T[1:], step]))
         build.constant("own_share", noise.own.flatten())
         build.constant("shared_share", (noise.shared * noise.scale.square()).flatten())
-        build.constant("usual", squares.square())
-        build.constant("around", around)
-        build.constant("to_noise", torch.eye(count).repeat(orders - 1, 1))
-        moving = op("Reshape", op("Slice", motion, "one", "end", "frame_axis"), "moving_row")
+        build.constant("usual", noise.scale.square().flatten())
+        build.constant("around", torch.block_diag(*[noise.together.T] * kinds))
+        build.constant("to_noise", torch.eye(count).repeat(kinds, 1))
+        moving = op("Reshape", op("MatMul", "to_moving", "windows"), "moving_row")
         energy = op("Mul", moving, moving)
         spread = op("MatMul", op("Div", energy, "usual"), "around")
         total = op("Add", op("Mul", energy, "own_share"), op("Mul", spread, "shared_share"))

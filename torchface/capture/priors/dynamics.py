@@ -19,6 +19,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _LARGEST = 2**26
 _LONGEST = 120
+_SAME_RATE = 0.02  # relative
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,22 @@ class DynamicsPrior(nn.Module):
             NameMismatchError: they are others, or in another order.
         """
         require_same_names(self.names, names)
+
+    def rate_note(self, fps: float) -> str | None:
+        """What to tell a user whose frames come at another rate than those that the prior has learned from.
+
+        Args:
+            fps: frames a second of a video or a take.
+
+        Returns:
+            A sentence, or None where the rates are within 2 % of each other.
+        """
+        if abs(fps - self.fps) <= _SAME_RATE * self.fps:
+            return None
+        return (
+            f"the dynamics prior has learned from {self.fps:g} frames a second and the video has {fps:g}: what it "
+            f"expects of a frame is off by as much (train.priors --fps {fps:g} makes one for this rate)"
+        )
 
     @property
     def config(self) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def learn(
         moving,
         (torch.cat(unseen) - told) * target_scale,
         known * target_scale.square(),
-        moving.std(0).clamp(min=_SMALLEST),
+        moving.square().mean(0).sqrt().clamp(min=_SMALLEST),
         groups,
         settings.floor,
     )
