@@ -152,6 +152,13 @@ def test_weights_and_a_start() -> None:
     found = robust_pnp(points, pixels, K, weights=weights)
     assert not found.inliers[:, :17].any()
     assert float(degrees(found.pose.rotation, rotation).max()) < 1e-3
+    # What weighs a quarter may be off twice as far.
+    clean = filmed(6)[3]
+    clean[:, 30, 0] += 6.0
+    weights = torch.ones(68).double()
+    assert not robust_pnp(points, clean, K).inliers[:, 30].any()
+    weights[30] = 0.25
+    assert robust_pnp(points, clean, K, weights=weights).inliers[:, 30].all()
     # With one draw a frame hardly any is found; the start is tried beside it.
     wrong, _ = spoiled(filmed(6, 0.3)[3], 0.6)
     start = Pose(rotation, translation + 0.5, torch.zeros(6).double())

@@ -221,14 +221,15 @@ def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, trans
         settled = (better & (error - reached < _DONE * error)) | (~better & (damping > 1e6)) | (error < 1e-20)
         error = torch.where(better, reached, error)
         damping = torch.where(better, damping * 0.1, damping * 10).clamp(min=1e-12)
-        found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
         if bool(settled.any()):  # views that are done wait for no other
+            found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
             left = (~settled).nonzero()[:, 0]
-            if not len(left):
-                break
             going, x, q, K, w = going[left], x[left], q[left], K[left], w[left]
             rotation, translation, error, damping = rotation[left], translation[left], error[left], damping[left]
             nearest = nearest[left]
+            if not len(left):
+                break
+    found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
     return Pose(found.rotation, found.translation, (found.errors / total).sqrt())
 
 
