@@ -17,7 +17,7 @@ from torchface.landmarks.trees import LandmarkTrees, similarity_to, start_shapes
 
 _AROUND = 0.6  # of the box's side that is shown to the trees on every side
 _OUTLYING = 0.02  # of the box's side: starts that end so far from the others count half
-_HALF = 0.03
+_HALF = 0.02
 _LARGEST_SIDE = 4096
 
 
@@ -64,7 +64,7 @@ class Consensus(NamedTuple):
 
     @property
     def confidence(self) -> Tensor:
-        """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.03 of the box's side."""
+        """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.02 of the box's side."""
         return 1 / (1 + (self.spread / _HALF).square())
 
 

@@ -1,0 +1,89 @@
+"""Faces and landmarks in real pictures: what is found, how far it is off, how much it trembles, what it costs.
+
+``make bench`` prints the figures.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import zoo
+from torchface.io.images import load_image
+from torchface.io.landmarks import load_landmark_points
+from torchface.io.landmarks_dlib import load_dlib_faces
+from torchface.io.video import open_video
+from torchface.landmarks import LandmarkTracker, LandmarkTrees, find_faces, find_landmarks, landmark_jitter
+from torchface.landmarks.consensus import ConsensusSettings
+from torchface.landmarks.face_box import overlaps
+from torchface.landmarks.ibug import box_around
+from torchface.landmarks.tracking import track_landmarks
+
+
+@pytest.fixture(scope="module")
+def trees() -> LandmarkTrees:
+    model = zoo.get_model("face_landmarks")
+    assert isinstance(model, LandmarkTrees)
+    return model
+
+
+def photographs(data: Path) -> list[tuple[Path, list[Tensor]]]:
+    """Photographs and the landmarks (68,2) of the faces annotated in them."""
+    folder = data / "images" / "dlib_faces"
+    faces: dict[str, list[Tensor]] = {}
+    for one in load_dlib_faces(folder / "training_with_face_landmarks.xml"):
+        faces.setdefault(one.image, []).append(one.points.float())
+    portrait = data / "images" / "ibug" / "image_0010"
+    alone = (portrait.with_suffix(".png"), [load_landmark_points(portrait.with_suffix(".pts")).ibug().float()])
+    return [*((folder / name, marks) for name, marks in faces.items()), alone]
+
+
+@pytest.mark.real
+def test_photographed_faces(trees: LandmarkTrees, data: Path) -> None:
+    found, wrong, total, off = 0, 0, 0, []
+    for path, marks in photographs(data):
+        picture = (load_image(path) * 255).round().to(torch.uint8)
+        faces = find_faces(picture)
+        shared = overlaps(torch.stack([box_around(one[None])[0] for one in marks]), faces.boxes)
+        total += len(marks)
+        wrong += int((shared.amax(0) < 0.3).sum())
+        for one, row in zip(marks, shared, strict=True):
+            if float(row.max()) > 0.3:
+                found += 1
+                seen = find_landmarks(picture, trees, int(row.argmax()))
+                off.append(float((seen.landmarks - one).norm(dim=1).mean() / (one[36] - one[45]).norm()))
+    errors = torch.tensor(off)
+    print(f"\n{found} of {total} faces found, {wrong} boxes where there is none; landmarks off by")
+    print(f"{errors.mean():.1%} of the distance of the eyes' outer corners in the mean, {errors.median():.1%} median")
+    assert found >= 16
+    assert wrong == 0
+    assert errors.median() < 0.09
+
+
+@pytest.mark.real
+def test_a_filmed_face(trees: LandmarkTrees, data: Path) -> None:
+    frames = list(open_video(data / "video" / "single_face.mp4").frames())
+    jitter = {}
+    print("\nstarts  frames tracked  jitter, pixels  without the jaw  ms of processor time a frame")
+    for starts in (2, 4, 8, 16, 32):
+        begun = time.process_time()
+        track = track_landmarks(frames, LandmarkTracker(trees, starts=ConsensusSettings(starts=starts)))
+        spent = 1000 * (time.process_time() - begun) / len(frames)
+        seen = int(torch.isfinite(track.values).flatten(1).all(1).sum())
+        jitter[starts] = float(landmark_jitter(track.values))
+        inner = float(landmark_jitter(track.values[:, 17:]))
+        print(f"{starts:6}  {seen:7} of {len(frames)}  {jitter[starts]:14.2f}  {inner:15.2f}  {spent:28.1f}")
+        assert seen == len(frames)
+    assert jitter[16] < 0.6 * jitter[2]
+
+
+@pytest.mark.real
+def test_a_video_without_a_face(trees: LandmarkTrees, data: Path) -> None:
+    track = track_landmarks(data / "video" / "no_face.mp4", LandmarkTracker(trees))
+    seen = int(torch.isfinite(track.values).flatten(1).all(1).sum())
+    print(f"\n{seen} of {len(track)} frames show a face where there is none")
+    assert seen == 0
