@@ -216,8 +216,8 @@ def test_both_algorithms_end_at_the_same_place(planted) -> None:
     model = AppearanceModel.fit(pictures[:12], truth[:12], AppearanceSettings(iterations=40))
     level, picture = model.levels[-1], pictures[13][None, None]
     start = truth[13:14] + torch.tensor([1.0, -0.8])
-    fast = model._refine_level(level, picture, start)
     crop = model.crop(picture, start, float(level.scale))
+    fast = crop.pose.apply(model._refine_level(level, crop, crop.pose.undo(start)))
     found, at = crop.pose.undo(start), torch.zeros(1, len(level.modes))
     precision = torch.cat([torch.zeros(4), model.deviations.pow(-2)])
     for _ in range(40):
@@ -287,7 +287,11 @@ def broken_scale(model: AppearanceModel) -> None:
     model.levels[0].scale.fill_(1e7)
 
 
-@pytest.mark.parametrize("break_it", [broken_corner, broken_deviation, broken_scale])
+def broken_mean(model: AppearanceModel) -> None:
+    model.mean_shape.mul_(1e6)
+
+
+@pytest.mark.parametrize("break_it", [broken_corner, broken_deviation, broken_scale, broken_mean])
 def test_files_that_could_not_have_been_learned_are_refused(
     film: PortraitFilm, break_it: Callable[[AppearanceModel], None], tmp_path: Path
 ) -> None:

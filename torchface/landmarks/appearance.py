@@ -59,8 +59,8 @@ class AppearanceSettings:
         if self.features not in get_args(Features):
             known = ", ".join(get_args(Features))
             raise NameMismatchError(f"features: found {self.features!r}, expected one of {known}")
-        if not self.resolutions or not all(4 <= one <= 512 for one in self.resolutions):
-            raise ValueRangeError(f"resolutions: found {self.resolutions}, expected numbers from 4 to 512")
+        if not self.resolutions or not all(4 <= one <= 256 for one in self.resolutions):
+            raise ValueRangeError(f"resolutions: found {self.resolutions}, expected numbers from 4 to 256")
         limits = {
             "spacing": (0.5, 16.0),
             "iterations": (1, 1000),
@@ -181,8 +181,11 @@ class AppearanceModel(nn.Module):
         positive = [self.deviations, *(one for level in self.levels for one in (level.noise, level.typical))]
         if not all(bool((one > 0).all()) for one in positive):
             raise ValueRangeError("appearance: found a deviation or noise of 0 or below, expected positive ones")
-        if not all(4 <= float(level.scale) <= 512 for level in self.levels):
-            raise ValueRangeError("appearance: found a level's scale outside 4 to 512 pixels")
+        if not all(4 <= float(level.scale) <= 256 for level in self.levels):
+            raise ValueRangeError("appearance: found a level's scale outside 4 to 256 pixels")
+        size = self.mean_shape.square().sum(1).mean().sqrt()
+        if not (0.9 < float(size) < 1.1 and float(self.mean_shape.abs().max()) < 8):
+            raise ValueRangeError(f"appearance: found a mean shape of size {float(size):.3g}, expected 1")
 
     @classmethod
     def fit(
@@ -231,18 +234,21 @@ class AppearanceModel(nn.Module):
         before, after = start.new_full((2, len(start)), torch.inf)
         seen = torch.isfinite(start).flatten(1).all(1) & (start.flatten(1).std(1) > 0)
         if seen.any():
-            pictures, points = grey[seen], start[seen]
-            before[seen] = self.error(pictures, points)
+            pictures, points = grey[seen], start[seen].to(self.mean_shape)
+            first = points
             for level in self.levels:
-                points = self._refine_level(level, pictures, points)
-            found[seen], after[seen] = points, self.error(pictures, points)
+                crop = self.crop(pictures, points, float(level.scale))
+                points = crop.pose.apply(self._refine_level(level, crop, crop.pose.undo(points)))
+            # Both in the last crop: what is compared has been seen alike, and was computed once.
+            before[seen] = self._error_in(crop, first).to(start)
+            after[seen] = self._error_in(crop, points).to(start)
+            found[seen] = points.to(start)
         return AppearanceFit(found, after, before)
 
     def error(self, images: Tensor, landmarks: Tensor) -> Tensor:
         """How badly faces at these landmarks (B,68,2) look like the person, (B,), at the finest resolution."""
-        level = self.levels[-1]
-        crop = self.crop(grey_images(images), landmarks, float(level.scale))
-        return level.error(level.residual(level.sample(crop.features, self._points(crop.pose.undo(landmarks)))))
+        points = landmarks.to(self.mean_shape)
+        return self._error_in(self.crop(grey_images(images), points, float(self.levels[-1].scale)), points)
 
     def crop(self, images: Tensor, landmarks: Tensor, resolution: float) -> FaceCrop:
         """Upright pictures of faces, ``resolution`` pixels a unit of the mean shape, as features.
@@ -267,10 +273,16 @@ class AppearanceModel(nn.Module):
             pictures[rows] = _cut_out(images[rows], some, (width, height), count)
         return FaceCrop(dense_features(pictures, self.settings.features), pose)
 
-    def _refine_level(self, level: AppearanceLevel, images: Tensor, landmarks: Tensor) -> Tensor:
-        """The best landmarks, by residual and shape, of those that the steps lead to; the start is one of them."""
-        crop = self.crop(images, landmarks, float(level.scale))
-        found = best = crop.pose.undo(landmarks)
+    def _error_in(self, crop: FaceCrop, landmarks: Tensor) -> Tensor:
+        level = self.levels[-1]
+        return level.error(level.residual(level.sample(crop.features, self._points(crop.pose.undo(landmarks)))))
+
+    def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, start: Tensor) -> Tensor:
+        """The best landmarks, by residual and shape, of those that the steps lead to from a start; pixels of the crop.
+
+        The start is one of them.
+        """
+        found = best = start
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
         still = torch.zeros_like(lowest, dtype=torch.bool)
@@ -291,7 +303,7 @@ class AppearanceModel(nn.Module):
             ahead = torch.where(still[:, None, None], found, ahead)
             still = still | ((ahead - found).flatten(1).abs().amax(1) < _STILL)
             found = ahead
-        return crop.pose.apply(best)
+        return best
 
     def _plausible(self, landmarks: Tensor, level: AppearanceLevel) -> Tensor:
         """Whether landmarks (B,68,2) in a crop are finite, and of about the size that faces have in it, (B,)."""
