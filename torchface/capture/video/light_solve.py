@@ -21,7 +21,8 @@ _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 250.0  # millimetres; nearer, a lamp would be in the picture, and soft light would pass for such a one
 _MOST_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
-_ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 30, 1e-5
+_NARROWING = (1.0, 0.5, 0.25)
+_ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 20, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +79,8 @@ class LampFit:
 def find_lamp(seen: SeenSkin) -> LampFit:
     """The lamp that explains best what was seen; see ``estimate_light``."""
     starts, width = _starts(seen.thinned(_FEW))
-    found = [_refined(seen, start, width) for start in starts]  # a few; each casts its own shadows
-    best = min(found, key=lambda one: one.cost)
-    # Once more with what is left as the measure of what is an outlier.
-    return _refined(seen, best, min(width, _width(best.residuals, seen)))
+    found = [_settled(seen, start, width) for start in starts]  # a few; each casts its own shadows
+    return min(found, key=lambda one: (_width(one.residuals, seen), one.cost))
 
 
 def information(seen: SeenSkin, fit: LampFit) -> Tensor:
@@ -104,6 +103,16 @@ def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
         if all(float(directions[i] @ directions[j]) < math.cos(math.radians(_APART)) for j in chosen):
             chosen.append(i)
     return [tried[i] for i in chosen[:_KEPT]], width
+
+
+def _settled(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
+    """Refined with an estimator that narrows, so that a large foreign shadow lets go; at last as wide as what is left.
+
+    What is left at the median, not the objective, then says which start was right: each has its own outliers.
+    """
+    for share in _NARROWING:
+        start = _refined(seen, start, max(share * width, _LEAST_WIDTH))
+    return _refined(seen, start, min(width, _width(start.residuals, seen)))
 
 
 def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
