@@ -19,8 +19,9 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
     .. math:: R = I + \frac{\sin\theta}{\theta} [v] + \frac{1 - \cos\theta}{\theta^2} [v]^2
 
     Example:
-        >>> (rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])) @ torch.tensor([1.0, 0.0, 0.0])).round().tolist()
-        [0.0, 1.0, 0.0]
+        >>> turned = rotation_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])) @ torch.tensor([1.0, 0.0, 0.0])
+        >>> torch.allclose(turned, torch.tensor([0.0, 1.0, 0.0]), atol=1e-6)
+        True
     """
     # sinc divides without a case of its own for no angle; 2 sin²(θ/2)/θ² keeps the digits that 1 - cos θ loses.
     angle = vectors.norm(dim=-1)[..., None, None] / torch.pi
