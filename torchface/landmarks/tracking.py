@@ -31,9 +31,9 @@ class TrackingSettings:
     """When a face counts as lost, and where it is looked for.
 
     Starts on a face end near each other, starts on anything else do not: with the shipped trees the mean spread was
-    0.009 to 0.033 of the box's side on 19 photographed faces, 0.004 to 0.021 on drawn ones, and 0.058 to 0.099 on
-    pieces of pictures without a face (5th to 95th percentile; the most on a photographed face was 0.038, the least
-    without one 0.049).
+    0.008 to 0.036 of the box's side on 19 photographed faces, 0.004 to 0.020 on drawn ones, and 0.057 to 0.10 on
+    pieces of pictures without a face (5th to 95th percentile; the most on a photographed face was 0.045, the least
+    without one 0.054).
 
     Args:
         sure: mean spread up to which a face is one without asking the detector, of the box's side.
