@@ -38,7 +38,7 @@ from torchface.workflows.track_files import (
     summary,
     write_curves,
 )
-from torchface.workflows.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
+from torchface.workflows.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models, rate_notes
 from torchface.workflows.track_overlay import video_light, write_overlay
 from torchface.workflows.track_result import FEWEST_STABLE, Tracked
 from torchface.workflows.track_state import TrackedFrames, TrackState, digest, file_digest
@@ -137,7 +137,10 @@ def track_video(
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
-    tracked = Tracked(film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products)
+    notes = rate_notes(models, film.fps)
+    tracked = Tracked(
+        film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, notes=notes
+    )
     products |= write_curves(tracked, out)
     if settings.overlay:
         texture_key = "" if settings.texture is None else file_digest(settings.texture)
