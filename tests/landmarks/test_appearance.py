@@ -203,8 +203,7 @@ def test_a_step_is_the_plain_simultaneous_algorithms_step(film: PortraitFilm, mo
         flat = level.jacobian(residual.coefficients)[0].flatten(0, 1)
         modes = level.modes.flatten(1)
         projected = flat - modes.T @ (modes @ flat)
-        mixed = torch.cat([torch.ones(1), residual.coefficients[0]])
-        found = torch.einsum("j,k,jkpq->pq", mixed, mixed, level.curvature())
+        found = level.projected_curvature(residual.coefficients)[0]
         torch.testing.assert_close(found, projected.T @ projected, rtol=1e-6, atol=1e-6 * float(found.abs().max()))
     finally:
         level.float()

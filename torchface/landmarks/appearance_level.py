@@ -89,9 +89,7 @@ class AppearanceLevel(nn.Module):
         slope = (mixed @ self.slope.flatten(1)).unflatten(1, self.slope.shape[1:])
         pull = (residual.left[..., None] * slope).sum(1)
         downhill = pull.flatten(1) @ self.motion.flatten(0, 1) / self.noise
-        products = (mixed[:, :, None] * mixed[:, None]).flatten(1)
-        curvature = products @ self.curvature().flatten(2).flatten(0, 1) / self.noise
-        curvature = curvature.unflatten(1, (state.shape[1], -1))
+        curvature = self.projected_curvature(residual.coefficients) / self.noise
         damping = 1e-4 * curvature.diagonal(dim1=1, dim2=2).mean(1)[:, None] + 1e-9
         system = curvature + torch.diag_embed(precision + damping)
         return torch.linalg.solve(system, downhill + precision * state)
@@ -100,17 +98,59 @@ class AppearanceLevel(nn.Module):
         """J (B,C,N,Q) of the texture with these coefficients (B,K)."""
         return torch.einsum("bk,kcnd,ndq->bcnq", _with_one(coefficients), self.slope, self.motion)
 
-    def curvature(self) -> Tensor:
-        """The coefficients (K+1,K+1,Q,Q) of the projected curvature; kept until the state changes."""
+    def projected_curvature(self, coefficients: Tensor) -> Tensor:
+        """The projected curvature of the texture with these coefficients (B,K), (B,Q,Q)."""
+        mixed = _with_one(coefficients)
+        first, second = _pairs(mixed.shape[1], mixed.device)
+        flat = (mixed[:, first] * mixed[:, second]) @ self._curvature_terms()
+        count = self.motion.shape[2]
+        rows, columns = _pairs(count, mixed.device)
+        whole = flat.new_empty(len(flat), count, count)
+        whole[:, rows, columns] = flat
+        whole[:, columns, rows] = flat
+        return whole
+
+    def _curvature_terms(self) -> Tensor:
+        r"""What each product of two coefficients adds to each entry of the curvature, (J,R): upper triangles of both.
+
+        A place's gradients meet in a 2 x 2 tensor, summed over the channels before the motions come in:
+
+        .. math:: J_i^\top J_j = \sum_n M_n^\top \bigl( \textstyle\sum_c g_{icn} g_{jcn}^\top \bigr) M_n
+
+        which takes a tenth of the work of the Jacobians' own products. Kept until the state changes.
+        """
         known = (self.slope.data_ptr(), self.slope._version, self.slope.device)
         if self._curvature is None or self._curvature_of != known:
-            terms = torch.einsum("kcnd,ndq->kqcn", self.slope, self.motion).flatten(2)
-            modes = self.modes.flatten(1)
-            flat = (terms - (terms @ modes.T) @ modes).flatten(0, 1)
-            products = (flat @ flat.T).unflatten(1, (len(terms), -1)).unflatten(0, (len(terms), -1))
-            self._curvature = products.transpose(1, 2).contiguous()
+            first, second = _pairs(len(self.slope), self.slope.device)
+            rows, columns = _pairs(self.motion.shape[2], self.slope.device)
+            x, y = self.slope.unbind(-1)
+            crossed = torch.einsum("icn,jcn->ijn", x, y)
+            tensors = torch.stack([
+                torch.einsum("icn,jcn->ijn", x, x), (crossed + crossed.transpose(0, 1)) / 2,
+                torch.einsum("icn,jcn->ijn", y, y),
+            ], dim=-1)[first, second]  # fmt: skip
+            across, down = self.motion.unbind(1)
+            moved = torch.stack([
+                across[:, rows] * across[:, columns],
+                across[:, rows] * down[:, columns] + down[:, rows] * across[:, columns],
+                down[:, rows] * down[:, columns],
+            ], dim=1)  # fmt: skip
+            whole = tensors.flatten(1) @ moved.flatten(0, 1)
+            # What the projection takes away: the Jacobians' shares along the modes.
+            pulls = torch.einsum("kcn,icnd->iknd", self.modes, self.slope)
+            shares = pulls.flatten(2) @ self.motion.flatten(0, 1)
+            along = torch.einsum("ikp,jkq->ijpq", shares, shares)
+            taken = (along[first, second] + along[second, first])[:, rows, columns] / 2
+            twice = torch.where(first == second, 1.0, 2.0).to(whole)
+            self._curvature = (whole - taken) * twice[:, None]
             self._curvature_of = known
         return self._curvature
+
+
+def _pairs(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the upper triangle of a square."""
+    rows, columns = torch.triu_indices(count, count, device=device)
+    return rows, columns
 
 
 def _with_one(coefficients: Tensor) -> Tensor:
