@@ -27,8 +27,7 @@ def calibration_picture(trial: OneStep) -> Figure:
     ks = torch.linspace(0.0, 4.0, 81, dtype=torch.float64)
     normal = torch.distributions.Normal(0.0, 1.0)
     scaled = (trial.errors / trial.deviations).double()
-    moving = trial.persistence.abs() > 1e-3
-    for values, label in ((scaled, "all weights"), (scaled[moving], "weights that change")):
+    for values, label in ((scaled, "all weights"), (scaled[trial.changing], "weights that change")):
         share = torch.stack([(values.abs() < k).double().mean() for k in ks])
         within.plot(ks, share, label=label)
     within.plot(ks, 2 * normal.cdf(ks) - 1, "k--", label="a normal distribution")
@@ -36,7 +35,7 @@ def calibration_picture(trial: OneStep) -> Figure:
     within.grid(alpha=0.3)
     within.legend()
     edges = np.linspace(0, 1, 21)
-    for values, label in ((scaled.flatten(), "all weights"), (scaled[moving], "weights that change")):
+    for values, label in ((scaled.flatten(), "all weights"), (scaled[trial.changing], "weights that change")):
         places.hist(normal.cdf(-values).numpy(), edges, density=True, histtype="step", linewidth=1.6, label=label)
     places.axhline(1.0, color="k", linestyle="--", label="uniform: a normal distribution")
     places.set(xlabel="probability integral transform of the truth", ylabel="density", xlim=(0, 1))

@@ -14,6 +14,7 @@ from torchface.capture.priors import DynamicsPrior, ShapePrior, windows_of
 from torchface.shape_names import mapping
 
 _FOCAL, _DISTANCE = 900.0, 600.0  # pixels, millimetres
+_STILL = 1e-3  # what a weight at rest changes by at most
 _LEAST_SHAPES = 0.5  # of those that a rig must know for a trial
 
 
@@ -26,12 +27,14 @@ class OneStep:
         deviations: predicted, (B,N).
         persistence: errors of the last frame as prediction, (B,N).
         extrapolation: errors of the line through the last two frames, (B,N).
+        changing: which weights truly change by more than a thousandth, (B,N) bool.
     """
 
     errors: Tensor
     deviations: Tensor
     persistence: Tensor
     extrapolation: Tensor
+    changing: Tensor
 
     def metrics(self) -> dict[str, float]:
         """Root mean squares in weights, the share of frames within k deviations, the mean negative log likelihood."""
@@ -54,10 +57,11 @@ def one_step(prior: DynamicsPrior, takes: Sequence[Tensor], noise: float = 0.0, 
     # The extrapolation needs two frames, and all are to be asked for the same ones.
     pairs = [windows_of(take.float(), max(prior.window, 2)) for take in takes]
     windows, following = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+    changing = (following - windows[:, -1]).abs() > _STILL
     windows = windows + noise * torch.randn(windows.shape, generator=generator)
     mean, variance = prior(windows)
     last, before = windows[:, -1], windows[:, -2]
-    return OneStep(mean - following, variance.sqrt(), last - following, 2 * last - before - following)
+    return OneStep(mean - following, variance.sqrt(), last - following, 2 * last - before - following, changing)
 
 
 @dataclass(frozen=True, eq=False)

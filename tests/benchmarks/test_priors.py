@@ -50,13 +50,11 @@ def test_predictions_of_takes_left_out(real_capture: Capture, noise: float) -> N
         found = trial.metrics()
         ours, line = found["one-step error"], found["one-step error of extrapolation"]
         last = found["one-step error of persistence"]
-        windows = torch.cat([windows_of(takes[i].float(), window)[0] for i in split])
         following = torch.cat([windows_of(takes[i].float(), window)[1] for i in split])
         inside = (trial.extrapolation + following).clamp(0, 1) - following
-        changing = (following - windows[:, -1]).abs() > 1e-3
         scaled = (trial.errors / trial.deviations).abs()
         within = [float((scaled < k).double().mean()) for k in (1, 2, 3)]
-        moving = [float((scaled[changing] < k).double().mean()) for k in (1, 2, 3)]
+        moving = [float((scaled[trial.changing] < k).double().mean()) for k in (1, 2, 3)]
         clipped = float(inside.square().mean().sqrt())
         shares = " ".join(f"{share:.3f}" for share in within) + "   " + " ".join(f"{share:.3f}" for share in moving)
         print(f"  {split}      {last:.5f}      {line:.5f} {clipped:.5f}        {ours:.5f}  {shares}")

@@ -22,7 +22,7 @@ _KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture] | type[StudentDens
     "mixture": GaussianMixture,
     "student": StudentDensity,
 }
-STRENGTH = 0.3
+STRENGTH = 0.15
 """Of a fitted prior: chosen by the error of solves of real takes that were left out of the learning."""
 _MOST_COMPONENTS = 8
 _FLOORS = (1e-4, 3e-4, 1e-3, 3e-3)
