@@ -267,7 +267,11 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
             "iBUG's 68 landmarks of faces in grey pictures, from boxes as OpenCV's Haar cascade gives them or "
             "`torchface.landmarks.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
             f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
-            + ("" if settings.data else " Learned from rendered people alone: expect twice the error on photographs.")
+            + (
+                ""
+                if settings.data
+                else " Learned from rendered people alone: expect two to three times the error on photographs."
+            )
         ),
         settings=effective,
         half=("offsets", "thresholds", "bases"),
