@@ -337,7 +337,7 @@ def _refined(trees: LandmarkTrees, grey: Tensor, box: Tensor, starts: ConsensusS
 def _relation(box: Tensor, other: Tensor) -> Tensor:
     """Where another box (4,) lies: its middle from the box's (2,) in sides of that, and its size by that's; (3,)."""
     away = (other[:2] + other[2:] / 2 - box[:2] - box[2:] / 2) / box[2]
-    return torch.cat([away, (other[2:3] / box[2:3]).clamp(0.7, 1.4)]).clamp(-0.3, 1.4)
+    return torch.cat([away.clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
 
 
 @torch.no_grad()
