@@ -15,10 +15,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface import zoo
+from torchface.io.landmarks_dlib import load_dlib_faces
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.ibug import MIRROR_68, relative_errors
 from torchface.onnx import export_model
-from train.landmarks import Faces, rendered_faces
+from train.landmarks import Faces, evaluate, load_faces, rendered_faces
 
 LEARN, TEST = 300, 150
 SETTINGS = TreeSettings(cascades=8, trees=60, depth=5, oversampling=10, turn=0, gamma=0, noise=0)
@@ -129,6 +131,29 @@ def learned_by_dlib(dlib, learn: Faces, own_oversampling: bool):  # type: ignore
             images.append(image.numpy())
             detections.append([dlib.full_object_detection(rectangle(dlib, box[number]), points) for box in boxes])
     return dlib.train_shape_predictor(images, detections, options)
+
+
+@pytest.mark.real
+def test_photographs(data: Path) -> None:
+    """18 faces of four photographs: the shipped trees, and trees learned from the other three photographs alone."""
+    path = data / "images" / "dlib_faces" / "training_with_face_landmarks.xml"
+    faces = load_faces(path)
+    pictures = [face.image for face in load_dlib_faces(path)]
+    print(f"\nshipped: mean error {100 * evaluate(zoo.get_model('face_landmarks'), faces).mean():.1f} %")
+    settings = TreeSettings(cascades=8, trees=60, oversampling=150, components=20)
+    errors = []
+    for picture in sorted(set(pictures)):
+        learn, test = (
+            Faces([faces.images[row] for row in rows], faces.boxes[rows], faces.landmarks[rows])
+            for rows in (
+                [row for row, name in enumerate(pictures) if name != picture],
+                [row for row, name in enumerate(pictures) if name == picture],
+            )
+        )
+        errors.append(evaluate(LandmarkTrees.fit(learn.images, learn.boxes, learn.landmarks, settings), test))
+        print(f"  {picture}, learned from the others: {100 * errors[-1].mean():.1f} %")
+    print(f"learned from photographs: mean error {100 * torch.cat(errors).mean():.1f} %")
+    assert torch.cat(errors).mean() < 0.1
 
 
 def test_time_of_a_full_model(tmp_path: Path) -> None:
