@@ -17,12 +17,14 @@ from torch import Tensor
 from torchface import TorchfaceError, zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.annotated_frames import AnnotatedFrame, load_annotated_frames
+from torchface.landmarks.appearance_level import sample_pixels
 from torchface.landmarks.shape_modes import planar_pose
 from torchface.rendering.compositing import caption, save_picture, sheet
 
 _OFF = 0.03
 _TO_REST = 0.5
 _DOT = 2
+_ROOM = 0.75
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,12 @@ def _picture(frame: AnnotatedFrame, found: Tensor) -> Tensor:
                 columns, rows = (x + dx).clamp(0, image.shape[2] - 1), (y + dy).clamp(0, image.shape[1] - 1)
                 image[:, rows, columns] = torch.tensor(color)[:, None]
     low, high = frame.landmarks.amin(0), frame.landmarks.amax(0)
-    room = 0.25 * (high - low)
-    left, top = (low - room).clamp(min=0).long().tolist()
-    right, bottom = (high + room).long().tolist()
-    cut = image[:, top : bottom + 1, left : right + 1]
-    return caption(torch.nn.functional.interpolate(cut[None], (300, 240), mode="bilinear")[0], frame.name)
+    x, y = ((low + high) / 2).tolist()
+    reach = _ROOM * float((high - low).max())
+    rows = torch.linspace(y - reach, y + reach, 300)
+    columns = torch.linspace(x - 0.8 * reach, x + 0.8 * reach, 240)
+    places = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    return caption(sample_pixels(image[None], places)[0].unflatten(1, (300, 240)), frame.name)
 
 
 def main() -> None:
