@@ -241,7 +241,8 @@ class VideoSolver(nn.Module):
             confidence: how far each landmark is trusted, (T,68) in [0,1].
 
         Returns:
-            What the face did, in the dtype of the landmarks; differentiable in all arguments.
+            What the face did, in the dtype of the landmarks; differentiable in all arguments, through all frames. A
+            pose that is found here counts as given.
 
         Raises:
             ShapeError: the shapes do not fit each other.
