@@ -21,7 +21,7 @@ _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 250.0  # millimetres; nearer, a lamp would be in the picture, and soft light would pass for such a one
 _MOST_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
-_NARROWING = (1.0, 0.5, 0.25)
+_NARROWING = (1.0, 0.5)
 _ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 20, 1e-4
 
 
