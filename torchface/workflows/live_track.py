@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,24 +13,21 @@ from torch import Tensor
 from torchface.capture.video import VideoSolver
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.capture.video.pose import PoseTracker
-from torchface.errors import FileFormatError, ValueRangeError
+from torchface.errors import ValueRangeError
 from torchface.geometry.calibration import CameraCalibration
 from torchface.geometry.distortion import undistort
 from torchface.io.live_link_stream import LiveLinkSender, parse_address
-from torchface.io.video import VideoFile, open_video
-from torchface.io.video_decoding import opencv
 from torchface.landmarks.tracking import LandmarkTracker
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.head_rotations import head_angles, rotation_columns
+from torchface.workflows.live_frames import Camera, PlayedVideo
 from torchface.workflows.track import TrackSettings, camera_of, landmark_noise, load_actor
 from torchface.workflows.track_files import save_curves
 from torchface.workflows.track_models import TrackModels, load_track_models
 
 _FEWEST = 6
 _EYES = 6
-_USUAL_RATE = 30.0
-_PATIENCE = 5.0
 _DEFAULT = TrackSettings()
 
 
@@ -181,96 +177,3 @@ def track_live(
         take = Take(fps, weights=Track(actor.names, weights[..., None]), extras={"columns": rotation_columns(still)})
         path = save_curves(take, out)["weights"]
     return LiveReport(weights, found, torch.tensor(latency), source.dropped, len(rows) / took, path)
-
-
-class PlayedVideo:
-    """A video file whose frames come in their own time, as a camera's would; those that come too early are dropped.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        FileFormatError: it cannot be opened.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.film: VideoFile = open_video(path)
-        self.dropped = 0
-
-    def frames(self) -> Iterator[tuple[float, Tensor]]:
-        """When each frame was due, and the frame, uint8 (3,H,W)."""
-        begin = time.perf_counter()
-        for number, frame in enumerate(self.film.color_frames()):
-            due = begin + number / self.film.fps
-            early = due - time.perf_counter()
-            if early > 0:
-                time.sleep(early)
-            elif -early > 1 / self.film.fps:  # a camera would have shown the next one by now
-                self.dropped += 1
-                continue
-            yield due, frame
-
-    def __enter__(self) -> PlayedVideo:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
-
-
-class Camera:
-    """A camera at this machine; a thread takes its frames, and the newest one is given.
-
-    Args:
-        number: of the device, from 0.
-
-    Raises:
-        FileFormatError: there is none, or it gives no picture.
-    """
-
-    def __init__(self, number: int) -> None:
-        cv2 = opencv()
-        self._capture = cv2.VideoCapture(number)
-        good, frame = self._capture.read() if self._capture.isOpened() else (False, None)
-        if not good or frame is None:
-            self._capture.release()
-            raise FileFormatError(f"camera {number}: cannot be opened, expected the number of a device, from 0")
-        rate = self._capture.get(cv2.CAP_PROP_FPS)
-        height, width = frame.shape[:2]
-        self.film = VideoFile(Path(f"camera {number}"), rate if 1 <= rate <= 1000 else _USUAL_RATE, width, height, 1)
-        self.dropped = 0
-        self._newest: tuple[float, object] | None = None
-        self._change = threading.Condition()
-        self._open = True
-        self._thread = threading.Thread(target=self._take, daemon=True)
-        self._thread.start()
-
-    def frames(self) -> Iterator[tuple[float, Tensor]]:
-        """When each frame came, and the frame, uint8 (3,H,W); until the camera gives no more."""
-        while True:
-            with self._change:
-                self._change.wait_for(lambda: self._newest is not None or not self._open, _PATIENCE)
-                newest, self._newest = self._newest, None
-            if newest is None:
-                return
-            came, frame = newest
-            pixels = torch.from_numpy(frame)  # type: ignore[arg-type]
-            yield came, pixels.flip(-1).permute(2, 0, 1).contiguous()
-
-    def _take(self) -> None:
-        while self._open:
-            good, frame = self._capture.read()
-            with self._change:
-                if not good:
-                    self._open = False
-                else:
-                    self.dropped += self._newest is not None
-                    self._newest = (time.perf_counter(), frame)
-                self._change.notify()
-
-    def __enter__(self) -> Camera:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open = False
-        self._thread.join(_PATIENCE)
-        self._capture.release()
