@@ -14,7 +14,8 @@ from torchface.errors import ShapeError, ValueRangeError
 class Quadratic:
     r"""An energy :math:`E(w) = \tfrac12 w^\top H w + f^\top w + c` of blendshape weights, a frame each.
 
-    Energies add: ``marker_term(...) + sparsity_term(...)`` is the energy of both. Every term is in mm² a marker.
+    Energies add: ``marker_term(...) + sparsity_term(...)`` is the energy of both. Terms of
+    markers are in mm² a marker, terms of video and its priors are negative log likelihoods.
 
     Args:
         H: (N,N) for all frames, or (B,N,N).

@@ -29,6 +29,8 @@ TURN, SHIFT = 0.02, 4.0
 
 _FEWEST = 6
 _ROUNDS, _SLIDING_ROUNDS = 30, 3
+# Where the prior outweighs the landmarks its bound creeps; who asks for exact answers, for derivatives, gets them.
+_EXACT, _EXACT_ROUNDS = 1e-6, 500
 # What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre.
 _LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
 # Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full.
@@ -360,7 +362,7 @@ class VideoSolver(nn.Module):
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
         with torch.no_grad():
             head, rows = start, self._chosen(start)
-            for turn in range(_ROUNDS):
+            for turn in range(_ROUNDS if self.tolerance >= _EXACT else _EXACT_ROUNDS):
                 # Which points the contour's landmarks are is settled first; later it could go back and forth.
                 if 0 < turn < _SLIDING_ROUNDS:
                     rows = self._chosen(head)
