@@ -15,7 +15,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
-from torchface.capture import DynamicsPrior, ShapePrior
+from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import GaussianMixture, ReciprocalPrior, face_regions, windows_of
 from torchface.capture.priors.dynamics_training import fitted_kernel
 from torchface.capture.priors.gaussian_process import Evidence, GaussianProcesses, posterior, whitening_of
@@ -76,8 +76,12 @@ def test_forms_of_the_dynamics(real_capture: Capture) -> None:
     }
     print("\nroot mean square error and negative log likelihood a weight, takes 5 and 6 of six left out")
     for label, groups in forms.items():
+        # So many processes would take minutes with as many inducing points each.
+        settings = DynamicsSettings(inducing=40, subset=400, rounds=15) if len(groups) > 10 else None
         prior, seconds = cpu_seconds(
-            lambda groups=groups: DynamicsPrior.fit(takes[:4], names, 3, groups=groups)  # type: ignore[misc]
+            lambda groups=groups, settings=settings: DynamicsPrior.fit(  # type: ignore[misc]
+                takes[:4], names, 3, groups=groups, settings=settings
+            )
         )
         found = one_step(prior, takes[4:]).metrics()
         print(f"  {label:30} {found['one-step error']:.5f} {found['negative log likelihood a weight']:8.3f}"
