@@ -22,7 +22,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.head_rotations import head_angles, rotation_columns
 from torchface.workflows.live_frames import Camera, PlayedVideo
-from torchface.workflows.track import TrackSettings, camera_of, landmark_noise, load_actor
+from torchface.workflows.track import TrackSettings, camera_of, load_actor, solver_for
 from torchface.workflows.track_files import save_curves
 from torchface.workflows.track_models import TrackModels, load_track_models
 
@@ -103,9 +103,7 @@ class LiveSolver:
         if self._solver is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
         if self._solver is None:  # the first face tells how large it is, and so how noisy its landmarks are
-            noise = landmark_noise(landmarks[None], self._models)
-            rig, models = self._rig, self._models
-            self._solver = VideoSolver(rig, None, self._calibration.intrinsics, models.prior, models.dynamics, noise)
+            self._solver = solver_for(self._rig, self._models, self._calibration, landmarks[None])
             self._state = self._solver.start()
         self._state = self._solver.step(
             self._state, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
