@@ -18,6 +18,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
+from torchface.optim.held_set import solve_from_held_set
 from torchface.rig import BlendshapeRig
 
 SPARSITY = 1.0
@@ -383,8 +384,12 @@ class VideoSolver(nn.Module):
         begin = torch.nn.functional.pad(head.weights, (0, 6))
         H = 0.5 * (energy.H + energy.H.transpose(1, 2))
         exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
-        problem = BoxProblem.of(H, energy.f, self._lower, self._upper)
-        found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
+        if len(H) == 1:
+            row = solve_from_held_set(H[0], energy.f[0], self._lower, self._upper, begin[0], exactness, _NEWTON_STEPS)
+            found = row[None]
+        else:
+            problem = BoxProblem.of(H, energy.f, self._lower, self._upper)
+            found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
         return head.moved(found[:, :shapes], found[:, shapes:])
 
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:

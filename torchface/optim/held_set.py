@@ -1,0 +1,58 @@
+"""One box-constrained quadratic program from a start whose held variables are all but right: a factorisation or two."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.optim.active_set import projected_newton
+from torchface.optim.box_problem import BoxProblem, metric
+
+_CHANGES = 12
+
+
+def solve_from_held_set(
+    H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, start: Tensor, tolerance: float, iterations: int = 50
+) -> Tensor:
+    r"""The minimum of :math:`\tfrac12 x^\top H x + f^\top x` in a box, for a single problem, by sets of held variables.
+
+    Variables of a set are held at their bounds and the others solved for exactly; where
+    :math:`x - (Hx + f)/\operatorname{diag} H` lies beyond a bound is the next set. A set that comes again is the
+    solution's, and from a start near the solution the first or second does. That happens without any line search, so
+    it may also fail to: then ``projected_newton`` takes over.
+
+    Args:
+        H: (N,N), symmetric, positive semidefinite, float64.
+        f: (N,).
+        lower, upper: (N,), infinite where there is no bound.
+        start: in the box, (N,).
+        tolerance, iterations: of ``projected_newton``.
+
+    Returns:
+        (N,), without gradients.
+
+    Source: Hintermüller, Ito and Kunisch 2002, The primal-dual active set strategy as a semismooth Newton method.
+    """
+    H, f = H.detach(), f.detach()
+    slope = torch.addmv(f, H, start)
+    at_lower, at_upper = (start <= lower) & (slope > 0), (start >= upper) & (slope < 0)
+    diagonal = H.diagonal()
+    # Each set follows from the solution of the one before.
+    for _ in range(_CHANGES):
+        held = at_lower | at_upper
+        free = (~held).to(H.dtype)
+        bound = torch.where(at_lower, lower, torch.where(at_upper, upper, 0.0))
+        reduced = H * free * free[:, None]
+        reduced.diagonal().add_(held)
+        factor, failed = torch.linalg.cholesky_ex(reduced)
+        if bool(failed):
+            break
+        right = torch.where(held, bound, -torch.addmv(f, H, bound))
+        x = torch.cholesky_solve(right[:, None], factor)[:, 0]
+        aim = x - torch.addmv(f, H, x) / diagonal
+        below, above = aim < lower, aim > upper
+        if torch.equal(below, at_lower) and torch.equal(above, at_upper):
+            return torch.minimum(torch.maximum(x, lower), upper)
+        at_lower, at_upper = below, above
+    problem = BoxProblem(H[None], f[None], lower, upper, metric(H[None]))
+    return projected_newton(problem, start[None], tolerance, iterations)[0]
