@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.capture.video.face_points import FacePoints
 from torchface.capture.video.lighting import PointLight, estimate_light
 from torchface.errors import ValueRangeError
 from torchface.geometry.calibration import CameraCalibration
@@ -61,7 +62,7 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     """Draws frame number t, uint8 (3,H,W): the mesh half through, found landmarks green, the solved rig's red."""
     solution, rig = tracked.solution, tracked.rig
     weights = solution.weights.detach().to(rig.deltas)
-    marks = rig.neutral.landmarks
+    points = FacePoints.of(rig, rig.neutral.landmarks)  # those of the contour slide, as the solver has them
 
     def draw(t: int, frame: Tensor) -> Tensor:
         if not tracked.seen[t]:
@@ -70,7 +71,9 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
         vertices = rig(weights[t : t + 1])[0].double()
         camera = camera_at(tracked, t)
         shaded = shade_over(picture, vertices, rig.neutral.faces, camera)
-        return with_dots(shaded, tracked.pinhole[t], camera.project(vertices[marks]))
+        here = weights[t : t + 1].double()
+        rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
+        return with_dots(shaded, tracked.pinhole[t], camera.project(points.at(here)[0, rows]))
 
     return draw
 
