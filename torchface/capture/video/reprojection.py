@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.capture.energy import Quadratic
 from torchface.capture.video.face_points import JAW, FacePoints
 from torchface.geometry.pnp import pixel_jacobian
-from torchface.geometry.rotations import cross_matrix, rotation_matrix
+from torchface.geometry.rotations import rotation_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +104,16 @@ def linearise(
     placed = points.rest[rows] + (basis.flatten(1, 2) @ state.weights[..., None]).view(count, -1, 3)
     turned = placed @ state.rotation.transpose(-1, -2)
     pixels, by_place = pixel_jacobian(turned + state.translation[:, None], intrinsics)
-    residual = (pixels - landmarks) * precision[..., None]
-    by_place = by_place * precision[..., None, None]
+    # Residuals and their derivatives by the points' places go through the same products.
+    lines = torch.cat([(pixels - landmarks)[..., None], by_place], dim=-1) * precision[..., None, None]
     if along < 1:
-        line = pixels[:, :JAW]
-        tangent = torch.cat([line[:, 1:2] - line[:, :1], line[:, 2:] - line[:, :-2], line[:, -1:] - line[:, -2:-1]], 1)
-        tangent = torch.nn.functional.normalize(tangent, dim=-1)
+        contour, jaw = lines[:, :JAW], pixels[:, :JAW]
+        beyond = torch.cat([jaw[:, :1], jaw, jaw[:, -1:]], dim=1)
+        tangent = torch.nn.functional.normalize(beyond[:, 2:] - beyond[:, :-2], dim=-1)
         squeeze = (1 - along) * tangent[..., :, None] * tangent[..., None, :]
-        contour = residual[:, :JAW] - (squeeze @ residual[:, :JAW, :, None])[..., 0]
-        residual = torch.cat([contour, residual[:, JAW:]], dim=1)
-        by_place = torch.cat([by_place[:, :JAW] - squeeze @ by_place[:, :JAW], by_place[:, JAW:]], dim=1)
-    by_world = by_place @ state.rotation[:, None]
-    by_motion = torch.cat([by_place @ -cross_matrix(turned), by_place], dim=-1)
+        lines = torch.cat([contour - squeeze @ contour, lines[:, JAW:]], dim=1)
+    residual, by_place = lines[..., 0], lines[..., 1:]
+    by_world = (by_place.reshape(count, -1, 3) @ state.rotation).view(by_place.shape)
     by_weights = (by_world @ basis).view(count, -1, 2, shapes)
-    return Linearised(residual, torch.cat([by_weights, by_motion], dim=-1))
+    by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
+    return Linearised(residual, torch.cat([by_weights, by_turn, by_place], dim=-1))
