@@ -62,11 +62,9 @@ class Expectation:
 
     def quadratic(self, head: HeadState) -> Quadratic:
         """Over the weights and the head's motion from a state."""
-        shapes = head.weights.shape[1]
-        gradient = (self.information @ self.away(head)[..., None])[..., 0]
-        return Quadratic(
-            self.information, gradient - (self.information[..., :shapes] @ head.weights[..., None])[..., 0]
-        )
+        motion = head.motion_from(self.mean.rotation, self.mean.translation)
+        beyond = torch.cat([-self.mean.weights, motion], dim=1)
+        return Quadratic(self.information, (self.information @ beyond[..., None])[..., 0])
 
     def updated(self, head: HeadState, seen: Quadratic) -> Belief:
         """After a frame whose landmarks were linearised at a state.

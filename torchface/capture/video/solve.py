@@ -219,7 +219,8 @@ class VideoSolver(nn.Module):
         self.register_buffer("intrinsics", intrinsics.detach().double())
         self.register_buffer("landmark_weights", weights.double())
         shapes, like = len(rig.names), self.points.rest
-        self._constant = sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+        price = sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+        self._price = _beside_motion(price)
         free = like.new_full((6,), torch.inf)
         self._lower = torch.cat([like.new_zeros(shapes), -free])
         self._upper = torch.cat([like.new_ones(shapes), free])
@@ -382,20 +383,20 @@ class VideoSolver(nn.Module):
         shapes = len(self.names)
         energy = self.energy(terms, head, rows)
         begin = torch.nn.functional.pad(head.weights, (0, 6))
-        H = 0.5 * (energy.H + energy.H.transpose(1, 2))
         exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
-        if len(H) == 1:
-            row = solve_from_held_set(H[0], energy.f[0], self._lower, self._upper, begin[0], exactness, _NEWTON_STEPS)
-            found = row[None]
+        if len(begin) == 1:
+            H, f = energy.H[0], energy.f[0]
+            found = solve_from_held_set(H, f, self._lower, self._upper, begin[0], exactness, _NEWTON_STEPS)[None]
         else:
+            H = 0.5 * (energy.H + energy.H.transpose(1, 2))
             problem = BoxProblem.of(H, energy.f, self._lower, self._upper)
             found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
         return head.moved(found[:, :shapes], found[:, shapes:])
 
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
-        weights = self._constant if self.prior is None else self._constant + self.prior.energy(head.weights)
-        return self.seen(terms, head, rows) + terms.expected.quadratic(head) + _beside_motion(weights)
+        known = self.seen(terms, head, rows) + terms.expected.quadratic(head) + self._price
+        return known if self.prior is None else known + _beside_motion(self.prior.energy(head.weights))
 
     def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """What landmarks and tracked poses tell, linearised at a state, over weights and motion from there, (B,N+6)."""
