@@ -26,7 +26,7 @@ def track(
     face: int = 0,
     whole_take: bool = False,
     part: str | None = None,
-    no_overlay: bool = False,
+    overlay: bool = True,
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
@@ -54,7 +54,7 @@ def track(
         face: Which of several faces to follow, from 0, the largest first.
         whole_take: Smooth the head's pose over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
-        no_overlay: Draw no overlay video.
+        overlay: Draw the face over the video, as overlay.mp4.
         live: A camera's number, such as 0, or a video file that is played in its own time.
         stream: Where --live sends to; Unreal listens on port 11111.
         seconds: After which --live ends; until Ctrl-C if absent.
@@ -67,7 +67,7 @@ def track(
         found = "neither" if video is None else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
     settings = TrackSettings(
-        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, not no_overlay
+        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay
     )
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)
