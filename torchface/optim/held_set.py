@@ -40,19 +40,18 @@ def solve_from_held_set(
     # Each set follows from the solution of the one before.
     for _ in range(_CHANGES):
         held = at_lower | at_upper
-        free = (~held).to(H.dtype)
         bound = torch.where(at_lower, lower, torch.where(at_upper, upper, 0.0))
-        reduced = H * free * free[:, None]
+        reduced = H.masked_fill(held, 0.0).masked_fill_(held[:, None], 0.0)
         reduced.diagonal().add_(held)
         factor, failed = torch.linalg.cholesky_ex(reduced)
-        if bool(failed):
+        if failed:
             break
-        right = torch.where(held, bound, -torch.addmv(f, H, bound))
+        right = torch.where(held, bound, torch.addmv(f, H, bound).neg_())
         x = torch.cholesky_solve(right[:, None], factor)[:, 0]
-        aim = x - torch.addmv(f, H, x) / diagonal
+        aim = torch.addcdiv(x, torch.addmv(f, H, x), diagonal, value=-1)
         below, above = aim < lower, aim > upper
         if torch.equal(below, at_lower) and torch.equal(above, at_upper):
-            return torch.minimum(torch.maximum(x, lower), upper)
+            return x.clamp(lower, upper)
         at_lower, at_upper = below, above
     problem = BoxProblem(H[None], f[None], lower, upper, metric(H[None]))
     return projected_newton(problem, start[None], tolerance, iterations)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -157,6 +157,10 @@ class ShapePrior(nn.Module):
 
     def _assembled(self, weights: Tensor, factors: Tensor) -> Quadratic:
         """The groups' bounds at weights (B,N), each times its factor (G,B)."""
+        if self.groups == (tuple(range(len(self.names))),):
+            (density,) = cast("Sequence[Density]", self.densities)
+            own, pull = density.bound(weights)
+            return Quadratic(factors[0, :, None, None] * own, factors[0, :, None] * pull)
         H = weights.new_zeros(len(weights), len(self.names), len(self.names))
         f = weights.new_zeros(len(weights), len(self.names))
         for (density, part), group, factor in zip(self._parts(weights), self.groups, factors, strict=True):

@@ -107,14 +107,13 @@ class FacePoints:
         rows = torch.arange(LANDMARKS, device=weights.device).expand(len(weights), -1)
         if self.rows.shape[1] == 1:
             return rows
-        seen = self.at(weights)[:, LANDMARKS:] @ (intrinsics @ rotation).transpose(-1, -2)
-        seen = seen + (translation @ intrinsics.T)[:, None]
-        pixels = (seen[..., :2] / seen[..., 2:])[:, (self.rows - LANDMARKS).clamp(min=0)]
-        up = rotation[:, :2, 1]
-        across = torch.nn.functional.normalize(torch.stack([-up[:, 1], up[:, 0]], dim=-1), dim=-1)
-        across = across * torch.where((across * rotation[:, :2, 0]).sum(-1) < 0, -1.0, 1.0)[:, None]
+        image = self.at(weights) @ (intrinsics @ rotation).transpose(-1, -2) + (translation @ intrinsics.T)[:, None]
+        pixels = (image[..., :2] / image[..., 2:])[:, self.rows]
+        # The picture's direction at right angles to the face's vertical, toward its positive x.
+        across = torch.stack([-rotation[:, 1, 1], rotation[:, 0, 1]], dim=-1)
+        across = torch.where((across * rotation[:, :2, 0]).sum(-1, keepdim=True) < 0, -across, across)
         best = outermost(pixels, self.valid, across[:, None] * self.side[:, None])
-        slid = self.rows[torch.arange(JAW, device=weights.device), best]
+        slid = self.rows.expand(len(weights), -1, -1).gather(2, best[..., None])[..., 0]
         return torch.cat([torch.where(best > 0, slid, rows[:, :JAW]), rows[:, JAW:]], dim=1)
 
 
