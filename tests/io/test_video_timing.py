@@ -56,6 +56,7 @@ def test_a_lost_frame_in_a_hundred_passes() -> None:
         (np.where(np.random.default_rng(0).random(300) < 0.1, 2 / 30, 1 / 30), "last more than half a frame longer"),
         (np.full(100, 1 / 15), "its header says 30 frames a second"),
         (np.linspace(1 / 30, 1 / 20, 200), "ms each"),
+        (np.tile([1 / 30, 2 / 30], 24), "differ by 33 %"),
     ],
 )
 def test_variable_rates_are_named(lasts: np.ndarray, message: str) -> None:

@@ -14,14 +14,15 @@ _RATE_CHANGE = 0.1
 _ROUNDING = 0.0005  # seconds: Matroska counts whole milliseconds
 _HOLE = 0.5
 _HOLES = 0.01
+_SPREAD = 0.25  # a jitter of ±0.2 frames in the times makes 0.16 in how long frames last
 
 
 def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     """Refuses a video of variable frame rate: what is solved counts in frames of one length.
 
     Cameras of telephones jitter by some milliseconds and lose a frame now and then: that passes. What does not: a
-    rate that changes by more than a tenth, fifteen frames taken together, and holes in which more than one frame in a
-    hundred is missing.
+    rate that changes by more than a tenth, fifteen frames taken together, frames that last differently by more than a
+    quarter (root mean square), and holes in which more than one frame in a hundred is missing.
 
     Args:
         path: for the message.
@@ -43,6 +44,8 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     allowed = _RATE_CHANGE * usual + _ROUNDING
     if missing > 1 + _HOLES * len(lasts):
         what = f"{int(holes.sum())} of {len(lasts)} last more than half a frame longer or shorter"
+    elif (spread := float(np.sqrt(np.mean((lasts[~holes] / usual - 1) ** 2)))) > _SPREAD:
+        what = f"they differ by {100 * spread:.0f} %"
     elif means.max() - means.min() > allowed:
         worst = int(np.abs(means - usual).argmax())
         what = f"from frame {worst} to {worst + window} they last {1000 * means[worst]:.1f} ms each"

@@ -15,7 +15,7 @@ import torchface
 from torchface.capture.video import VideoSolution, VideoSolver
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.pose import HeadPoses, measure_poses, smooth_poses, track_pose
-from torchface.capture.video.whole_take import solve_whole_take
+from torchface.capture.video.whole_take import interpolated, solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files import write_file
 from torchface.geometry.calibration import CameraCalibration, assumed_calibration
@@ -333,5 +333,7 @@ def _solve(
         torch.stack([getattr(one, name) for one in states]).detach().to(landmarks)
         for name in ("weights", "rotation", "translation")
     )
+    if whole_take:
+        weights = interpolated(weights, enough)
     errors = solver.reprojection_errors(landmarks, weights, turned, moved)
     return VideoSolution(weights, turned, moved, errors, enough)

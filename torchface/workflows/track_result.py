@@ -79,7 +79,7 @@ class Tracked:
     def lines(self) -> list[str]:
         """For people to read."""
         count, seen = len(self.frames), int(self.seen.sum())
-        errors = self.solution.errors
+        errors = torch.where(self.seen, self.solution.errors, torch.nan)
         lines = [
             f"{count} frames at {self.video.fps:g} a second, the face found in {seen} ({100 * seen / count:.1f} %)",
             f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
@@ -102,7 +102,10 @@ class Tracked:
             )
         lost = count - seen
         if lost:
-            lines.append(f"{lost} frames without a face were bridged; landmarks.csv says which (success 0)")
+            lines.append(
+                f"{lost} frames without a face: they keep the face before, or with --whole-take lie between those "
+                "before and after; landmarks.csv says which (success 0)"
+            )
         bounds = self.bounds()
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:

@@ -189,6 +189,10 @@ def test_frames_without_a_face_are_bridged(small: BlendshapeRig) -> None:
         assert float((solution.weights[16:] - weights[16:]).abs().max()) < 0.2
     causal, whole = solver(found), solve_whole_take(solver, found)
     gap = slice(12, 16)
+    assert torch.equal(causal.weights[gap], causal.weights[11:12].expand(4, -1))
+    ends = whole.weights[[11, 16]]
+    between = torch.lerp(ends[:1], ends[1:], torch.arange(1, 5).to(ends)[:, None] / 5)
+    torch.testing.assert_close(whole.weights[gap], between)
     assert (whole.weights - weights)[gap].abs().mean() < (causal.weights - weights)[gap].abs().mean()
 
 

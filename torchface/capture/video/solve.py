@@ -49,7 +49,8 @@ class VideoSolution:
         rotation: rig to camera, refined with the weights, (T,3,3).
         translation: rig to camera, (T,3), millimetres.
         errors: root mean square distance of the seen landmarks to the rig's, (T,), pixels; NaN where none is seen.
-        solved: frames with at least six landmarks, (T,) bool; the others are bridged by what priors tell.
+        solved: frames with at least six landmarks, (T,) bool; the others keep the weights of the frame before,
+            or in a whole take lie between those before and after.
     """
 
     weights: Tensor
@@ -300,7 +301,8 @@ class VideoSolver(nn.Module):
     ) -> VideoState:
         """The next frame's state; its ``weights``, ``rotation`` and ``translation`` are the frame's.
 
-        A frame with fewer than six landmarks goes on as the priors tell, or as the frame before.
+        A frame with fewer than six landmarks keeps the weights of the frame before: rest is likeliest of all faces, but
+        not of one that smiled a moment ago.
 
         Args:
             state: of the frame before; ``start()`` for the first.
@@ -327,6 +329,9 @@ class VideoSolver(nn.Module):
         expected = self._expected(state, rotation, translation)
         precision = self._precision(seen if enough else torch.zeros_like(seen), confidence)
         terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
+        if state.head is not None and not enough:
+            held = HeadState(state.head.weights, rotation, translation)
+            return self._handed_on(state, terms, expected, Solved(held, self._chosen(held)), enough)
         # After a gap the tracked pose is nearer than where the head was left.
         near = (
             expected.mean
@@ -335,6 +340,11 @@ class VideoSolver(nn.Module):
         )
         begin = expected.mean.weights if state.head is None else state.head.weights
         solved = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
+        return self._handed_on(state, terms, expected, solved, enough)
+
+    def _handed_on(
+        self, state: VideoState, terms: FrameTerms, expected: Expectation, solved: Solved, enough: bool
+    ) -> VideoState:
         head = solved.head
         if self.dynamics is None:
             return VideoState(head, None, state.window, enough)
@@ -362,7 +372,8 @@ class VideoSolver(nn.Module):
 
     def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
-        with torch.no_grad():
+        # Steps are many and small; what tensors keep for derivatives is a fifth of their price.
+        with torch.inference_mode():
             head, rows = start, self._chosen(start)
             for turn in range(_ROUNDS if self.tolerance >= _EXACT else _EXACT_ROUNDS):
                 # Which points the contour's landmarks are is settled first; later it could go back and forth.
@@ -371,6 +382,8 @@ class VideoSolver(nn.Module):
                 before, head = head, self._advanced(terms, head, rows)
                 if float((head.weights - before.weights).abs().max()) < self.tolerance:
                     break
+        # Copies, as autograd refuses tensors that were made without it.
+        head, rows = HeadState(head.weights.clone(), head.rotation.clone(), head.translation.clone()), rows.clone()
         if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
             head = self._attached(terms, head, rows)
         return Solved(head, rows)

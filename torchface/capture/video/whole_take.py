@@ -52,7 +52,19 @@ def solve_whole_take(
         head = _solved(solver, states[first:], smoothed)
     rows = (torch.arange(len(landmarks)) - first).clamp(min=0)  # frames before the first face have its state
     weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
+    weights = interpolated(weights, enough)
     return VideoSolution(weights, turned, moved, solver.reprojection_errors(landmarks, weights, turned, moved), enough)
+
+
+def interpolated(weights: Tensor, solved: Tensor) -> Tensor:
+    """Weights (T,N) with straight lines where ``solved`` (T,) is false; at both ends they stay."""
+    known = solved.nonzero()[:, 0]
+    at = torch.arange(len(weights), device=weights.device)
+    after = torch.searchsorted(known, at).clamp(max=len(known) - 1)
+    before = (torch.searchsorted(known, at, right=True) - 1).clamp(min=0)
+    left, right = known[before], known[after]
+    share = ((at - left) / (right - left).clamp(min=1)).clamp(0, 1).to(weights)[:, None]
+    return torch.lerp(weights[left], weights[right], share)
 
 
 @dataclass(frozen=True, eq=False)
