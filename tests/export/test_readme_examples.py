@@ -15,10 +15,14 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
+from torchface.capture.video import VideoSolver
+from torchface.geometry.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
 from torchface.landmarks.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
-from torchface.onnx import export_model
+from torchface.onnx import export_model, export_video_solver
+from torchface.onnx.video_export import filmed
+from torchface.synthetic import performer
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
 WEB = EXPORT / "web"
@@ -65,7 +69,12 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
         export_model(model, path / f"{name}.onnx")
     markers = solver.rest + solver.basis[..., 0] * torch.linspace(0, 1, 5)[:, None, None]
     markers[2, 3] = torch.nan
-    for name, values in {"neutral": people[0], "image": images[0], "markers": markers}.items():
+    person = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "browInnerUp"])
+    camera = assumed_calibration(640, 480)
+    export_video_solver(person, camera, path / "video_solver.onnx")
+    marks = filmed(VideoSolver(person, None, camera.intrinsics), 5)[1]
+    inputs = {"neutral": people[0], "image": images[0], "markers": markers, "landmarks": marks}
+    for name, values in inputs.items():
         array = values.numpy().astype(np.float32)
         np.save(path / f"{name}.npy", array)
         (path / f"{name}.f32").write_bytes(array.tobytes())
@@ -101,6 +110,7 @@ RESULTS = {
     "Landmarks of an unwrapped head": "pixels",
     "Landmarks of faces in a picture": "landmarks",
     "Weights from markers": "previous",
+    "Weights from landmarks in a video": "weights",
 }
 
 

@@ -103,8 +103,59 @@ def action_units(model: str, out: Path, quiet: bool = False) -> None:
     print(out)
 
 
+def video_solver(
+    rig: Path,
+    camera: Path,
+    out: Path,
+    prior: str | None = None,
+    dynamics: str | None = None,
+    part: str | None = None,
+    quiet: bool = False,
+) -> None:
+    """Write the video solve of one rig and one camera as an ONNX file, and check it.
+
+    Inputs of the graph: `landmarks` (68,2), pixels, NaN where not seen, `confidence` (68,), and what the frame before
+    gave, `previous_` and its name; all NaN for the first frame. Outputs: `weights` (N,), `rotation` (3,3),
+    `translation` (3,), millimetres, and with a dynamics prior `window`, `mean` and `covariance`. Pixels are of pictures
+    without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a film.
+
+    Args:
+        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
+        camera: The camera's calibration, as `torchface calibrate` writes it.
+        out: The .onnx file to write.
+        prior: Which weights faces have: a model's name in the zoo, or a folder.
+        dynamics: How weights go on: a model's name in the zoo, or a folder.
+        part: Keep this region of the rig only, such as face.
+        quiet: Show no progress.
+    """
+    from torchface import zoo
+    from torchface.capture import DynamicsPrior, ShapePrior
+    from torchface.errors import FileFormatError
+    from torchface.io import load_rig
+    from torchface.io.cameras import load_calibration
+    from torchface.onnx import export_video_solver
+
+    with steps(quiet) as step:
+        step("reading rig, camera and priors")
+        loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
+        shapes = None if prior is None else zoo.get_model(prior)
+        if not isinstance(shapes, ShapePrior | None):
+            raise FileFormatError(f"{prior}: found a {type(shapes).__name__}, expected a prior of shapes")
+        motion = None if dynamics is None else zoo.get_model(dynamics)
+        if not isinstance(motion, DynamicsPrior | None):
+            raise FileFormatError(f"{dynamics}: found a {type(motion).__name__}, expected a prior of dynamics")
+        step("exporting and checking")
+        report = export_video_solver(loaded, calibration, out, shapes, motion)
+    table = Table(show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    console.print(table)
+    print(out)
+
+
 EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
+    "video-solver": video_solver,
 }

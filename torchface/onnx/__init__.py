@@ -7,6 +7,8 @@ from torchface.onnx.hybrid import HybridGraph
 from torchface.onnx.model_export import export_model
 from torchface.onnx.solver import SolverGraph
 from torchface.onnx.solver_export import SolverReport, export_hybrid_solver, export_solver
+from torchface.onnx.video_export import VideoReport, export_video_solver
+from torchface.onnx.video_solver import VideoGraph
 
 __all__ = [
     "ActionUnitReport",
@@ -14,9 +16,12 @@ __all__ = [
     "HybridGraph",
     "SolverGraph",
     "SolverReport",
+    "VideoGraph",
+    "VideoReport",
     "export_action_units",
     "export_dynamics_prior",
     "export_hybrid_solver",
     "export_model",
     "export_solver",
+    "export_video_solver",
 ]
