@@ -156,6 +156,12 @@ class VideoGraph(nn.Module):
             gradient = gradient + torch.nn.functional.pad(slope, (0, 6))
             by, dual = self._step(head.weights[0], gradient, factors, dual)
             head = self._moved(head, by)
+        # A face that is not seen stays as it was.
+        head = HeadState(
+            torch.where(enough, head.weights, weights),
+            torch.where(enough, head.rotation, rotation),
+            torch.where(enough, head.translation, translation),
+        )
         begun = ~first | enough
         out = [
             torch.where(begun, head.weights[0], 0.0),

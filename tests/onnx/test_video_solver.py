@@ -1,0 +1,174 @@
+"""The video solve's graph recovers what was planted, frame after frame, and ONNX Runtime computes the graph."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import __version__
+from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
+from torchface.capture.video import VideoSolver
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.calibration import CameraCalibration
+from torchface.onnx import VideoGraph, VideoReport, export_video_solver, video_export
+from torchface.onnx.sweep import swept_inverse
+from torchface.onnx.video_export import filmed
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
+CAMERA = CameraCalibration(K, torch.zeros(5, dtype=torch.float64), 640, 480, None)
+SEEN = ("jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft", "mouthLeft")
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    """The performer with a few shapes that landmarks show well."""
+    return performer(texture=False).select(SEEN)
+
+
+@pytest.fixture(scope="module")
+def takes(rig: BlendshapeRig) -> list[Tensor]:
+    return [filmed(VideoSolver(rig, None, K), 200, seed)[0] for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def dynamics(takes: list[Tensor]) -> DynamicsPrior:
+    return DynamicsPrior.fit(takes, SEEN, 3, settings=DynamicsSettings(inducing=20, subset=100, rounds=2))
+
+
+@pytest.fixture(scope="module")
+def written(
+    rig: BlendshapeRig, takes: list[Tensor], dynamics: DynamicsPrior, tmp_path_factory: pytest.TempPathFactory
+) -> VideoReport:
+    path = tmp_path_factory.mktemp("graph") / "video_solver.onnx"
+    return export_video_solver(rig, CAMERA, path, ShapePrior.fit(takes, SEEN), dynamics, facts={"licence": "MIT"})
+
+
+def played(graph: VideoGraph, landmarks: Tensor) -> list[dict[str, Tensor]]:
+    """Every frame's outputs, each from the state that the one before handed on."""
+    state, found = graph.start(), []
+    for marks in landmarks:
+        with torch.no_grad():
+            outputs = dict(zip(graph.outputs, graph(marks, torch.ones(68), *state), strict=True))
+        state = tuple(outputs[name] for name in graph.state)
+        found.append(outputs)
+    return found
+
+
+def test_sweeps_invert() -> None:
+    rows = torch.randn(9, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows = rows * torch.logspace(-2, 2, 6, dtype=torch.float64)
+    matrix = rows.T @ rows
+    torch.testing.assert_close(swept_inverse(matrix), torch.linalg.inv(matrix), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_planted_weights_are_recovered_frame_after_frame(
+    rig: BlendshapeRig, dynamics: DynamicsPrior, remembers: bool
+) -> None:
+    """From no more than landmarks: the first frame's pose is found too, and missing landmarks are skipped."""
+    settings = {"sparsity": 0.0, "ridge": 1e-9, "pixel_noise": 0.01}
+    solver = VideoSolver(rig, None, K, dynamics=dynamics if remembers else None, **settings)
+    weights, landmarks = filmed(solver, 30)
+    assert bool(torch.isnan(landmarks).any())
+    found = torch.stack([frame["weights"] for frame in played(VideoGraph(solver), landmarks)])
+    assert float((found - weights).square().mean().sqrt()) < 2e-3
+    assert float((found - weights).abs().max()) < 0.02
+
+
+def test_it_is_the_exact_solve_and_its_memory(rig: BlendshapeRig, takes: list[Tensor], dynamics: DynamicsPrior) -> None:
+    """With steps enough, weights, pose and covariance are those of ``VideoSolver`` after many frames."""
+    solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), dynamics, tolerance=1e-8)
+    _, landmarks = filmed(solver, 12)
+    landmarks[5] = torch.nan
+    states, _ = solver.states(landmarks)
+    for frame, state in zip(played(VideoGraph(solver, 30), landmarks), states, strict=True):
+        torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
+        torch.testing.assert_close(frame["rotation"].double(), state.rotation, atol=1e-4, rtol=0)
+        torch.testing.assert_close(frame["translation"].double(), state.translation, atol=2e-2, rtol=0)
+        assert state.belief is not None
+        spread = state.belief.covariance[0]
+        size = spread.diagonal().sqrt()
+        torch.testing.assert_close(
+            frame["covariance"] / size / size[:, None], spread / size / size[:, None], atol=1e-3, rtol=0
+        )
+
+
+def test_the_file_is_the_graph(written: VideoReport) -> None:
+    assert written.frames >= 100
+    assert written.parity <= 1e-4
+    assert written.gap < 0.01
+    assert abs(written.error - written.exact_error) < 2e-3
+    assert written.size == written.path.stat().st_size
+    assert list(written.path.parent.iterdir()) == [written.path]
+    assert "against the exact solve over 100 frames" in str(written)
+
+
+def test_the_metadata_says_what_goes_in_and_out(written: VideoReport, rig: BlendshapeRig) -> None:
+    session = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
+    count = len(SEEN)
+    assert {i.name: i.shape for i in session.get_inputs()} == {
+        "landmarks": [68, 2],
+        "confidence": [68],
+        "previous_rotation": [3, 3],
+        "previous_translation": [3],
+        "previous_window": [3, count],
+        "previous_mean": [count + 6],
+        "previous_covariance": [count + 6, count + 6],
+    }
+    assert [o.name for o in session.get_outputs()] == [
+        *("weights", "rotation", "translation", "window", "mean", "covariance")
+    ]
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert metadata["task"] == "video_solver"
+    assert tuple(json.loads(metadata["shape_names"])) == rig.names
+    assert json.loads(metadata["intrinsics"]) == K.tolist()
+    assert json.loads(metadata["width"]) == 640
+    assert metadata["version"] == __version__
+    assert metadata["licence"] == "MIT"
+    assert {opset.domain for opset in onnx.load(written.path).opset_import} == {""}
+
+
+def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig) -> None:
+    """Frames before the first face hand on no state; the file then begins as if they had not been."""
+    session = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
+    names = [o.name for o in session.get_outputs()]
+    none = {i.name: np.full(i.shape, np.nan, np.float32) for i in session.get_inputs() if i.name[:9] == "previous_"}
+    trust = np.ones(68, np.float32)
+    _, landmarks = filmed(VideoSolver(rig, None, K), 2, seed=3)
+    empty = np.full((68, 2), np.nan, np.float32)
+    empty[:5] = landmarks[0, :5].nan_to_num(100.0)
+    first = dict(zip(names, session.run(names, {"landmarks": empty, "confidence": trust, **none}), strict=True))
+    assert np.isnan(first["rotation"]).all()
+    assert (first["weights"] == 0).all()
+    handed = {name: first[name[9:]] for name in none}
+    marks = {"landmarks": landmarks[1].numpy(), "confidence": trust}
+    for one, other in zip(session.run(names, {**marks, **none}), session.run(names, {**marks, **handed}), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_graph_that_differs_is_not_written(
+    rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video_export, "_PARITY", -1.0)
+    with pytest.raises(ValueRangeError, match="differ from PyTorch's"):
+        export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", steps=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
+    bells = ShapePrior(SEEN, [range(len(SEEN))], [GaussianMixture.fit(torch.rand(30, len(SEEN)), 1)])
+    with pytest.raises(ValueRangeError, match="expected one of Student's distributions"):
+        VideoGraph(VideoSolver(rig, None, K, bells))
+    with pytest.raises(ValueRangeError, match="pose_trust"):
+        VideoGraph(VideoSolver(rig, None, K, pose_trust=1.0))
+    with pytest.raises(ShapeError, match=r"expected \(68,2\)"):
+        VideoGraph(VideoSolver(rig, None, K))(torch.zeros(67, 2), torch.ones(68))
