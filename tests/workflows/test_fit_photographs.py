@@ -13,6 +13,7 @@ from torchface.cli import main
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.alignment import similarity_transform
 from torchface.geometry.camera import look_at
+from torchface.io.cameras import load_calibration
 from torchface.io.images import load_image, save_image
 from torchface.io.landmarks import load_landmark_points
 from torchface.landmarks import NoFaceError, TrackedFace
@@ -87,6 +88,9 @@ def test_the_command_makes_the_actors_rig(
     assert float(blue.float().mean()) < 0.01  # none of the background
     for i in range(3):
         assert load_image(tmp_path / f"rig_{i + 1}_p{i}.png").shape == (3, 480, 1440)
+        camera = load_calibration(tmp_path / f"rig_{i + 1}_p{i}.toml")
+        assert (camera.width, camera.height) == load_image(studio / f"p{i}.png").shape[:0:-1]
+        assert not camera.assumed
 
 
 def test_landmarks_that_no_file_gives_are_found(

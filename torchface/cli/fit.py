@@ -29,7 +29,8 @@ def fit(
     Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked at and corrected.
     All photographs show one person with one expression; profiles beside a front view tell how far things stand out.
     The photographs become the rig's texture. Beside OUT lies a picture for each photograph: it, the fit over it, and
-    the landmarks, found green and fitted red.
+    the landmarks, found green and fitted red; and its camera as .toml, for `torchface track --camera` where the video
+    is from the same.
 
     Args:
         photographs: Image files.
@@ -55,5 +56,7 @@ def fit(
         )
     for line in made.lines(photographs):
         console.print(line, highlight=False, markup=False)
-    for path in (*(picture.with_suffix(".pts") for picture in made.pictures[: len(made.found)]), *made.pictures, out):
+    marks = (picture.with_suffix(".pts") for picture in made.pictures[: len(made.found)])
+    cameras = (picture.with_suffix(".toml") for picture in made.pictures)
+    for path in (*marks, *cameras, *made.pictures, out):
         print(path)

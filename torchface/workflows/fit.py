@@ -11,8 +11,9 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
+from torchface.geometry.calibration import CameraCalibration
 from torchface.geometry.camera import Camera
-from torchface.io import load_rig, save_rig
+from torchface.io import load_rig, save_calibration, save_rig
 from torchface.io.images import load_image
 from torchface.io.landmarks import load_landmark_points, save_pts
 from torchface.io.landmarks_dlib import load_dlib_faces
@@ -142,6 +143,9 @@ def fit_photographs(
     pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn
         save_picture(overlay(fit, i, image, marks[i]), path)
+    for picture, camera, (width, height), error in zip(pictures, fit.cameras, sizes, fit.errors.tolist(), strict=True):
+        calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
+        save_calibration(calibration, picture.with_suffix(".toml"))
     for picture, one in zip(pictures, found, strict=False):  # to be corrected and given as --landmarks
         save_pts(one.face.landmarks, picture.with_suffix(".pts"))
     return FittedHead(transferred.rig, fit, pictures, transferred.report.summary(), tuple(found))

@@ -19,7 +19,6 @@ from torchface.workflows.track_state import digest
 DEFAULT_LANDMARKS = "face_landmarks"
 """The model of the zoo that finds landmarks where none is named."""
 
-_SAME_RATE = 0.02
 _Model = TypeVar("_Model", bound=nn.Module)
 
 
@@ -79,14 +78,15 @@ def load_track_models(
     return found
 
 
-def rate_notes(models: TrackModels, fps: float) -> tuple[str, ...]:
-    """What there is to say where a dynamics prior has learned at another frame rate than a video's."""
-    if models.dynamics is None or abs(models.dynamics.fps / fps - 1) < _SAME_RATE:
-        return ()
-    return (
-        f"the dynamics prior has learned at {models.dynamics.fps:g} frames a second and the video has {fps:g}: it "
-        "expects motion of another speed (python -m train.priors --fps learns one for this rate)",
-    )
+def check_rate(fps: float, models: TrackModels, path: Path) -> None:
+    """Refuses a dynamics prior of another frame rate than a video's: it spoils what is solved.
+
+    Raises:
+        ValueRangeError: the rates differ.
+    """
+    note = None if models.dynamics is None else models.dynamics.rate_note(fps)
+    if note is not None:
+        raise ValueRangeError(f"{path}: {note}")
 
 
 def _read(option: str, name: str | Path, kind: type[_Model]) -> _Model:

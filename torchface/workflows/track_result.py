@@ -40,7 +40,6 @@ class Tracked:
         seconds: what each step took, by its name.
         products: the files, by what they are.
         light: of the video, where a texture was put on the face.
-        notes: what there is to say of the models, for people to read.
     """
 
     video: VideoFile
@@ -55,7 +54,6 @@ class Tracked:
     seconds: dict[str, float]
     products: dict[str, Path]
     light: PointLight | None = None
-    notes: tuple[str, ...] = ()
 
     @property
     def seen(self) -> Tensor:
@@ -117,7 +115,6 @@ class Tracked:
                 f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
                 "the eyes): is it this person's own?"
             )
-        lines.extend(self.notes)
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
         lines.extend(
