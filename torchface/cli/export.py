@@ -157,5 +157,5 @@ EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
-    "video-solver": video_solver,
+    "video_solver": video_solver,
 }

@@ -25,8 +25,11 @@ def swept_inverse(matrix: Tensor) -> Tensor:
     # With a diagonal of ones no sweep subtracts numbers that are large beside its own.
     scale = 1 / (matrix * identity).sum(0).sqrt()
     scales = scale[:, None] * scale
-    swept = matrix * scales - 2 * identity
+    # Minus the inverse plus the identity, which makes a row what a sweep takes of it.
+    swept = matrix * scales - identity
+    one = torch.from_numpy(np.ones((1, 1))).to(matrix)
     for k in range(size):  # each sweep needs the one before
-        row = swept[k : k + 1] + identity[k : k + 1]
-        swept = torch.addmm(swept, row.T, row / (row[:, k : k + 1] + 1), alpha=-1.0)
-    return -swept * scales
+        row = swept[k : k + 1]
+        pivot = torch.addmm(one, row, identity[:, k : k + 1])
+        swept = torch.addmm(swept, row.T, row / pivot, alpha=-1.0)
+    return (identity - swept) * scales
