@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -108,15 +108,21 @@ class PoseTracker:
     def step(self, landmarks: Tensor, confidence: Tensor | None = None) -> HeadPose:
         """The pose after a frame's landmarks (68,2), NaN for not seen; ``confidence`` (68,) from 0 weighs them.
 
+        No gradients go through it.
+
         Raises:
             ShapeError: not 68 landmarks.
         """
-        self._filter.predict()
-        before = self._filter.likeliest()
-        start = Pose(before[0][None], before[1][None], torch.zeros(1))
-        weights = None if confidence is None else confidence[None]
-        measured = _measured(self.points, landmarks[None], self.intrinsics, self.settings, weights, start)
-        return _filtered_step(self._filter, measured, 0)
+        # Operations are many and small; what tensors keep for derivatives is a fifth of their price.
+        with torch.inference_mode():
+            self._filter.predict()
+            before = self._filter.likeliest()
+            start = Pose(before[0][None], before[1][None], torch.zeros(1))
+            weights = None if confidence is None else confidence[None]
+            measured = _measured(self.points, landmarks[None], self.intrinsics, self.settings, weights, start)
+            pose = _filtered_step(self._filter, measured, 0)
+        # Copies, as autograd refuses tensors that were made without it.
+        return replace(pose, rotation=pose.rotation.clone(), translation=pose.translation.clone())
 
 
 def measure_poses(
