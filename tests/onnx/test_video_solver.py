@@ -15,8 +15,11 @@ from torch import Tensor
 from torchface import __version__
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
 from torchface.capture.video import VideoSolver
+from torchface.cli import main
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.calibration import CameraCalibration
+from torchface.io import save_rig
+from torchface.io.cameras import save_calibration
 from torchface.onnx import VideoGraph, VideoReport, export_video_solver, video_export
 from torchface.onnx.sweep import swept_inverse
 from torchface.onnx.video_export import filmed
@@ -75,8 +78,8 @@ def test_planted_weights_are_recovered_frame_after_frame(
     rig: BlendshapeRig, dynamics: DynamicsPrior, remembers: bool
 ) -> None:
     """From no more than landmarks: the first frame's pose is found too, and missing landmarks are skipped."""
-    settings = {"sparsity": 0.0, "ridge": 1e-9, "pixel_noise": 0.01}
-    solver = VideoSolver(rig, None, K, dynamics=dynamics if remembers else None, **settings)
+    memory = dynamics if remembers else None
+    solver = VideoSolver(rig, None, K, dynamics=memory, sparsity=0.0, ridge=1e-9, pixel_noise=0.01)
     weights, landmarks = filmed(solver, 30)
     assert bool(torch.isnan(landmarks).any())
     found = torch.stack([frame["weights"] for frame in played(VideoGraph(solver), landmarks)])
@@ -172,3 +175,20 @@ def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
         VideoGraph(VideoSolver(rig, None, K, pose_trust=1.0))
     with pytest.raises(ShapeError, match=r"expected \(68,2\)"):
         VideoGraph(VideoSolver(rig, None, K))(torch.zeros(67, 2), torch.ones(68))
+
+
+def test_the_command_writes_a_solver_of_rig_and_camera(
+    rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rig(rig.select(SEEN[:2]), tmp_path / "rig.glb")
+    save_calibration(CAMERA, tmp_path / "camera.toml")
+    given = ["--rig", f"{tmp_path}/rig.glb", "--camera", f"{tmp_path}/camera.toml", "--out", f"{tmp_path}/out.onnx"]
+    with pytest.raises(SystemExit) as refused:
+        main(["export", "video_solver", *given, "--prior", "head", "--quiet"])
+    assert refused.value.code == 2
+    assert "expected a prior of shapes" in capsys.readouterr().err
+    assert not (tmp_path / "out.onnx").exists()
+    main(["export", "video_solver", *given, "--quiet"])
+    assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path}/out.onnx"
+    session = onnxruntime.InferenceSession(tmp_path / "out.onnx", providers=["CPUExecutionProvider"])
+    assert [o.name for o in session.get_outputs()] == ["weights", "rotation", "translation"]
