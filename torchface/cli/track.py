@@ -66,9 +66,7 @@ def track(
     if (video is None) == (live is None):
         found = "neither" if video is None else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
-    settings = TrackSettings(
-        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay
-    )
+    settings = TrackSettings(landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay)
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)
         return
