@@ -162,6 +162,7 @@ def test_a_graph_that_differs_is_not_written(
     rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(video_export, "_PARITY", -1.0)
+    monkeypatch.setattr(video_export, "FRAMES", 3)
     with pytest.raises(ValueRangeError, match="differ from PyTorch's"):
         export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", steps=1)
     assert not list(tmp_path.iterdir())
@@ -178,8 +179,9 @@ def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
 
 
 def test_the_command_writes_a_solver_of_rig_and_camera(
-    rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(video_export, "FRAMES", 3)
     save_rig(rig.select(SEEN[:2]), tmp_path / "rig.glb")
     save_calibration(CAMERA, tmp_path / "camera.toml")
     given = ["--rig", f"{tmp_path}/rig.glb", "--camera", f"{tmp_path}/camera.toml", "--out", f"{tmp_path}/out.onnx"]
