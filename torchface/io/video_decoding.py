@@ -43,7 +43,7 @@ def opened(path: Path) -> cv2.VideoCapture:
     cv2 = opencv()
     capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     if not capture.isOpened():
-        raise FileFormatError(f"{path}: cannot be opened as a video; expected a codec that FFmpeg knows")
+        raise FileFormatError(f"{path}: cannot be opened as a video: cut off, or of a codec that FFmpeg does not know")
     return capture
 
 
