@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 
-from torchface.errors import MissingExtraError, ValueRangeError
+from torchface.errors import ValueRangeError
+from torchface.extras import import_extra
 from torchface.registration.corpus_job import CorpusJob
 from torchface.registration.corpus_record import CorpusEntry, CorpusTask
 
@@ -22,12 +22,7 @@ def import_ray() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"a cluster needs ray, which is not installed ({error}); expected: pip install torchface[cluster]"
-        ) from error
+    return import_extra("ray", "ray", "cluster", "a cluster")
 
 
 def on_cluster(job: CorpusJob, tasks: Sequence[CorpusTask], address: str) -> Iterator[CorpusEntry]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 from types import ModuleType
 
-from torchface.errors import MissingExtraError
+from torchface.extras import import_extra
 
 
 def scikit(module: str) -> ModuleType:
@@ -14,9 +13,4 @@ def scikit(module: str) -> ModuleType:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return importlib.import_module(f"sklearn.{module}")
-    except ImportError as error:
-        raise MissingExtraError(
-            "training a classifier needs scikit-learn: pip install 'torchface[train]' (a trained one runs without)"
-        ) from error
+    return import_extra(f"sklearn.{module}", "scikit-learn", "train", "training a classifier")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -22,7 +21,8 @@ from torchface.capture.priors.gaussian_process import (
 )
 from torchface.capture.priors.motion import motion_basis, moving_parts, windows_of
 from torchface.capture.priors.motion_noise import MotionNoise
-from torchface.errors import MissingExtraError, ShapeError, ValueRangeError
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.extras import import_extra
 
 if TYPE_CHECKING:
     from torchface.capture.priors.dynamics import DynamicsPrior, DynamicsSettings
@@ -40,13 +40,7 @@ def import_gpytorch() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return importlib.import_module("gpytorch")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"learning dynamics needs gpytorch, which is not installed ({error}); expected: "
-            "pip install torchface[train]"
-        ) from error
+    return import_extra("gpytorch", "gpytorch", "train", "learning dynamics")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchface.errors import MissingExtraError
+from torchface.extras import import_extra
 from torchface.mesh import Mesh
 from torchface.viz.browser.visitors import only_this_page
 
@@ -33,12 +33,7 @@ def import_viser() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return importlib.import_module("viser")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"the viewer needs viser, which is not installed ({error}); expected: pip install torchface[viewer]"
-        ) from error
+    return import_extra("viser", "viser", "viewer", "the viewer")
 
 
 def start_server(label: str, port: int = 8080) -> viser.ViserServer:
