@@ -285,7 +285,7 @@ def _for_choice(learn: PriorTakes) -> tuple[PriorTakes, PriorTakes]:
 
 def _fitted(kind: Kind, takes: PriorTakes, widths: Sequence[float], seed: int) -> ShapePrior:
     if kind != "reciprocal":
-        return ShapePrior.fit(takes.weights, takes.names, seed=seed)
+        return ShapePrior.fit(takes.weights, takes.names)
     together = torch.cat(takes.weights)
     groups = face_halves(takes.names)
     densities = [

@@ -99,7 +99,6 @@ class ShapePrior(nn.Module):
         takes: Sequence[Tensor],
         names: Sequence[str],
         groups: Sequence[Sequence[int]] | None = None,
-        seed: int = 0,
     ) -> ShapePrior:
         """Learns a bell with heavy tails about the face at rest, a :class:`StudentDensity` a group.
 
@@ -111,7 +110,6 @@ class ShapePrior(nn.Module):
             takes: weights of each take, (T,N); frames with a NaN are left out.
             names: of the N shapes.
             groups: all shapes together if absent: brows and mouth do tell of each other in real takes.
-            seed: of nothing here; forms that draw numbers take it.
 
         Raises:
             ShapeError: no takes, or of another number of shapes.
