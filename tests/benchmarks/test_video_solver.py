@@ -426,7 +426,7 @@ def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
         ("its covariance, one frame on", Belief, "expectation"),
         ("its covariance, after the frame", Expectation, "updated"),
         ("what it expects", Expectation, "quadratic"),
-        ("quadratic programs in the box", frame_solve, "solve_from_held_set"),
+        ("quadratic programs in the box", frame_solve, "solve_from_active_set"),
         ("sums, steps, checks", solver, "step"),
     ):
         timed(part, owner, name)

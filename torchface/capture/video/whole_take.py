@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchface.capture.video.belief import Belief, Expectation
 from torchface.capture.video.face_points import LANDMARKS
+from torchface.capture.video.frame_states import FrameTerms, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState
-from torchface.capture.video.solve import FrameTerms, VideoSolution, VideoSolver, VideoState
+from torchface.capture.video.solve import VideoSolver
 from torchface.errors import ValueRangeError
 
 # Added to variances before they are inverted: what rounding leaves of a direction that is known exactly.

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchface.optim import held_set
-from torchface.optim.held_set import solve_from_held_set
+from torchface.optim import warm_active_set
+from torchface.optim.warm_active_set import solve_from_active_set
 
 
 def program(seed: int, size: int, rank: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -35,22 +35,22 @@ def off_optimum(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, x: Tensor) -
 @given(st.integers(0, 2**31), st.integers(1, 30))
 def test_the_optimum_from_any_start(seed: int, size: int) -> None:
     H, f, lower, upper, start = program(seed, size, 2 * size)
-    x = solve_from_held_set(H, f, lower, upper, start, 1e-9)
+    x = solve_from_active_set(H, f, lower, upper, start, 1e-9)
     assert bool((x >= lower).all() & (x <= upper).all())
     assert float(off_optimum(H, f, lower, upper, x)) < 1e-7
 
 
 def test_a_start_at_the_optimum_stays() -> None:
     H, f, lower, upper, start = program(3, 20, 40)
-    found = solve_from_held_set(H, f, lower, upper, start, 1e-9)
-    torch.testing.assert_close(solve_from_held_set(H, f, lower, upper, found, 1e-9), found, rtol=0, atol=1e-10)
+    found = solve_from_active_set(H, f, lower, upper, start, 1e-9)
+    torch.testing.assert_close(solve_from_active_set(H, f, lower, upper, found, 1e-9), found, rtol=0, atol=1e-10)
 
 
 def test_singular_programs_and_sets_that_do_not_settle_are_solved_too(monkeypatch: pytest.MonkeyPatch) -> None:
     H, f, lower, upper, start = program(5, 12, 6)
-    x = solve_from_held_set(H, f, lower, upper, start, 1e-6)
+    x = solve_from_active_set(H, f, lower, upper, start, 1e-6)
     assert float(off_optimum(H, f, lower, upper, x)) < 1e-5
     H, f, lower, upper, start = program(7, 20, 40)
-    wanted = solve_from_held_set(H, f, lower, upper, start, 1e-9)
-    monkeypatch.setattr(held_set, "_CHANGES", 0)
-    torch.testing.assert_close(solve_from_held_set(H, f, lower, upper, start, 1e-9), wanted, rtol=0, atol=1e-6)
+    wanted = solve_from_active_set(H, f, lower, upper, start, 1e-9)
+    monkeypatch.setattr(warm_active_set, "_CHANGES", 0)
+    torch.testing.assert_close(solve_from_active_set(H, f, lower, upper, start, 1e-9), wanted, rtol=0, atol=1e-6)

@@ -1,4 +1,4 @@
-"""One box-constrained quadratic program from a start whose held variables are all but right: a factorisation or two."""
+"""A box-constrained quadratic program from a start whose active set is all but right: a factorisation or two."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torchface.optim.box_problem import BoxProblem, metric
 _CHANGES = 12
 
 
-def solve_from_held_set(
+def solve_from_active_set(
     H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, start: Tensor, tolerance: float, iterations: int = 50
 ) -> Tensor:
-    r"""The minimum of :math:`\tfrac12 x^\top H x + f^\top x` in a box, for a single problem, by sets of held variables.
+    r"""The minimum of :math:`\tfrac12 x^\top H x + f^\top x` in a box, one problem, by a primal-dual active set.
 
-    Variables of a set are held at their bounds and the others solved for exactly; where
+    Variables of the set are held at their bounds and the others solved for exactly; where
     :math:`x - (Hx + f)/\operatorname{diag} H` lies beyond a bound is the next set. A set that comes again is the
     solution's, and from a start near the solution the first or second does. That happens without any line search, so
     it may also fail to: then ``projected_newton`` takes over.
