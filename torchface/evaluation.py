@@ -42,6 +42,16 @@ def weight_error(solved: Tensor, true: Tensor) -> WeightError:
     return WeightError(difference.mean(0), difference.amax(0), correlation.to(solved.dtype))
 
 
+def weight_jitter(weights: Tensor) -> float:
+    """How much weights (T,N) tremble: the root mean square of their second differences, over that of white noise.
+
+    White noise of deviation 0.01 has a jitter of 0.01; NaN for fewer than three frames.
+    """
+    if len(weights) < 3:
+        return float("nan")
+    return float(((weights[2:] - 2 * weights[1:-1] + weights[:-2]).double().square().mean() / 6).sqrt())
+
+
 @dataclass(frozen=True, eq=False)
 class ShapeErrors:
     """Weights by one set of names against weights by another.

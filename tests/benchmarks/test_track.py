@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from torchface import Take, Track, save_rig
+from torchface.evaluation import weight_jitter
 from torchface.geometry.calibration import CameraCalibration
 from torchface.io.cameras import save_calibration
 from torchface.io.weights import save_weights_csv
@@ -16,7 +17,6 @@ from torchface.synthetic.performance import perform
 from torchface.synthetic.performer import performer
 from torchface.workflows.evaluate import EvaluationSettings, evaluate
 from torchface.workflows.track import TrackSettings, track_video
-from torchface.workflows.track_page import weight_jitter
 
 FRAMES, FPS = 150, 60.0
 WIDTH, HEIGHT = 320, 240

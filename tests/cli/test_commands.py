@@ -8,9 +8,10 @@ import torch
 from rich.console import Console
 
 from torchface.attachment import Attachment
-from torchface.capture import MarkerSolver
+from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.cli import COMMANDS, main, progress
 from torchface.cli.export import EXPORTS
+from torchface.evaluation import weight_jitter
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, load_take, save_mesh, save_rig, save_take
 from torchface.io.picks import LandmarkVertices, save_landmarks
@@ -48,10 +49,18 @@ def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: B
     assert written is not None
     found = dome_rig.weights_from(written).float()
     torch.testing.assert_close(found, torch.load(shoot / "true.pt", weights_only=True), atol=0.06, rtol=0)
-    rig = load_rig(shoot / "rig.glb")
-    solved = MarkerSolver(rig, place_markers(dome_rig, 30)).solve_take(load_take(shoot / "take.c3d")).weights
-    assert solved is not None
-    torch.testing.assert_close(found, solved.values[..., 0].float(), atol=1e-5, rtol=0)
+    solver, take = MarkerSolver(load_rig(shoot / "rig.glb"), place_markers(dome_rig, 30)), load_take(shoot / "take.c3d")
+    smooth = WholeTakeSolver(solver).solve_take(take).weights
+    assert smooth is not None
+    torch.testing.assert_close(found, smooth.values[..., 0].float(), atol=1e-5, rtol=0)
+    common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
+    run("solve", shoot / "rig.glb", shoot / "take.c3d", *common, "--frame-by-frame")
+    written, single = load_take(out).weights, solver.solve_take(take).weights
+    assert written is not None
+    assert single is not None
+    frames = dome_rig.weights_from(written).float()
+    torch.testing.assert_close(frames, single.values[..., 0].float(), atol=1e-5, rtol=0)
+    assert weight_jitter(found) < weight_jitter(frames)
 
 
 def test_solve_with_a_neutral_frame_undoes_the_space_of_the_take(shoot: Path, dome_rig: BlendshapeRig) -> None:
@@ -189,7 +198,7 @@ def test_solve_cleans_a_slipping_take_and_reports_it(
     save_take(Take(60.0, markers=Track(recording.take.markers.names, values)), shoot / "dirty.c3d")
     out, page = shoot / "weights.csv", shoot / "report"
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
-    run("solve", shoot / "rig.glb", shoot / "dirty.c3d", *common, "--slip", "--clean", "--whole", "--report", page)
+    run("solve", shoot / "rig.glb", shoot / "dirty.c3d", *common, "--slip", "--clean", "--report", page)
     told = capsys.readouterr().err
     assert "helmet: moved by up to" in told
     assert "swap M004 ↔ M021 100–129" in told

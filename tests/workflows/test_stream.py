@@ -58,7 +58,9 @@ def test_a_take_that_the_command_solves_goes_out_frame_by_frame(dome_rig: Blends
         receiver.settimeout(5)
         files = [str(tmp_path / name) for name in ("rig.glb", "take.c3d")]
         options = ["--attachment", str(tmp_path / "attachment.json"), "--out", str(tmp_path / "w.csv"), "--quiet"]
-        main(["solve", *files, *options, "--stream", f"udp://127.0.0.1:{receiver.getsockname()[1]}"])
+        main(
+            ["solve", *files, *options, "--frame-by-frame", "--stream", f"udp://127.0.0.1:{receiver.getsockname()[1]}"]
+        )
         frames = [decode_frame(receiver.recv(2048)) for _ in range(12)]
     written = load_take(tmp_path / "w.csv").weights
     assert written is not None

@@ -21,7 +21,7 @@ def solve(
     keep_rest: bool = False,
     slip: bool = False,
     clean: bool = False,
-    whole: bool = False,
+    frame_by_frame: bool = False,
     video: Path | None = None,
     action_units: str | None = None,
     labels: Path | None = None,
@@ -46,7 +46,8 @@ def solve(
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.
         slip: The helmet moves on the head: find its motion, and keep it out of the weights.
         clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
-        whole: Solve the whole take at once: smooth curves, gaps bridged; fast motion keeps its height.
+        frame_by_frame: Solve every frame on its own, with the markers' noise in the curves. Otherwise the whole take is
+            solved at once: smooth curves, gaps bridged, fast motion keeps its height.
         video: What a head camera saw of painted patterns during the take; leads the shapes that markers hardly see.
         action_units: The classifier for the video, by name or folder; see `python -m train.action_units`.
         labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if absent.
@@ -68,7 +69,7 @@ def solve(
     camera = None if video is None or action_units is None else HeadCamera(video, action_units, labels, table)
 
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
-    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, whole, **terms)
+    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms)
     with steps(quiet) as step:
         done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step)
     for line in done.lines():

@@ -47,7 +47,8 @@ class SolveSettings:
         subtract_rest: subtract what is left at rest between markers and sites, where the take is laid on the rig.
         slip: the helmet moves on the head.
         clean: find and repair swapped labels, spikes and markers that drift or fell off.
-        whole: weights of the whole take at once, smooth over time.
+        frame_by_frame: every frame on its own; otherwise the weights of the whole take at once, smooth over time. With
+            what a head camera saw every frame is on its own.
         sparsity, ridge: see ``MarkerSolver``.
     """
 
@@ -56,7 +57,7 @@ class SolveSettings:
     subtract_rest: bool = True
     slip: bool = False
     clean: bool = False
-    whole: bool = False
+    frame_by_frame: bool = False
     sparsity: float = SPARSITY
     ridge: float = RIDGE
 
@@ -166,8 +167,7 @@ def solve_markers(
         TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
     say = progress or (lambda line: None)
-    if predicted is not None and settings.whole:
-        raise ValueRangeError("solve: found a whole take to solve at once beside a video, expected one of the two")
+    whole = predicted is None and not settings.frame_by_frame
     alignment = None
     if settings.align or settings.neutral is not None:
         say("laying the take on the rig")
@@ -177,8 +177,8 @@ def solve_markers(
     if settings.clean:
         say("looking for what is wrong with the take")
         cleanup = clean_take(MarkerSolver(rig, attachment, alignment, **terms), take, settings.slip)
-        take = cleanup.take if settings.whole else cleanup.filled
-    if not settings.whole:
+        take = cleanup.take if whole else cleanup.filled
+    if not whole:
         require_seen(take)
     say("solving")
     motion = None
@@ -195,7 +195,7 @@ def solve_markers(
     if predicted is not None:
         solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
     else:
-        solved = WholeTakeSolver(solver).solve_take(steady) if settings.whole else solver.solve_take(steady)
+        solved = WholeTakeSolver(solver).solve_take(steady) if whole else solver.solve_take(steady)
     labels = tuple(label for label in attachment.labels or () if label in take.markers.names)
     assert steady.markers is not None
     markers = steady.markers.select(labels).values
@@ -294,7 +294,7 @@ def _sent(
     take solved whole or with a video) as they were solved."""
     take = solution.take
     assert take.weights is not None
-    if settings.whole or predicted:
+    if predicted or not settings.frame_by_frame:
         return stream_weights(take.weights.values[..., 0], take.weights.names, take.fps, address)
     solver = MarkerSolver(rig, solution.attachment, None, settings.sparsity, settings.ridge)
     return stream_markers(LiveMarkerSolver(solver), solution.markers.float(), take.fps, address)

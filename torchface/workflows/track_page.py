@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
 from torchface.viz.curves import error_curve, weight_curves
 from torchface.viz.motion import motion_curves
@@ -142,10 +143,3 @@ def _bounds(tracked: Tracked) -> Table:
         if share[i] > 0
     ]
     return Table(("at its bound of 1", "frames"), rows or [("none", "")])
-
-
-def weight_jitter(weights: Tensor) -> float:
-    """How much weights (T,N) tremble: the root mean square of their second differences, over that of white noise."""
-    if len(weights) < 3:
-        return float("nan")
-    return float(((weights[2:] - 2 * weights[1:-1] + weights[:-2]).double().square().mean() / 6).sqrt())
