@@ -151,6 +151,21 @@ def test_a_name_that_is_none_is_refused(home: Path, name: str) -> None:
         zoo.get_model(name)
 
 
+def test_a_folder_beside_the_user_goes_by_its_bare_name(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    zoo.save_model(morphable(), tmp_path / "model12", **FACTS)
+    assert zoo.find("model12").resolve() == tmp_path / "model12"
+    assert torch.equal(zoo.get_model("model12").mean, morphable().mean)
+    assert zoo.describe("model12").name == "model12"
+    (tmp_path / "mine").mkdir()  # the zoo's go first
+    assert zoo.find("mine") == home / "mine"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(NameMismatchError, match=r"'empty' \(the folder of that name holds no model.toml\)"):
+        zoo.find("empty")
+
+
 def test_links_that_lead_out_are_not_followed(home: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     shutil.copytree(home / "mine", outside)

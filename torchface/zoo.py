@@ -81,7 +81,8 @@ def get_model(name_or_path: str | Path) -> Any:
     """A model, ready for use.
 
     Args:
-        name_or_path: a name of :func:`list_models`; or a folder, as a ``Path`` or with a separator in it.
+        name_or_path: a name of :func:`list_models`; or a folder, as a ``Path`` or by its path. A name of the zoo goes
+            before a folder of that name in the working directory; a separator (``./head``) asks for the folder.
 
     Returns:
         A module of one of the classes in ``KINDS``, in evaluation mode, on the CPU.
@@ -151,9 +152,13 @@ def find(name_or_path: str | Path) -> Path:
         for root in _roots():
             if _is_model(root, given):
                 return root / given
+    local = Path(given or os.devnull)
+    if (local / DESCRIPTION).is_file():
+        return local
+    why = f" (the folder of that name holds no {DESCRIPTION})" if local.is_dir() else ""
     known = ", ".join(list_models()) or "none at all"
     raise NameMismatchError(
-        f"model: found no {given[:80]!r}, expected one of {known}; or a path, such as './{given[:40]}'"
+        f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder"
     )
 
 

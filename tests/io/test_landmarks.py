@@ -52,8 +52,59 @@ def test_other_sets_are_not_taken_for_ibugs(tmp_path: Path) -> None:
         LandmarkPoints(torch.zeros(2, 3)).ibug()
     labels = [{"label": "ear", "mask": [0]}]
     other = load_landmark_points(save(tmp_path / "ear.ljson", ljson([[0, 0, 0]], labels)))
-    with pytest.raises(NameMismatchError, match="found the groups ear, expected chin"):
+    with pytest.raises(NameMismatchError, match=r"ear\.ljson: found the groups ear, expected jaw, left_eyebrow"):
         other.ibug()
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_menpos_labels_of_today_come_in_ibugs_order(tmp_path: Path, version: int) -> None:
+    sizes = {"mouth": 20, "left_eye": 6, "jaw": 17, "right_eye": 6, "nose": 9, "right_eyebrow": 5, "left_eyebrow": 5}
+    firsts, labels = {}, [{"label": "inner", "mask": [0, 3]}]
+    for name, count in sizes.items():
+        firsts[name] = sum(map(len, (one["mask"] for one in labels[1:])))
+        labels.append({"label": name, "mask": list(range(firsts[name], firsts[name] + count))})
+    points = [[float(i), 2.0 * i, -1.0 * i] for i in range(68)]
+    document: dict = ljson(points, labels)
+    if version == 2:
+        document = {"version": 2, "labels": labels, "landmarks": {"points": points}}
+    if version == 1:
+        sets = [
+            {"label": one["label"], "landmarks": [{"point": points[row]} for row in one["mask"]]} for one in labels[1:]
+        ]
+        document = {"version": 1, "groups": sets}
+    order = load_landmark_points(save(tmp_path / "a.ljson", document)).ibug()[:, 0].long().tolist()
+    names = ("jaw", "left_eyebrow", "right_eyebrow", "nose", "left_eye", "right_eye", "mouth")
+    assert order == [row for name in names for row in range(firsts[name], firsts[name] + sizes[name])]
+
+
+def test_menpos_all_alone_leaves_the_files_order(tmp_path: Path) -> None:
+    document = ljson([[i, i, i] for i in range(68)], [{"label": "all", "mask": list(range(68))}])
+    assert load_landmark_points(save(tmp_path / "a.ljson", document)).ibug()[:, 0].tolist() == list(range(68))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"jaw": range(16)}, "found 16 points under 'jaw', expected iBUG's 17"),
+        ({"nose": range(31, 40)}, "found points that belong to two of the groups"),
+        ({"mouth": None}, r"expected jaw, .* \(none for mouth\)"),
+    ],
+)
+def test_groups_that_do_not_fit_are_refused(tmp_path: Path, change: dict, message: str) -> None:
+    masks: dict = {
+        "jaw": range(17),
+        "left_eyebrow": range(17, 22),
+        "right_eyebrow": range(22, 27),
+        "nose": range(27, 36),
+        "left_eye": range(36, 42),
+        "right_eye": range(42, 48),
+        "mouth": range(48, 68),
+    }
+    masks = {name: list(rows) for name, rows in (masks | change).items() if rows is not None}
+    labels = [{"label": name, "mask": rows} for name, rows in masks.items()]
+    found = load_landmark_points(save(tmp_path / "head.ljson", ljson([[i, i, i] for i in range(68)], labels)))
+    with pytest.raises((ShapeError, NameMismatchError), match=r"head\.ljson: .*" + message):
+        found.ibug()
 
 
 def test_missing_points_are_nan_and_flat_ones_turn_from_row_column_to_x_y(tmp_path: Path) -> None:

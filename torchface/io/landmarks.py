@@ -16,8 +16,17 @@ from torchface.io.picks import load_correspondences
 
 _LARGEST_FILE = 16 * 2**20
 _MOST_POINTS = 1_000_000
-_IBUG_ORDER = ("chin", "leyebrow", "reyebrow", "nose", "leye", "reye", "mouth")
-"""menpo's group names in the order of iBUG's 68; its left is the viewer's."""
+_IBUG_GROUPS = (
+    ("jaw", "chin", 17),
+    ("left_eyebrow", "leyebrow", 5),
+    ("right_eyebrow", "reyebrow", 5),
+    ("nose", "nose", 9),
+    ("left_eye", "leye", 6),
+    ("right_eye", "reye", 6),
+    ("mouth", "mouth", 20),
+)
+"""The groups of iBUG's 68 in their order, by menpo's label today and formerly, with their sizes; menpo's left is the
+viewer's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,29 +37,49 @@ class LandmarkPoints:
         points: (L,3) in the file's unit, or (L,2) pixels, x right, y down, pixel centres at integers from 0;
             NaN where the file has none.
         groups: rows by name, such as ``"nose"``, each (n,) int64; empty where the file tells none.
+        source: the file, for what is said of the points.
     """
 
     points: Tensor
     groups: dict[str, Tensor] = field(default_factory=dict)
+    source: str = "landmarks"
 
     def ibug(self) -> Tensor:
         """The points in iBUG's order of 68: jaw, brows, nose, eyes, mouth, each from the viewer's left.
 
+        A file that tells groups is read by them, whatever the order of its rows; groups beside those are left aside,
+        and menpo's ``all`` alone tells no order but the file's.
+
         Raises:
             NameMismatchError: the groups are not those of menpo's 68.
-            ShapeError: there are not 68.
+            ShapeError: there are not 68, or a group has another number of points than iBUG's.
         """
-        points = self.points
-        if self.groups:
-            missing = [name for name in _IBUG_ORDER if name not in self.groups]
-            if missing:
-                raise NameMismatchError(
-                    f"landmarks: found the groups {', '.join(self.groups)}, expected {', '.join(_IBUG_ORDER)}"
-                )
-            points = points[torch.cat([self.groups[name] for name in _IBUG_ORDER])]
-        if len(points) != 68:
-            raise ShapeError(f"landmarks: found {len(points)}, expected 68")
-        return points
+        rows = self._ibug_rows() if set(self.groups) - {"all"} else torch.arange(len(self.points))
+        if len(rows) != 68:
+            raise ShapeError(f"{self.source}: found {len(rows)}, expected 68 landmarks in iBUG's order")
+        return self.points[rows]
+
+    def _ibug_rows(self) -> Tensor:
+        found, missing, chosen = ", ".join(self.groups), [], []
+        for label, former, count in _IBUG_GROUPS:
+            name = label if label in self.groups else former
+            rows = self.groups.get(name)
+            if rows is None:
+                missing.append(label)
+                continue
+            if len(rows) != count:
+                raise ShapeError(f"{self.source}: found {len(rows)} points under {name!r}, expected iBUG's {count}")
+            chosen.append(rows)
+        if missing:
+            expected = ", ".join(label for label, _, _ in _IBUG_GROUPS)
+            raise NameMismatchError(
+                f"{self.source}: found the groups {found}, expected {expected}, menpo's labels of iBUG's 68 "
+                f"(none for {', '.join(missing)})"
+            )
+        order = torch.cat(chosen)
+        if len(order.unique()) != len(order):
+            raise ShapeError(f"{self.source}: found points that belong to two of the groups {found}, expected one each")
+        return order
 
 
 def load_landmark_points(path: str | Path) -> LandmarkPoints:
@@ -71,7 +100,7 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected .ljson, .pts or .json")
     document = _json(path)
     if ending == ".json" and isinstance(document, dict) and "format" in document:
-        return LandmarkPoints(load_correspondences(path).points)
+        return LandmarkPoints(load_correspondences(path).points, source=str(path))
     return _ljson(path, document)
 
 
@@ -127,7 +156,7 @@ def _ljson(path: Path, document: Any) -> LandmarkPoints:
         if not isinstance(name, str) or not fits:
             raise FileFormatError(f"{path}: found a label without a name or with rows outside 0 to {len(points) - 1}")
         groups[name] = torch.tensor(rows, dtype=torch.int64)
-    return LandmarkPoints(points, groups)
+    return LandmarkPoints(points, groups, str(path))
 
 
 def _first_version(path: Path, document: dict[str, Any]) -> LandmarkPoints:
@@ -140,7 +169,7 @@ def _first_version(path: Path, document: dict[str, Any]) -> LandmarkPoints:
             raise FileFormatError(f"{path}: found a group without label or landmarks, expected both")
         groups[entry["label"]] = torch.arange(len(rows), len(rows) + len(marks))
         rows += [mark.get("point") if isinstance(mark, dict) else None for mark in marks]
-    return LandmarkPoints(_points(path, rows), groups)
+    return LandmarkPoints(_points(path, rows), groups, str(path))
 
 
 def _points(path: Path, rows: Any) -> Tensor:
@@ -178,4 +207,4 @@ def _pts(path: Path) -> LandmarkPoints:
         raise FileFormatError(f"{path}: found text among the points, expected numbers ({error})") from error
     if torch.isinf(points).any():
         raise FileFormatError(f"{path}: found an infinite position, expected finite numbers")
-    return LandmarkPoints(points - 1 if points.shape[1] == 2 else points)
+    return LandmarkPoints(points - 1 if points.shape[1] == 2 else points, source=str(path))

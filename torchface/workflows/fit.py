@@ -203,10 +203,7 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
 
 
 def _pixels(file: Path) -> Tensor:
-    try:
-        points = load_landmark_points(file).ibug()
-    except ShapeError as error:
-        raise ShapeError(f"{file}: {error}") from error
+    points = load_landmark_points(file).ibug()
     if points.shape[1] != 2:
         raise FileFormatError(f"{file}: found points in space, three numbers each; expected pixels of a photograph")
     return points.double()
