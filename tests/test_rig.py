@@ -50,3 +50,8 @@ def test_bad_rigs_and_weights_are_named() -> None:
     broken[1, 0, 0] = torch.inf
     with pytest.raises(ValueRangeError, match="NaN or infinite in b"):
         BlendshapeRig(rig.neutral, broken, rig.names)
+
+
+def test_one_name_is_no_list_of_names() -> None:
+    with pytest.raises(NameMismatchError, match=r"found the text 'ab', expected a list of names: \['ab'\]"):
+        small_rig().index("ab")

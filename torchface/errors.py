@@ -31,3 +31,7 @@ class AlignmentError(TorchfaceError):
 
 class MissingExtraError(TorchfaceError):
     """An optional dependency is not installed."""
+
+
+class TraceError(TorchfaceError):
+    """A module whose path depends on its data was traced by ``torch.jit.trace``."""

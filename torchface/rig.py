@@ -68,7 +68,13 @@ class BlendshapeRig(nn.Module):
         return self.vertices + moved.view(len(weights), *self.vertices.shape)
 
     def index(self, names: Sequence[str]) -> list[int]:
-        """Rows of these shapes; raises ``NameMismatchError`` for one the rig lacks."""
+        """Rows of these shapes.
+
+        Raises:
+            NameMismatchError: the rig lacks one, or ``names`` is a text where a list belongs.
+        """
+        if isinstance(names, str):
+            raise NameMismatchError(f"rig: found the text {names!r}, expected a list of names: [{names!r}]")
         row = {name: i for i, name in enumerate(self.names)}
         missing = [name for name in names if name not in row]
         if missing:

@@ -197,3 +197,40 @@ def test_bad_input_says_what_is_wrong(changes: dict[str, object], error: type[Ex
     arguments, rest = broken(**changes)
     with pytest.raises(error, match=says):
         box_qp(*arguments, **rest)  # type: ignore[arg-type]
+
+
+def test_the_module_follows_its_hessian() -> None:
+    H = hessian(8, 0.5, 20.0)
+    f, _ = planted(H, 5)
+    qp = BoxQP(torch.nn.Parameter(H.clone()), lower=-1.0)
+    qp(f)
+    optimizer = torch.optim.SGD(qp.parameters(), lr=0.5)
+    with torch.enable_grad():
+        qp(f).square().sum().backward()
+    optimizer.step()
+    assert float((qp.H.detach() - H).abs().max()) > 1e-2
+    torch.testing.assert_close(qp(f), box_qp(qp.H.detach(), f, lower=-1.0), rtol=0, atol=1e-9)
+    other = BoxQP(hessian(8, 0.5, 20.0, seed=5), lower=-2.0, upper=0.5)
+    wanted = other(f)
+    qp.load_state_dict(other.state_dict())
+    assert set(other.state_dict()) == {"H", "lower", "upper"}
+    torch.testing.assert_close(qp(f), wanted, rtol=0, atol=1e-9)
+    qp.H.data.mul_(3.0)
+    torch.testing.assert_close(qp(f), box_qp(3.0 * other.H, f, -2.0, 0.5), rtol=0, atol=1e-9)
+
+
+def test_the_module_changes_its_precision() -> None:
+    H = hessian(8, 0.5, 20.0)
+    f, x = planted(H, 5)
+    qp = BoxQP(H.float())
+    assert (qp(f.float()).double() - x).abs().max() < 1e-4
+    exact = qp.double()(f)
+    assert exact.dtype == torch.float64
+    torch.testing.assert_close(exact, box_qp(H.float().double(), f), rtol=0, atol=1e-10)
+
+
+def test_a_hessian_that_becomes_indefinite_is_refused() -> None:
+    qp = BoxQP(torch.eye(3))
+    qp.H[0, 0] = -1.0
+    with pytest.raises(ValueRangeError, match="not positive semidefinite"):
+        qp(torch.zeros(1, 3))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from dataclasses import dataclass
 
-from torchface.errors import ShapeError, ValueRangeError
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.implicit import BoxSolution
+from torchface.optim.prepared import Prepared
 from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 
 # Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
@@ -67,24 +70,34 @@ def box_qp(
         >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).round(decimals=4).tolist()
         [[0.5, 1.0], [0.0, 0.5]]
     """
-    return BoxQP(H, lower, upper, tolerance)(f, start)
+    with torch.no_grad():
+        prepared = _PreparedHessian.of(H)
+        bounds = _checked_bounds(lower, upper, prepared.exact)
+    return _minimiser(H, prepared, f, *bounds, start, tolerance)
 
 
-class BoxQP:
-    """``box_qp`` with H checked and factored once, for many calls.
+class BoxQP(nn.Module):
+    """``box_qp`` as a module that checks and factors H once for many calls.
+
+    H is a buffer, or a parameter where an ``nn.Parameter`` is given. What is prepared from it follows it: an
+    optimiser's step, ``load_state_dict``, ``.to()`` and ``.double()`` take effect at the next call.
 
     Args:
         H: (N,N), or (B,N,N) for exactly B problems a call.
         lower, upper, tolerance: as in ``box_qp``.
 
     Raises:
-        ShapeError, ValueRangeError: as in ``box_qp``.
+        ShapeError, ValueRangeError: as in ``box_qp``; also at a call, where H has become unfit since.
 
     Example:
         >>> qp = BoxQP(torch.eye(2), lower=0.0, upper=float("inf"))
         >>> qp(torch.tensor([[-3.0, 1.0]])).round(decimals=4).tolist()
         [[3.0, 0.0]]
     """
+
+    H: Tensor
+    lower: Tensor
+    upper: Tensor
 
     def __init__(
         self,
@@ -93,36 +106,85 @@ class BoxQP:
         upper: float | Tensor = 1.0,
         tolerance: float | None = None,
     ) -> None:
-        self.H = H
-        with torch.no_grad():
-            self._exact = _checked_hessian(H)
-            self.tolerance = _TOLERANCE[H.dtype] if tolerance is None else tolerance
-            self.lower, self.upper = _checked_bounds(lower, upper, self._exact)
-            self._factors: SplittingFactors | None = prepare_splitting(self._exact) if H.ndim == 2 else None
+        super().__init__()
+        self.tolerance = tolerance
+        if isinstance(H, nn.Parameter):
+            self.H = H
+        else:
+            self.register_buffer("H", H)
+        self._prepared: Prepared[_PreparedHessian] = Prepared()
+        exact = self._prepare().exact
+        for name, bound in zip(("lower", "upper"), _checked_bounds(lower, upper, exact), strict=True):
+            self.register_buffer(name, bound)
 
-    def __call__(self, f: Tensor, start: Tensor | None = None) -> Tensor:
-        """The minimisers (B,N) for f (B,N)."""
-        _check_vectors(self.H, f, start)
-        if torch.is_grad_enabled() and (self.H.requires_grad or f.requires_grad):
-            solution: Tensor = BoxSolution.apply(self.H, f, self.lower, self.upper, lambda: self._solve(f, start))
-            return solution
-        return self._solve(f, start)
+    def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
+        """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
+        return _minimiser(self.H, self._prepare(), f, self.lower, self.upper, start, self.tolerance)
 
-    @torch.no_grad()
-    def _solve(self, f: Tensor, start: Tensor | None) -> Tensor:
-        count, variables = f.shape
-        solution = torch.empty_like(f)
-        numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
-        chunk = max(1, numbers // max(variables if self.H.ndim == 2 else variables**2, 1))
-        for first in range(0, count, chunk):
-            rows = slice(first, first + chunk)
-            H = self._exact if self.H.ndim == 2 else self._exact[rows]
-            problem = BoxProblem.of(H, f[rows].double(), self.lower, self.upper)
-            factors = prepare_splitting(H) if self._factors is None else self._factors
-            x = _solve(problem, factors, None if start is None else start[rows].double(), self.tolerance)
-            # Rounding to float32 must not step over a bound.
-            solution[rows] = torch.minimum(torch.maximum(x.to(f.dtype), self.lower.to(f)), self.upper.to(f))
+    def _prepare(self) -> _PreparedHessian:
+        return self._prepared.get((self.H,), lambda: _PreparedHessian.of(self.H))
+
+    def extra_repr(self) -> str:
+        return f"{self.H.shape[-1]} variables"
+
+
+@dataclass(frozen=True, eq=False)
+class _PreparedHessian:
+    """The symmetric part of H in float64, and the factors of one H for all problems."""
+
+    exact: Tensor
+    factors: SplittingFactors | None
+
+    @classmethod
+    def of(cls, H: Tensor) -> _PreparedHessian:
+        exact = _checked_hessian(H)
+        return cls(exact, prepare_splitting(exact) if H.ndim == 2 else None)
+
+
+def _minimiser(
+    H: Tensor,
+    prepared: _PreparedHessian,
+    f: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    start: Tensor | None,
+    tolerance: float | None,
+) -> Tensor:
+    """The minimisers (B,N), differentiable in H and f where these ask for it."""
+    if torch.jit.is_tracing():
+        raise TraceError(
+            "box_qp: iterates until every problem is solved, and a trace would repeat one frame's path for all; "
+            "expected an ONNX graph made by `torchface export solver` (or torchface.onnx), which fixes the iterations"
+        )
+    _check_vectors(H, f, start)
+    tolerance = _TOLERANCE[H.dtype] if tolerance is None else tolerance
+    lower, upper = lower.double(), upper.double()
+    if torch.is_grad_enabled() and (H.requires_grad or f.requires_grad):
+        solution: Tensor = BoxSolution.apply(
+            H, f, lower, upper, lambda: _solve_in_chunks(prepared, f, lower, upper, start, tolerance)
+        )
         return solution
+    return _solve_in_chunks(prepared, f, lower, upper, start, tolerance)
+
+
+@torch.no_grad()
+def _solve_in_chunks(
+    prepared: _PreparedHessian, f: Tensor, lower: Tensor, upper: Tensor, start: Tensor | None, tolerance: float
+) -> Tensor:
+    count, variables = f.shape
+    shared = prepared.exact.ndim == 2
+    solution = torch.empty_like(f)
+    numbers = _CHUNK_NUMBERS.get(f.device.type, _CHUNK_NUMBERS["other"])
+    chunk = max(1, numbers // max(variables if shared else variables**2, 1))
+    for first in range(0, count, chunk):
+        rows = slice(first, first + chunk)
+        H = prepared.exact if shared else prepared.exact[rows]
+        problem = BoxProblem.of(H, f[rows].double(), lower, upper)
+        factors = prepare_splitting(H) if prepared.factors is None else prepared.factors
+        x = _solve(problem, factors, None if start is None else start[rows].double(), tolerance)
+        # Rounding to float32 must not step over a bound.
+        solution[rows] = torch.minimum(torch.maximum(x.to(f.dtype), lower.to(f)), upper.to(f))
+    return solution
 
 
 def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None, tolerance: float) -> Tensor:

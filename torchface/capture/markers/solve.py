@@ -14,6 +14,7 @@ from torchface.capture.energy import Quadratic, marker_term, ridge_term, sparsit
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.optim import BoxQP, box_qp
+from torchface.optim.prepared import Prepared
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
@@ -43,13 +44,14 @@ class MarkerSolver(nn.Module):
         rig: N shapes.
         attachment: where the M markers sit on it; its ``residual``, where it has one, is added to the points.
         alignment: moves marker space into rig space, one similarity; none if absent. Errors count in rig space.
-        sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``.
-        ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1.
+        sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``. A tensor of one number is
+            kept as a parameter (``nn.Parameter``) or a buffer, and the weights are differentiable in it.
+        ridge: :math:`\varepsilon`, mm² a marker for a squared weight of 1; as ``sparsity``.
 
     Raises:
         TopologyError: the attachment belongs to another mesh.
         ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite.
-        ShapeError: ``alignment`` holds more than one similarity.
+        ShapeError: ``alignment`` holds more than one similarity, or ``sparsity`` or ``ridge`` more than one number.
 
     Source: thesis 4.1.3, 4.1.4 and appendix.
     """
@@ -62,8 +64,8 @@ class MarkerSolver(nn.Module):
         rig: BlendshapeRig,
         attachment: Attachment,
         alignment: Similarity | None = None,
-        sparsity: float = SPARSITY,
-        ridge: float = RIDGE,
+        sparsity: float | Tensor = SPARSITY,
+        ridge: float | Tensor = RIDGE,
     ) -> None:
         super().__init__()
         attachment.check(rig.neutral)
@@ -81,12 +83,13 @@ class MarkerSolver(nn.Module):
         basis: Tensor,
         rest: Tensor,
         alignment: Similarity | None,
-        sparsity: float,
-        ridge: float,
+        sparsity: float | Tensor,
+        ridge: float | Tensor,
     ) -> None:
         self.names: tuple[str, ...] = tuple(names)
         self.labels: tuple[str, ...] = tuple(labels)
-        self.sparsity, self.ridge = float(sparsity), float(ridge)
+        self.sparsity = self._penalty("sparsity", sparsity)
+        self.ridge = self._penalty("ridge", ridge)
         self.register_buffer("basis", basis)
         self.register_buffer("rest", rest)
         if alignment is not None and alignment.scale.shape != (1,):
@@ -94,8 +97,18 @@ class MarkerSolver(nn.Module):
         for name in ("scale", "rotation", "translation"):
             moved = None if alignment is None else getattr(alignment, name).to(rest)
             self.register_buffer(f"alignment_{name}", moved)
-        self._prepared: tuple[Tensor, float, float, BoxQP] | None = None
+        self._prepared: dict[float, Prepared[BoxQP]] = {}
         self.regularization(self.rest)  # a negative weight is an error here, not at the first solve
+
+    def _penalty(self, name: str, value: float | Tensor) -> float | Tensor:
+        """A number as it is; a tensor of one as a scalar that moves and saves with the module."""
+        if not isinstance(value, Tensor):
+            return float(value)
+        if value.numel() != 1:
+            raise ShapeError(f"{name}: found {tuple(value.shape)}, expected one number")
+        if not isinstance(value, nn.Parameter):
+            self.register_buffer(name, value)
+        return value
 
     @property
     def config(self) -> dict[str, Any]:
@@ -103,9 +116,15 @@ class MarkerSolver(nn.Module):
         return {
             "names": list(self.names),
             "labels": list(self.labels),
-            "sparsity": self.sparsity,
-            "ridge": self.ridge,
+            "sparsity": number(self.sparsity),
+            "ridge": number(self.ridge),
             "aligned": self.alignment is not None,
+            # In the state, with their shapes.
+            "tensors": {
+                name: list(value.shape)
+                for name in ("sparsity", "ridge")
+                if isinstance(value := getattr(self, name), Tensor)
+            },
         }
 
     @classmethod
@@ -127,8 +146,12 @@ class MarkerSolver(nn.Module):
         self = cls.__new__(cls)
         nn.Module.__init__(self)
         alignment = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3)) if config["aligned"] else None
-        basis = torch.zeros(len(labels), 3, len(names))
-        self._hold(names, labels, basis, basis[..., 0], alignment, config["sparsity"], config["ridge"])
+        basis, rest = torch.zeros(len(labels), 3, len(names)), torch.zeros(len(labels), 3)
+        sparsity, ridge = (
+            torch.zeros(config["tensors"][name]) if name in config.get("tensors", {}) else config[name]
+            for name in ("sparsity", "ridge")
+        )
+        self._hold(names, labels, basis, rest, alignment, sparsity, ridge)
         return self
 
     @property
@@ -216,20 +239,30 @@ class MarkerSolver(nn.Module):
         return self._shared(tolerance)(f, start)
 
     def _shared(self, tolerance: float) -> BoxQP:
-        prepared = self._prepared
-        # The buffer is another tensor after .to(); then H is formed anew.
-        if prepared is None or prepared[0] is not self.basis or prepared[1:3] != (self.ridge, tolerance):
-            H = marker_term(self.basis.double(), self.rest.double(), self.rest.double()[None]).H
-            H = H + self.regularization(H).H
-            self._prepared = prepared = (self.basis, self.ridge, tolerance, BoxQP(H, 0.0, 1.0, tolerance))
-        return prepared[3]
+        """The problem of complete frames: prepared once, and anew where what it is made of has changed."""
+        parts = (self.basis, self.rest, self.ridge)
+        if torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts):
+            return BoxQP(self._hessian(), 0.0, 1.0, tolerance)  # a graph serves one backward pass
+        prepare = self._prepared.setdefault(tolerance, Prepared())
+        return prepare.get((self.basis, self.ridge), lambda: BoxQP(self._hessian(), 0.0, 1.0, tolerance))
+
+    def _hessian(self) -> Tensor:
+        rest = self.rest.double()
+        H = marker_term(self.basis.double(), rest, rest[None]).H
+        return H + self.regularization(H).H
 
     def _in_rig_space(self, markers: Tensor) -> Tensor:
         alignment = self.alignment
         return markers if alignment is None else alignment.apply(markers)
 
     def extra_repr(self) -> str:
-        return f"{len(self.labels)} markers, {len(self.names)} shapes, sparsity={self.sparsity}, ridge={self.ridge}"
+        penalties = f"sparsity={number(self.sparsity):g}, ridge={number(self.ridge):g}"
+        return f"{len(self.labels)} markers, {len(self.names)} shapes, {penalties}"
+
+
+def number(penalty: float | Tensor) -> float:
+    """The value of a solver's ``sparsity`` or ``ridge``, without its gradient."""
+    return penalty.item() if isinstance(penalty, Tensor) else penalty
 
 
 def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
