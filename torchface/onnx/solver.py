@@ -8,7 +8,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.markers.solve import MarkerSolver, number
+from torchface.capture.markers.solve import MarkerSolver, penalty_value
 from torchface.errors import ShapeError
 from torchface.optim.box_problem import metric
 from torchface.optim.splitting import RELAXATION, RHO, prepare_splitting
@@ -71,7 +71,7 @@ class SolverGraph(nn.Module):
         super().__init__()
         self.names, self.labels = solver.names, solver.labels
         self.steps, self.steps_with_gaps, self.rho = steps, steps_with_gaps, rho
-        self.sparsity, self.ridge = number(solver.sparsity), number(solver.ridge)
+        self.sparsity, self.ridge = penalty_value(solver.sparsity), penalty_value(solver.ridge)
         rest, basis = solver.rest.double(), solver.basis.double()
         scale = 1.0
         if solver.alignment is not None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.helmet import rigid_columns
-from torchface.capture.markers.solve import MarkerSolver, number as number_of
+from torchface.capture.markers.solve import MarkerSolver, penalty_value
 from torchface.optim import BoxQP
 
 # What disagrees by more is left out of the next round, millimetres; then down to the take's own limit.
@@ -58,7 +58,7 @@ def predict_markers(
     rest, columns = solver.rest.double(), solver.basis.double()
     shapes = columns.shape[2]
     lower, upper = rest.new_zeros(shapes), rest.new_ones(shapes)
-    ridge, price = rest.new_full((shapes,), 2 * _RIDGE), rest.new_full((shapes,), number_of(solver.sparsity))
+    ridge, price = rest.new_full((shapes,), 2 * _RIDGE), rest.new_full((shapes,), penalty_value(solver.sparsity))
     if slip:
         columns = torch.cat([columns, rigid_columns(rest, rest.mean(0))], dim=2)
         bound = rest.new_full((6,), torch.inf)

@@ -116,8 +116,8 @@ class MarkerSolver(nn.Module):
         return {
             "names": list(self.names),
             "labels": list(self.labels),
-            "sparsity": number(self.sparsity),
-            "ridge": number(self.ridge),
+            "sparsity": penalty_value(self.sparsity),
+            "ridge": penalty_value(self.ridge),
             "aligned": self.alignment is not None,
             # In the state, with their shapes.
             "tensors": {
@@ -256,11 +256,11 @@ class MarkerSolver(nn.Module):
         return markers if alignment is None else alignment.apply(markers)
 
     def extra_repr(self) -> str:
-        penalties = f"sparsity={number(self.sparsity):g}, ridge={number(self.ridge):g}"
+        penalties = f"sparsity={penalty_value(self.sparsity):g}, ridge={penalty_value(self.ridge):g}"
         return f"{len(self.labels)} markers, {len(self.names)} shapes, {penalties}"
 
 
-def number(penalty: float | Tensor) -> float:
+def penalty_value(penalty: float | Tensor) -> float:
     """The value of a solver's ``sparsity`` or ``ridge``, without its gradient."""
     return penalty.item() if isinstance(penalty, Tensor) else penalty
 

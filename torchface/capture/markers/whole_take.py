@@ -9,7 +9,7 @@ import torch
 from scipy.fft import dct, idct
 from torch import Tensor
 
-from torchface.capture.markers.solve import MarkerSolver, number
+from torchface.capture.markers.solve import MarkerSolver, penalty_value
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.take import Take, Track
 
@@ -56,7 +56,7 @@ class WholeTakeSolver:
     sparsity: float | None = None
 
     def __post_init__(self) -> None:
-        sparsity = SPARSITY_SHARE * number(self.markers.sparsity) if self.sparsity is None else self.sparsity
+        sparsity = SPARSITY_SHARE * penalty_value(self.markers.sparsity) if self.sparsity is None else self.sparsity
         object.__setattr__(self, "sparsity", float(sparsity))
         for name in ("smoothness", "release", "sparsity"):
             value = getattr(self, name)
@@ -103,7 +103,7 @@ class WholeTakeSolver:
         if release == math.inf:
             huber = size.square()
         price = self.sparsity or 0.0
-        return float(data + price * w.sum() + number(solver.ridge) * w.square().sum() + smoothness * huber.sum())
+        return float(data + price * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber.sum())
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
@@ -127,7 +127,7 @@ class WholeTakeSolver:
         rest, rows = solver.rest.double(), solver.basis.double().flatten(0, 1)
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
-        H.diagonal().add_(2 * number(solver.ridge))
+        H.diagonal().add_(2 * penalty_value(solver.ridge))
         values, vectors = torch.linalg.eigh(H)
         rho = _RHO * float(H.diagonal().mean())
         waves = torch.arange(len(seen), dtype=torch.float64) * (math.pi / len(seen))
