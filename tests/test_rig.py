@@ -55,3 +55,12 @@ def test_bad_rigs_and_weights_are_named() -> None:
 def test_one_name_is_no_list_of_names() -> None:
     with pytest.raises(NameMismatchError, match=r"found the text 'ab', expected a list of names: \['ab'\]"):
         small_rig().index("ab")
+
+
+def test_under_arkits_names_the_face_moves_as_before() -> None:
+    rig = small_rig()
+    own = BlendshapeRig(rig.neutral, rig.deltas, ["wink", "browInnerUp_L", "JawOpen", "browInnerUp_R"])
+    renamed = own.with_arkit_names()
+    assert renamed.names == ("jawOpen", "browInnerUp", "wink")
+    weights = torch.tensor([[0.3, 0.7, 0.2]])
+    torch.testing.assert_close(renamed(weights), own(torch.tensor([[0.2, 0.7, 0.3, 0.7]])))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface.shape_names import ARKIT, mapping, mirror
+from torchface.shape_names import ARKIT, arkit_sources, mapping, mirror
 
 
 def test_arkit_has_52_names_and_its_mirror_is_an_involution() -> None:
@@ -33,3 +33,33 @@ def test_ict_and_back_keeps_every_weight_that_ict_has(ict_folder: Path) -> None:
     expected[ARKIT.index("tongueOut")] = 0
     torch.testing.assert_close(back @ there @ weights, expected)
     assert (there.sum(1) == 1).all()
+
+
+def test_arkit_names_take_every_shape_once_and_mean_what_mapping_means() -> None:
+    names = ["PupilDilate_L", "cheekPuff_R", "EyeBlinkLeft", "cheekPuff_L", "browInnerUp_L", "jawOpen", "JawOpen"]
+    sources = arkit_sources(names)
+    assert sources == {
+        "eyeBlinkLeft": (2,),
+        "jawOpen": (5,),
+        "cheekPuff": (3, 1),
+        "PupilDilate_L": (0,),
+        "browInnerUp_L": (4,),  # without its other half it is not ARKit's shape
+        "JawOpen": (6,),
+    }
+    # ARKit's weights move the renamed rig as they move the old one by mapping.
+    matrix = mapping(ARKIT, names)
+    for column, name in enumerate(ARKIT):
+        if name in sources:
+            assert set(matrix[:, column].nonzero()[:, 0].tolist()) >= set(sources[name])
+
+
+@pytest.mark.real
+def test_ict_has_51_of_arkits_names(ict_folder: Path) -> None:
+    ict = json.loads((ict_folder / "vertex_indices.json").read_text())["expressions"]
+    sources = arkit_sources(ict)
+    assert [name for name in ARKIT if name not in sources] == ["tongueOut"]
+    assert sorted(row for rows in sources.values() for row in rows) == list(range(len(ict)))
+    assert {name: [ict[row] for row in rows] for name, rows in sources.items() if len(rows) > 1} == {
+        "browInnerUp": ["browInnerUp_L", "browInnerUp_R"],
+        "cheekPuff": ["cheekPuff_L", "cheekPuff_R"],
+    }

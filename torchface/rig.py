@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
-from torchface.shape_names import mapping
+from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Track
 
 
@@ -101,6 +101,12 @@ class BlendshapeRig(nn.Module):
     def select(self, names: Sequence[str]) -> BlendshapeRig:
         """The rig with these shapes only, in this order."""
         return BlendshapeRig(self.neutral, self.deltas[self.index(names)], names)
+
+    def with_arkit_names(self) -> BlendshapeRig:
+        """The rig under ARKit's names, halves of one of ARKit's shapes merged; see ``shape_names.arkit_sources``."""
+        sources = arkit_sources(self.names)
+        deltas = torch.stack([self.deltas[list(rows)].sum(0) for rows in sources.values()])
+        return BlendshapeRig(self.neutral, deltas, tuple(sources))
 
     def part(self, keep: Tensor) -> BlendshapeRig:
         """The rig of some vertices only: a mask (V,) or ids; see ``torchface.mesh.submesh``."""

@@ -57,6 +57,37 @@ def mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
     return matrix
 
 
+def arkit_sources(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """How a rig's shapes are called in ARKit, and which of them add up to each: ARKit's in its order, then the others.
+
+    A shape that ARKit knows takes ARKit's spelling; two halves of what is one shape there (``browInnerUp``,
+    ``cheekPuff``) are merged; a shape without a twin in ARKit keeps its name.
+
+    Args:
+        names: no name twice.
+
+    Returns:
+        For each name to write the rows of ``names`` whose deltas it is the sum of; every row occurs once.
+
+    Example:
+        >>> arkit_sources(["PupilDilate_L", "browInnerUp_L", "browInnerUp_R", "eyeBlink_L"])
+        {'eyeBlinkLeft': (3,), 'browInnerUp': (1, 2), 'PupilDilate_L': (0,)}
+    """
+    rows: dict[str, int] = {}
+    for row, name in enumerate(names):
+        if name in ARKIT or _canonical(name) not in rows:  # of two spellings of one shape ARKit's own comes first
+            rows[_canonical(name)] = row
+    sources: dict[str, tuple[int, ...]] = {}
+    for name in ARKIT:
+        whole, halves = _canonical(name), _halves(_canonical(name))
+        if whole in rows:
+            sources[name] = (rows[whole],)
+        elif all(half in rows for half in halves):
+            sources[name] = (rows[halves[0]], rows[halves[1]])
+    taken = {row for group in sources.values() for row in group}
+    return sources | {name: (row,) for row, name in enumerate(names) if row not in taken}
+
+
 def mirror(names: Sequence[str]) -> Tensor:
     """For each name the index of its mirror image, (N,) int64; a name without one is its own.
 

@@ -86,6 +86,24 @@ def test_transfer_onto_the_own_neutral_writes_the_same_rig(shoot: Path, dome_rig
     torch.testing.assert_close(load_rig(shoot / "actor.glb").deltas, dome_rig.deltas, atol=5e-3, rtol=0)
 
 
+def test_transfer_writes_arkits_names_and_a_folder_in_the_templates_order(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ["jawOpen", "browInnerUp_L", "browInnerUp_R", "wink"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), shoot / "halves.glb")
+    save_mesh(dome_rig.neutral, shoot / "neutral.obj")
+    run("transfer", shoot / "halves.glb", shoot / "neutral.obj", "--out", shoot / "actor", "--names", "arkit")
+    assert "names: 2 of ARKit's 52; it has no wink" in " ".join(capsys.readouterr().err.split())
+    actor = load_rig(shoot / "actor")
+    assert actor.names == ("jawOpen", "browInnerUp", "wink")
+    merged = torch.stack([dome_rig.deltas[0], dome_rig.deltas[1] + dome_rig.deltas[2], dome_rig.deltas[3]])
+    torch.testing.assert_close(actor.deltas, merged, atol=5e-3, rtol=0)
+    assert torch.equal(actor.neutral.polygons, dome_rig.neutral.polygons)
+    with pytest.raises(SystemExit):
+        run("transfer", shoot / "halves.glb", shoot / "neutral.obj", "--out", shoot / "actor.fbx")
+    assert "expected .glb, or none for a folder" in " ".join(capsys.readouterr().err.split())
+
+
 def test_render_and_info_and_export(shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("render", shoot / "rig.glb", "--out", shoot / "a.png", "--height", "60", "--weights", "jawOpen=1", "--yaw", "0")
     run("render", shoot / "rig.glb", "--out", shoot / "b.png", "--height", "60", "--yaw", "0")

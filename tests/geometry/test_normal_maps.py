@@ -69,6 +69,16 @@ def test_weights_follow_names_not_order() -> None:
         maps.blend(["smile", "frown"], torch.zeros(3))
 
 
+def test_maps_of_merged_shapes_show_what_their_halves_show_together() -> None:
+    maps = DetailMaps(("smileLeft", "frown", "smileRight"), MAPS[:3], NEUTRAL)
+    merged = maps.merged({"smile": ["smileLeft", "smileRight"], "blink": ["blink"], "sneer": ["frown"]})
+    assert merged.names == ("smile", "sneer")
+    torch.testing.assert_close(merged.maps[1], MAPS[1])
+    both = maps.blend(["smileLeft", "smileRight", "frown"], torch.tensor([0.4, 0.4, 0.0]).double())
+    torch.testing.assert_close(merged.blend(["smile", "sneer"], torch.tensor([0.4, 0.0]).double()), both)
+    assert DetailMaps((), MAPS[:0], NEUTRAL).merged({"smile": ["smile"]}).names == ()
+
+
 def test_gradients_reach_the_weights() -> None:
     small, rest = MAPS[:, :, ::16, ::16], NEUTRAL[:, ::16, ::16]
     weights = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64, requires_grad=True)

@@ -10,7 +10,7 @@ from mutation import check_reader
 from rig_samples import quad_sheet, sheet_rig
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError
-from torchface.io import load_rig, save_mesh
+from torchface.io import load_rig, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -92,3 +92,73 @@ def test_a_mutated_shape_is_read_or_refused(tmp_path: Path) -> None:
     report = check_reader(load_with_this_shape, [tmp_path / "good.obj"], ".obj")
     assert report.read > 0
     assert report.refused > report.cases / 4
+
+
+def test_a_written_folder_is_the_same_rig(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "actor")
+    found = load_rig(tmp_path / "actor")
+    assert found.names == rig.names  # which are not sorted
+    assert (found.deltas - rig.deltas).abs().max() < 1e-5
+    assert torch.equal(found.neutral.vertices, rig.neutral.vertices)
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.uvs[found.neutral.uv_faces], rig.neutral.uvs[rig.neutral.uv_faces])
+    assert torch.equal(found.neutral.landmarks, rig.neutral.landmarks)
+    regions = rig.neutral.annotations.regions
+    assert all(torch.equal(found.neutral.annotations.regions[name], mask) for name, mask in regions.items())
+    assert torch.equal(found.neutral.annotations.mirror, rig.neutral.annotations.mirror)
+    assert (found.neutral.texture - rig.neutral.texture).abs().max() <= 0.5 / 255 + 1e-6
+    assert [path.name for path in tmp_path.iterdir()] == ["actor"]
+
+
+def test_shapes_that_a_rigger_adds_or_takes_away_are_heeded(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "actor")
+    (tmp_path / "actor" / "mouthSmileLeft.obj").unlink()
+    shutil.copy(tmp_path / "actor" / "jawOpen.obj", tmp_path / "actor" / "aNewOne.obj")
+    found = load_rig(tmp_path / "actor")
+    assert found.names == ("jawOpen", "eyeBlinkRight", "aNewOne")
+    save_rig(found, tmp_path / "actor")
+    with pytest.raises(
+        FileFormatError, match=r"actor: found OBJ files of another rig \(aNewOne.obj\), expected an empty"
+    ):
+        save_rig(rig, tmp_path / "actor")
+
+
+def test_names_that_make_no_files_and_other_endings_are_refused(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    for name in ("../jawOpen", "a/b", ".hidden", "Neutral", "", "nul\0"):
+        with pytest.raises(NameMismatchError, match="expected file names; write a"):
+            save_rig(BlendshapeRig(rig.neutral, rig.deltas[:1], (name,)), tmp_path / "actor")
+    with pytest.raises(
+        FileFormatError, match=r"actor.fbx: found the ending '.fbx', expected .glb, or none for a folder"
+    ):
+        save_rig(rig, tmp_path / "actor.fbx")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(FileFormatError, match="cannot be written"):
+        save_rig(rig, tmp_path / "file" / "actor")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_broken_notes_are_named(tmp_path: Path) -> None:
+    save_rig(sheet_rig(), tmp_path / "actor")
+    for text, told in (
+        ("{", "found broken JSON"),
+        ("[]", "found JSON that is no object"),
+        ('{"shapes": 3}', "shapes: found 3, expected an array"),
+        ('{"mesh": {"version": 1, "vertices": 30, "landmarks": [30]}}', "vertices 30 to 30, expected 0 to 29"),
+    ):
+        (tmp_path / "actor" / "rig.json").write_text(text)
+        with pytest.raises(FileFormatError, match=f"rig.json.*{told}"):
+            load_rig(tmp_path / "actor")
+
+
+@pytest.mark.real
+def test_a_real_rig_keeps_its_vertices_and_quads_in_a_folder(ict_folder: Path, tmp_path: Path) -> None:
+    rig = load_rig(ict_folder, shapes=["jawOpen", "eyeBlink_L"])
+    save_rig(rig, tmp_path / "ict")
+    found = load_rig(tmp_path / "ict")
+    assert found.names == rig.names
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.landmarks, rig.neutral.landmarks)
+    assert (found.deltas - rig.deltas).abs().max() < 1e-4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -21,6 +21,7 @@ def fit(
     inner_weight: float | None = None,
     face: int | None = None,
     texture_size: int = 1024,
+    names: Literal["arkit"] | None = None,
     quiet: bool = False,
 ) -> None:
     """Make a person's rig from one or several photographs, and write it as .glb.
@@ -38,23 +39,37 @@ def fit(
             one .xml of dlib's (imglab) that names the photographs; found if absent.
         landmark_model: What finds them, a model of the zoo by name, or its folder.
         model: A head model of the zoo by name, or its folder.
-        out: The .glb to write.
+        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
         template: The rig whose shapes the head is given, with the model's topology; the embedded performer if absent.
         focal: Focal length in pixels where it is known; estimated if absent.
         inner_weight: Weight of landmarks at brows, eyes, nose and mouth beside those of the face's contour.
         face: Which face of a photograph, from 0, where it shows several (the largest first) or an .xml holds several.
         texture_size: Texels a side of the rig's texture; 0 makes none.
+        names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
+            shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         quiet: Show no progress.
     """
     from torchface.modeling import FitSettings
     from torchface.workflows.fit import fit_photographs
+    from torchface.workflows.rig_names import naming_lines
 
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
     with steps(quiet) as step:
         made = fit_photographs(
-            photographs, landmarks, model, out, template, focal, settings, face, texture_size, step, landmark_model
+            photographs,
+            landmarks,
+            model,
+            out,
+            template,
+            focal,
+            settings,
+            face,
+            texture_size,
+            step,
+            landmark_model,
+            names,
         )
-    for line in made.lines(photographs):
+    for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False, markup=False)
     marks = (picture.with_suffix(".pts") for picture in made.pictures[: len(made.found)])
     cameras = (picture.with_suffix(".toml") for picture in made.pictures)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -23,6 +24,7 @@ def rig(
     model: str | None = None,
     texture_size: int = 2048,
     detail_size: int = 2048,
+    names: Literal["arkit"] | None = None,
     quiet: bool = False,
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
@@ -38,7 +40,7 @@ def rig(
     Args:
         scan: The actor at rest: any topology and pose, with holes, hair and collar.
         template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        out: The .glb to write.
+        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
         landmarks: The scan's landmarks: .ljson, .pts or .json in the order of the template's annotated landmarks, or
             correspondences saved by `torchface pick`. Without them the face is found by its shape.
         examples: Folder of scans of expressions.
@@ -53,14 +55,17 @@ def rig(
             starts; see `python -m train.morphable`.
         texture_size: Texels a side of the rig's texture; 0 makes none.
         detail_size: Texels a side of each normal map.
+        names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
+            shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         quiet: Show no progress.
     """
     from torchface.workflows.pose import pose_weights
     from torchface.workflows.rig import RigOptions, rig_actor
+    from torchface.workflows.rig_names import naming_lines
 
-    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size)
+    options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names)
     with steps(quiet) as step:
         report = rig_actor(scan, template, out, landmarks, examples, detail, options, step)
-    for line in report.lines():
+    for line in [*report.lines(), *naming_lines(report.rig, names)]:
         console.print(line, highlight=False, markup=False)
     print(out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -16,6 +16,7 @@ def transfer(
     out: Path,
     part: str | None = None,
     unit: str | None = None,
+    names: Literal["arkit"] | None = None,
     quiet: bool = False,
 ) -> None:
     """Give a neutral head the shapes of a template rig and write the rig as .glb.
@@ -25,23 +26,29 @@ def transfer(
     Args:
         template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         neutral: The new head: a mesh with the template's topology (.obj, .ply, .glb).
-        out: The .glb to write.
+        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
         part: Keep this region of the template only, such as face; the neutral then has this part's topology.
         unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
+        names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
+            shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         quiet: Show no progress.
     """
     from torchface.io import load_mesh, load_rig, save_rig
     from torchface.modeling.transfer import transfer_with_report
+    from torchface.workflows.rig import check_out
+    from torchface.workflows.rig_names import naming_lines, renamed
 
+    check_out(out)
     with steps(quiet) as step:
         step("reading the template")
         source = load_rig(template, part=part)
         step("transferring")
         transferred = transfer_with_report(source, load_mesh(neutral, unit=unit))
         step("writing the rig")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        save_rig(transferred.rig, out)
+        save_rig(renamed(transferred.rig, names), out)
     console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
+    for line in naming_lines(transferred.rig, names):
+        console.print(line, highlight=False, markup=False)
     if summary := transferred.report.summary():
         console.print(summary)
     print(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -59,6 +59,18 @@ class DetailMaps:
         if missing:
             raise NameMismatchError(f"detail maps: the rig has no shape {', '.join(map(repr, missing[:5]))}")
         return blend_normal_maps(self.maps, weights[[row[name] for name in self.names]], self.neutral)
+
+    def merged(self, sources: Mapping[str, Sequence[str]]) -> DetailMaps:
+        """The maps of shapes that are sums of these.
+
+        Args:
+            sources: for each new shape the names of those that add up to it; one without any map gets none.
+        """
+        row = {name: i for i, name in enumerate(self.names)}
+        rows = {name: [row[part] for part in parts if part in row] for name, parts in sources.items()}
+        rows = {name: found for name, found in rows.items() if found}
+        maps = [blend_normal_maps(self.maps[found], torch.ones(len(found)), self.neutral) for found in rows.values()]
+        return DetailMaps(tuple(rows), torch.stack(maps) if maps else self.maps[:0], self.neutral)
 
 
 def blend_normal_maps(maps: Tensor, weights: Tensor, neutral: Tensor | None = None) -> Tensor:

@@ -1,7 +1,7 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
 from torchface.io.cameras import load_calibration, save_calibration
-from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation, save_rig
+from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation
 from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.images import load_image, save_image, save_image16
 from torchface.io.landmarks import load_landmark_points, save_pts
@@ -16,7 +16,8 @@ from torchface.io.picks import (
     save_correspondences,
     save_landmarks,
 )
-from torchface.io.rigs import load_obj_folder, load_rig
+from torchface.io.rig_folder import load_obj_folder
+from torchface.io.rigs import load_rig, save_rig
 from torchface.io.takes import load_take, save_take
 
 __all__ = [

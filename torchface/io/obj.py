@@ -90,14 +90,45 @@ def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
         FileFormatError: the folder cannot be written to.
     """
     path = Path(path)
-    positions = (mesh.vertices.detach().cpu().double() / millimetres_per(unit)).numpy()
-    columns = positions if mesh.colors is None else np.hstack([positions, mesh.colors.detach().cpu().double().numpy()])
-    row = "v " + " ".join(["%.9g"] * columns.shape[1])
-    text = [row % tuple(values) for values in columns.tolist()]
     if mesh.texture is not None:
-        text.insert(0, f"mtllib {path.stem}.mtl")
         write_file(path.with_suffix(".png"), encode_png(mesh.texture))
         write_file(path.with_suffix(".mtl"), f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n".encode())
+    colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
+    rows = _vertex_lines(mesh.vertices, unit, colors)
+    write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))
+
+
+def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path, unit: str = "mm") -> None:
+    """Writes shapes of a mesh beside its own file, with the same faces and material.
+
+    Args:
+        mesh: the neutral, as ``write_obj`` wrote it.
+        shapes: the name and the vertices (V,3) of each; its file is called so.
+        neutral: the mesh's own file.
+        unit: of the files.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+    """
+    surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
+    for name, vertices in shapes:  # a file a turn
+        write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices, unit) + surface)
+
+
+def _material_line(mesh: Mesh, path: Path) -> bytes:
+    return b"" if mesh.texture is None else f"mtllib {path.stem}.mtl\n".encode()
+
+
+def _vertex_lines(vertices: Tensor, unit: str, colors: NDArray[np.float64] | None = None) -> bytes:
+    positions = (vertices.detach().cpu().double() / millimetres_per(unit)).numpy()
+    columns = positions if colors is None else np.hstack([positions, colors])
+    row = "v " + " ".join(["%.9g"] * columns.shape[1])
+    return "".join([row % tuple(values) + "\n" for values in columns.tolist()]).encode()
+
+
+def _surface_lines(mesh: Mesh) -> bytes:
+    """Texture coordinates and faces."""
+    text: list[str] = []
     sizes, corners, uv_corners = corners_of_polygons(mesh)
     if mesh.uvs is None:
         words = [str(i) for i in (corners + 1).tolist()]
@@ -108,7 +139,7 @@ def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
         text.append("usemtl skin")
     end = np.cumsum(sizes).tolist()
     text += ["f " + " ".join(words[e - n : e]) for e, n in zip(end, sizes.tolist(), strict=True)]
-    write_file(path, ("\n".join(text) + "\n").encode())
+    return ("\n".join(text) + "\n").encode()
 
 
 def _plain_vertices(path: Path, data: bytes) -> NDArray[np.float64] | None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from torchface.errors import FileFormatError
-from torchface.files import read_file
-from torchface.io.gltf import read_gltf_rig
+from torchface.geometry.normal_maps import DetailMaps
+from torchface.io.gltf import read_gltf_rig, write_gltf_rig
 from torchface.io.ict_facekit import is_ict_folder, load_ict_facekit, region
-from torchface.io.obj import face_bytes, read_obj, read_obj_vertices
+from torchface.io.rig_folder import load_obj_folder, save_obj_folder
 from torchface.rig import BlendshapeRig
 
 
@@ -50,29 +48,24 @@ def load_rig(
     return rig if part is None else rig.part(region(rig.neutral, part))
 
 
-def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = None) -> BlendshapeRig:
-    """A rig of OBJ files with the same faces, shapes sorted by name.
+def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
+    """Writes a rig for other programs, and so that ``load_rig`` gives the same one.
 
     Args:
-        folder: one neutral, and a file for each shape.
-        unit: of all the files.
-        neutral: the neutral's file name without ``.obj``; if absent the one file with "neutral" in its name.
+        rig: the rig.
+        path: a ``.glb``, see ``torchface.io.gltf``; or a name without an ending, for a folder of ``neutral.obj`` and
+            an OBJ a shape, see ``save_obj_folder``. It appears only when it is complete.
+        detail: wrinkle maps of its shapes.
 
     Raises:
-        FileFormatError: no neutral or several, no shape, or a broken file.
-        TopologyError: a shape has other vertices or faces than the neutral.
+        FileFormatError: another ending, a folder that holds another rig, or one that cannot be written to.
+        TopologyError: for a ``.glb`` the mesh has no triangle, or wrinkle maps and no texture coordinates.
+        NameMismatchError: a wrinkle map belongs to no shape of the rig, or a shape's name is no file's name.
     """
-    folder = Path(folder)
-    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".obj"}
-    candidates = [name for name in files if "neutral" in name.lower()] if neutral is None else [neutral]
-    if len(candidates) != 1 or candidates[0] not in files:
-        raise FileFormatError(
-            f"{folder}: found {len(files)} OBJ files, of them neutral: {', '.join(candidates) or 'none'}; expected one "
-            "neutral (name it by neutral=) and a file for each shape"
-        )
-    rest = files.pop(candidates[0])
-    if not files:
-        raise FileFormatError(f"{folder}: found only the neutral {rest.name}, expected a file for each shape")
-    mesh, topology = read_obj(rest, unit), face_bytes(read_file(rest))
-    deltas = [read_obj_vertices(path, mesh, topology, unit) - mesh.vertices for path in files.values()]
-    return BlendshapeRig(mesh, torch.stack(deltas), tuple(files))
+    suffix = Path(path).suffix.lower()
+    if suffix == ".glb":
+        write_gltf_rig(rig, path, detail)
+    elif suffix == "":
+        save_obj_folder(rig, path, detail)
+    else:
+        raise FileFormatError(f"{path}: found the ending {suffix!r}, expected .glb, or none for a folder of OBJ files")

@@ -27,6 +27,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
 from torchface.workflows.rig import check_out
+from torchface.workflows.rig_names import Naming, renamed
 from torchface.workflows.skin import dressed_as, hidden_parts
 
 _OVER, _MARGIN, _SHARE = 480, 0.45, 0.7
@@ -84,6 +85,7 @@ def fit_photographs(
     texture_size: int = 1024,
     progress: Callable[[str], None] | None = None,
     landmark_model: str | Path = DEFAULT_LANDMARKS,
+    names: Naming | None = None,
 ) -> FittedHead:
     """Fits a head to photographs of one person with one expression and writes it as a rig.
 
@@ -92,7 +94,7 @@ def fit_photographs(
         landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
             where there are none they are found, and written as .pts beside ``out``.
         model: a head model by name or folder; see ``zoo.get_model``.
-        out: the ``.glb`` to write; overlays are written beside it.
+        out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         template: a rig with the model's topology; the embedded performer where its topology is the model's.
         focal: length in pixels where it is known.
         settings: how landmarks are trusted.
@@ -100,10 +102,11 @@ def fit_photographs(
         texture_size: texels a side; 0 makes no texture.
         progress: called with a line before each step.
         landmark_model: finds landmarks where no file gives them; by name or folder.
+        names: of the written shapes; see ``rig_names.renamed``.
 
     Raises:
         NoFaceError: landmarks are to be found where no face is.
-        FileFormatError: ``out`` is no ``.glb`` or cannot be written to, or a file is broken.
+        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
         NameMismatchError: landmarks do not tell which photograph or face they are of.
         TorchfaceError: landmarks or model are of no use; see ``fit_images``.
     """
@@ -139,7 +142,7 @@ def fit_photographs(
     worn = dressed_as(fit.mesh, rig.neutral, unseen)
     transferred = transfer_with_report(rig, worn)
     say("writing the rig and the overlays")
-    save_rig(transferred.rig, out)
+    save_rig(renamed(transferred.rig, names), out)
     pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn
         save_picture(overlay(fit, i, image, marks[i]), path)

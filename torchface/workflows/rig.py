@@ -34,6 +34,7 @@ from torchface.registration.landmark_files import landmark_file, load_scan_landm
 from torchface.rig import BlendshapeRig
 from torchface.workflows.expressions import LAYOUT, Expression, expressions_in, neutral_in, weights_row
 from torchface.workflows.register import in_place_of, load_shape_model
+from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 from torchface.workflows.skin import dressed_as, hidden_parts
 
 _FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
@@ -54,6 +55,7 @@ class RigOptions:
         model: of heads in the template's topology, by name or folder; the neutral's registration starts from it.
         texture_size: of the actor's texture, texels a side.
         detail_size: of each normal map, texels a side.
+        names: of the written shapes; see ``rig_names.renamed``.
     """
 
     part: str | None = None
@@ -63,6 +65,7 @@ class RigOptions:
     model: str | Path | None = None
     texture_size: int = 2048
     detail_size: int = 2048
+    names: Naming | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +136,7 @@ def rig_actor(
     Args:
         scan: the actor at rest, any topology and pose.
         template: a rig.
-        out: the ``.glb`` to write.
+        out: the ``.glb`` or folder to write; see ``save_rig``.
         landmarks: of the scan; see ``load_scan_landmarks``. Found by shape alone if absent.
         examples: a folder of scans of expressions; see ``expressions_in``. Landmark files named as the scans may lie
             beside them.
@@ -143,7 +146,7 @@ def rig_actor(
         progress: called with a line before each step.
 
     Raises:
-        FileFormatError: ``out`` is no ``.glb`` or cannot be written to, or a file is broken.
+        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
         AlignmentError: not one example, or not one scan of details, could be used.
         TorchfaceError: neutral scan, template or an option is of no use.
     """
@@ -174,7 +177,7 @@ def rig_actor(
         actor = learned.rig
     maps = job.baked(actor, fine)
     say("writing the rig")
-    save_rig(actor, out, _detail(maps))
+    save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
     names = {label: baked for label, (_, baked) in maps.items()}
     return ActorReport(actor, registration, transferred.report.summary(), learned, used, names, tuple(job.skipped))
 
@@ -303,9 +306,11 @@ def _spread(distances: Tensor) -> str:
 
 
 def check_out(out: Path) -> None:
-    """Refuses a rig's file that is no ``.glb`` or cannot be written to, before any work is done."""
-    if out.suffix.lower() != ".glb":
-        raise FileFormatError(f"{out}: found the ending {out.suffix!r}, expected .glb")
+    """Refuses what a rig cannot be written to, before any work is done: a ``.glb``, or a folder without an ending."""
+    if out.suffix.lower() not in (".glb", ""):
+        raise FileFormatError(
+            f"{out}: found the ending {out.suffix!r}, expected .glb, or none for a folder of OBJ files"
+        )
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         trial = out.with_name(f".{out.name}.writable")

@@ -2,7 +2,7 @@
 
 from torchface.io.gltf.detail import load_detail_maps
 from torchface.io.gltf.reading import read_gltf_mesh, read_gltf_rig
-from torchface.io.gltf.writing import ShapeMatch, save_animation, save_gltf_mesh, save_rig
+from torchface.io.gltf.writing import ShapeMatch, save_animation, save_gltf_mesh, write_gltf_rig
 
 __all__ = [
     "ShapeMatch",
@@ -11,5 +11,5 @@ __all__ = [
     "read_gltf_rig",
     "save_animation",
     "save_gltf_mesh",
-    "save_rig",
+    "write_gltf_rig",
 ]

@@ -47,7 +47,7 @@ class ShapeMatch:
     unused: tuple[str, ...]
 
 
-def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
+def write_gltf_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
     """Writes a rig as ``.glb`` in metres.
 
     Vertices are split where texture coordinates differ, as glTF wants it; the attribute ``_VERTEX_ID`` and
@@ -68,7 +68,7 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = N
 
 
 def save_gltf_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Writes a mesh as ``.glb`` in metres; see ``save_rig``."""
+    """Writes a mesh as ``.glb`` in metres; see ``write_gltf_rig``."""
     _write(path, mesh, torch.zeros(0, *mesh.vertices.shape), (), None)
 
 
