@@ -12,11 +12,13 @@ from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import MarkerSolver
 from torchface.cli import main
 from torchface.errors import ValueRangeError
+from torchface.evaluation import weight_jitter
 from torchface.io.live_link_stream import decode_frame
 from torchface.onnx.live import LiveMarkerSolver
 from torchface.onnx.solver_export import random_frames
 from torchface.shape_names import ARKIT
 from torchface.synthetic.marker_stage import place_markers
+from torchface.temporal import OneEuroFilter, one_euro_filter
 from torchface.workflows.stream import stream_markers
 
 
@@ -39,6 +41,22 @@ def test_what_arrives_is_what_was_solved_in_time(dome_rig: BlendshapeRig) -> Non
     jaw = torch.stack([frame.weights[ARKIT.index("jawOpen")] for frame in frames])
     assert torch.equal(jaw, report.weights[:, dome_rig.names.index("jawOpen")])
     torch.testing.assert_close(report.weights, solver(markers), rtol=0, atol=2e-3)
+
+
+def test_smoothed_frames_know_only_those_before(dome_rig: BlendshapeRig) -> None:
+    solver = MarkerSolver(dome_rig, place_markers(dome_rig, 30))
+    markers = random_frames(solver, 30)
+
+    def sent(smoothing: OneEuroFilter | None) -> torch.Tensor:
+        clock = (0.0, lambda seconds: None)
+        address = "udp://127.0.0.1:11111"
+        return stream_markers(
+            LiveMarkerSolver(solver), markers, 60.0, address, lambda: clock[0], clock[1], smoothing
+        ).weights
+
+    single = sent(None)
+    torch.testing.assert_close(sent(OneEuroFilter(60.0)), one_euro_filter(single, 60.0), rtol=0, atol=1e-6)
+    assert weight_jitter(sent(OneEuroFilter(60.0))) < 0.5 * weight_jitter(single)
 
 
 def test_no_frames(dome_rig: BlendshapeRig) -> None:

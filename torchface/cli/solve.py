@@ -54,7 +54,7 @@ def solve(
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
         report: A folder for a page with every curve and a table of what was wrong with the take.
         stream: Then send the frames in their own time, as Live Link Face does: udp://127.0.0.1:11111 for Unreal on
-            this machine.
+            this machine. Each is smoothed by those before it (not with --frame-by-frame).
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.

@@ -2,6 +2,7 @@
 
 from torchface.temporal.adaptive import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
+from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
 from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
 from torchface.temporal.smoothing import savitzky_golay
 
@@ -10,6 +11,8 @@ __all__ = [
     "AdaptiveSettings",
     "KalmanFilter",
     "KalmanSettings",
+    "OneEuroFilter",
+    "OneEuroSettings",
     "RotationFilter",
     "adaptive_filter",
     "adaptive_smoother",
@@ -17,6 +20,7 @@ __all__ = [
     "filter_rotations",
     "kalman_filter",
     "kalman_smoother",
+    "one_euro_filter",
     "savitzky_golay",
     "smooth_rotations",
 ]

@@ -31,6 +31,7 @@ from torchface.io.live_link_stream import parse_address
 from torchface.onnx.live import LiveMarkerSolver
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, require_seen
+from torchface.temporal import OneEuroFilter
 from torchface.workflows.head_camera import HeadCamera, Predicted, predicted_curves
 from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
 
@@ -290,11 +291,12 @@ def solve_take(
 def _sent(
     rig: BlendshapeRig, solution: Solution, settings: SolveSettings, address: str, predicted: bool
 ) -> StreamReport:
-    """Frames in their own time: solved one by one as they are due; those that need more than their own markers (of a
-    take solved whole or with a video) as they were solved."""
+    """Frames in their own time, solved one by one as they are due and smoothed by what came before; those that need more
+    than their own markers (of a take with a video) as they were solved."""
     take = solution.take
     assert take.weights is not None
-    if predicted or not settings.frame_by_frame:
+    if predicted:
         return stream_weights(take.weights.values[..., 0], take.weights.names, take.fps, address)
-    solver = MarkerSolver(rig, solution.attachment, None, settings.sparsity, settings.ridge)
-    return stream_markers(LiveMarkerSolver(solver), solution.markers.float(), take.fps, address)
+    solver = LiveMarkerSolver(MarkerSolver(rig, solution.attachment, None, settings.sparsity, settings.ridge))
+    smoothing = None if settings.frame_by_frame else OneEuroFilter(take.fps)
+    return stream_markers(solver, solution.markers.float(), take.fps, address, smoothing=smoothing)

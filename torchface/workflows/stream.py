@@ -12,6 +12,7 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.io.live_link_stream import LiveLinkSender
 from torchface.onnx.live import LiveMarkerSolver
+from torchface.temporal import OneEuroFilter
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ def stream_markers(
     address: str,
     clock: Callable[[], float] = time.perf_counter,
     wait: Callable[[float], None] = time.sleep,
+    smoothing: OneEuroFilter | None = None,
 ) -> StreamReport:
     """Solves frames one at a time and sends each at its time.
 
@@ -49,11 +51,15 @@ def stream_markers(
         solver: for these markers.
         frames: (M,3) each, millimetres, NaN for not seen; from a take or as they come in.
         fps, address, clock, wait: see :func:`stream_weights`.
+        smoothing: calms the weights from frame to frame; none if absent.
 
     Raises:
         ValueRangeError: the address is none, or there was no frame.
     """
-    return stream_weights((solver.step(markers) for markers in frames), solver.names, fps, address, clock, wait)
+    weights = (solver.step(markers) for markers in frames)
+    if smoothing is not None:
+        weights = (smoothing.step(frame) for frame in weights)
+    return stream_weights(weights, solver.names, fps, address, clock, wait)
 
 
 def stream_weights(

@@ -1,0 +1,58 @@
+"""Calm at rest, quick in motion, and never ahead of its time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.evaluation import weight_jitter
+from torchface.temporal import OneEuroFilter, OneEuroSettings, one_euro_filter
+
+FPS = 60.0
+
+
+def test_agrees_with_the_published_recursion() -> None:
+    settings = OneEuroSettings(1.2, 4.0, 0.9)
+    values = torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def alpha(cutoff: float) -> float:
+        tau = 1 / (2 * math.pi * cutoff)
+        return 1 / (1 + tau * FPS)
+
+    value, speed, theirs = float(values[0]), 0.0, [float(values[0])]
+    for measured in values[1:].tolist():
+        rate = alpha(settings.speed_cutoff)
+        speed = rate * (measured - value) * FPS + (1 - rate) * speed
+        share = alpha(settings.cutoff + settings.speed * abs(speed))
+        value = share * measured + (1 - share) * value
+        theirs.append(value)
+    found = one_euro_filter(values, FPS, settings)
+    torch.testing.assert_close(found, torch.tensor(theirs, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_noise_at_rest_is_calmed_and_a_blink_comes_in_time() -> None:
+    noise = 0.03 * torch.randn(300, 8, generator=torch.Generator().manual_seed(1))
+    assert weight_jitter(one_euro_filter(0.4 + noise, FPS)) < 0.15 * weight_jitter(noise)
+    seconds = torch.arange(120) / FPS
+    blink = torch.exp(-((seconds - 1.0) ** 2) / (2 * 0.05**2))
+    filtered = one_euro_filter(blink[:, None], FPS)[:, 0]
+    assert float(filtered.max()) > 0.8
+    assert 0 <= int(filtered.argmax()) - int(blink.argmax()) <= 2
+
+
+def test_what_is_not_seen_stays_and_bad_input_is_named() -> None:
+    running = OneEuroFilter(FPS)
+    assert running.step(torch.tensor([0.5, math.nan])).tolist()[0] == 0.5
+    held = running.step(torch.tensor([math.nan, 0.25]))
+    assert held.tolist() == [0.5, 0.25]
+    with pytest.raises(ShapeError, match=r"found \(3,\), expected \(2,\)"):
+        running.step(torch.zeros(3))
+    running.reset()
+    assert running.step(torch.zeros(3)).tolist() == [0, 0, 0]
+    with pytest.raises(ValueRangeError, match="found 0 frames a second"):
+        OneEuroFilter(0)
+    with pytest.raises(ValueRangeError, match="expected positive cutoffs"):
+        OneEuroSettings(cutoff=0)
