@@ -291,8 +291,8 @@ def solve_take(
 def _sent(
     rig: BlendshapeRig, solution: Solution, settings: SolveSettings, address: str, predicted: bool
 ) -> StreamReport:
-    """Frames in their own time, solved one by one as they are due and smoothed by what came before; those that need more
-    than their own markers (of a take with a video) as they were solved."""
+    """Frames in their own time, solved one by one as they are due and smoothed by those before; those of a take with a
+    video, which need more than their own markers, as they were solved."""
     take = solution.take
     assert take.weights is not None
     if predicted:
