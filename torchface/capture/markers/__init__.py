@@ -2,6 +2,7 @@
 
 from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachment
 from torchface.capture.markers.cleanup import Cleanup, Defect, clean_take
+from torchface.capture.markers.fit_check import FitCheck, check_fit
 from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.initial_sites import sites_by_shape
@@ -15,6 +16,7 @@ __all__ = [
     "AttachmentFit",
     "Cleanup",
     "Defect",
+    "FitCheck",
     "HelmetMotion",
     "HelmetSolver",
     "HybridSolver",
@@ -23,6 +25,7 @@ __all__ = [
     "SparsityTrial",
     "WholeTakeSolver",
     "align_take",
+    "check_fit",
     "clean_take",
     "fit_attachment",
     "gamma_curves",

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.energy import marker_term, ridge_term
+from torchface.capture.markers.surface_motion import with_one
 from torchface.errors import AlignmentError
 from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.optim import BoxQP
@@ -13,6 +14,8 @@ from torchface.optim import BoxQP
 _ON_A_LINE = 1e-2
 _TOLERANCE = 3e-6
 _FILLS = 12
+_FIRST_RIDGE, _LAST_RIDGE, _FALLING_ROUNDS = 3.0, 0.01, 20
+_ROUNDS, _SETTLED = 80, 1e-3
 
 
 def solve_weights(affine: Tensor, moved: Tensor, ridge: float, start: Tensor | None = None) -> Tensor:
@@ -83,6 +86,33 @@ def pose_step(
     translation = centre + grow * (turn @ (pose.translation[0] - centre)) + step[3:6]
     moved_pose = Similarity(pose.scale * grow, turn @ pose.rotation, translation[None])
     return moved_pose, float(step[7])
+
+
+def pose_of_take(affine: Tensor, paths: Tensor) -> Similarity:
+    """The similarity that lays a take's markers on a rig, found in turns with the weights of all frames.
+
+    Args:
+        affine: of the sites, (M,3,N+1), millimetres of rig space.
+        paths: markers (T,M,3), millimetres of any space, NaN for not seen; every frame shows some.
+
+    Returns:
+        Marker space to rig space.
+    """
+    rest = affine[..., 0]
+    pose = similarity_transform(paths.nanmean(0)[None], rest[None])
+    weights, before = None, rest
+    for number in range(_ROUNDS):
+        falling = min(number / (_FALLING_ROUNDS - 1), 1.0)
+        ridge = _FIRST_RIDGE * (_LAST_RIDGE / _FIRST_RIDGE) ** falling
+        weights = solve_weights(affine, pose.apply(paths), ridge, weights)
+        pose, _ = pose_step(paths, pose, torch.einsum("mcn,tn->tmc", affine, with_one(weights)))
+        # How far the sites at rest went since the last round says whether the pose still moves.
+        here = pose.inverse().apply(rest)[0]
+        settled = float(((here - before).norm(dim=1) * pose.scale).max()) < _SETTLED
+        before = here
+        if settled and falling == 1.0:
+            break
+    return pose
 
 
 def check_spread(points: Tensor) -> None:

@@ -8,16 +8,13 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.rest_pose import check_spread, pose_step, solve_weights
+from torchface.capture.markers.rest_pose import check_spread, pose_of_take
 from torchface.capture.markers.solve import MarkerSolver, check_labels
-from torchface.capture.markers.surface_motion import with_one
 from torchface.errors import ValueRangeError
 from torchface.geometry.alignment import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
-_FIRST_RIDGE, _LAST_RIDGE, _FALLING_ROUNDS = 3.0, 0.01, 20
-_ROUNDS, _SETTLED = 80, 1e-3
 _FRAMES = 240
 
 
@@ -61,21 +58,7 @@ def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_f
         return pose
     check_spread(paths.nanmean(0))
     few = paths[:: max(1, len(paths) // _FRAMES)]
-    few = few[~torch.isnan(few).any(-1).all(1)]
-    pose = similarity_transform(paths.nanmean(0)[None], rest[None])
-    weights, before = None, rest
-    for number in range(_ROUNDS):
-        falling = min(number / (_FALLING_ROUNDS - 1), 1.0)
-        ridge = _FIRST_RIDGE * (_LAST_RIDGE / _FIRST_RIDGE) ** falling
-        weights = solve_weights(affine, pose.apply(few), ridge, weights)
-        pose, _ = pose_step(few, pose, torch.einsum("mcn,tn->tmc", affine, with_one(weights)))
-        # How far the sites at rest went since the last round says whether the pose still moves.
-        here = pose.inverse().apply(rest)[0]
-        settled = float(((here - before).norm(dim=1) * pose.scale).max()) < _SETTLED
-        before = here
-        if settled and falling == 1.0:
-            break
-    return pose
+    return pose_of_take(affine, few[~torch.isnan(few).any(-1).all(1)])
 
 
 def rest_residual(
