@@ -1,7 +1,8 @@
 """``python -m train.morphable --scans DIR --out models/NAME``: a head model, shape and colour, of registered meshes.
 
-``--performers 200`` learns from so many embedded performers instead, and needs no file. Killed and started again, a
-run goes on where it was.
+``--ict FaceXModel`` makes one of ICT-FaceKit's identity modes, which come from light-stage scans of people, with its 53
+expressions as the rig; ``--performers 200`` learns from so many embedded performers, and needs no file. Killed and
+started again, a run goes on where it was.
 """
 
 from __future__ import annotations
@@ -15,26 +16,23 @@ from pathlib import Path
 import torch
 import tyro
 
-from torchface import TorchfaceError, load_mesh, zoo
+from torchface import TorchfaceError, zoo
 from torchface.errors import ValueRangeError
 from torchface.geometry.samples import SampleRange, Samples, blocks
-from torchface.modeling import HeadModel
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.model_quality import ModelQuality, model_quality
 from torchface.modeling.sequence_fit import fit_sequence
-from torchface.rendering.compositing import save_picture
-from torchface.viz.model_pictures import (
-    color_modes_picture,
-    far_picture,
-    modes_picture,
-    morph_picture,
-    quality_picture,
-    random_picture,
-    scatter_picture,
-)
+from train.head_pictures import draw
 from train.head_samples import Source, balanced_colors, gather, laid, performers, registered
+from train.head_templates import ict_head_model, load_template
 
 _TESTED_PERFORMERS = 20
+_MANY, _FOLDS, _FEWEST_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
 _MEASURED = 500  # heads; leaving one out takes an eigensystem of so many for each
+_MEASURES = (
+    "; generalisation leaves one head out at a time; specificity is how far its random heads lie from the nearest it "
+    "has learned from (root mean squares over the vertices)."
+)
 _HALF = ("shape.components", "color.components")
 
 
@@ -44,12 +42,16 @@ class Settings:
 
     Args:
         scans: Folder of registered meshes, all of one topology, in any place; what `torchface register` writes.
+        ict: Take ICT-FaceKit's `FaceXModel` folder instead: its neutral, identity modes and expressions.
         performers: Learn from so many embedded performers instead of a folder's meshes.
         out: Folder for the model, its card and its pictures.
-        template: A mesh of the same topology that says where and how upright the heads are to stand, and brings
-            annotations; the first mesh where absent, set upright by its landmarks if it has any.
+        template: The template that the meshes were registered with, a mesh or a rig (.glb, a folder of OBJ files,
+            `FaceXModel`): says where and how upright the heads are to stand, and brings annotations. A rig travels with
+            the model, so that `torchface fit` needs no other. The first mesh where absent, set upright by its landmarks
+            if it has any.
+        part: The region of template or `FaceXModel` that the heads have, such as face.
         held_out: How many meshes, the last by name, are kept for the test; or how many more performers are drawn for
-            it. A tenth if absent, and 20 performers.
+            it. If absent 20 performers, a tenth of 100 meshes and more; of fewer meshes each is left out once.
         components: How many components of shape; all if absent, at most 200.
         color_components: How many components of colour; likewise.
         variance: Keep as few components of shape as hold this share of the variance.
@@ -62,9 +64,11 @@ class Settings:
     """
 
     scans: Path | None = None
+    ict: Path | None = None
     performers: int = 0
     out: Path = Path("models/head")
     template: Path | None = None
+    part: str | None = None
     held_out: int | None = None
     components: int | None = None
     color_components: int | None = None
@@ -94,8 +98,11 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
         TorchfaceError: neither scans nor performers, too few of them, all the same, or more components than they hold.
     """
     say = say or (lambda line: None)
+    _check_one_source(settings)
+    if settings.ict is not None:
+        return _ict(settings, settings.ict, say)
     source, held_out = _source(settings)
-    template = None if settings.template is None else load_mesh(settings.template)
+    template, rig = (None, None) if settings.template is None else load_template(settings.template, settings.part)
     work = settings.out.parent / f".{settings.out.name}.training"
     work.mkdir(parents=True, exist_ok=True)
     gathered = gather(source, held_out, work, template, say)
@@ -120,7 +127,7 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
         except ValueRangeError as error:
             say(f"no model of colours: {error}")
             test_colors = None
-    model = HeadModel.on(gathered.template, shape, color)
+    model = HeadModel.on(gathered.template, shape, color, rig)
     say("measuring")
     quality = None
     if count >= 3:
@@ -129,10 +136,51 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
         numbers = _spread(range(1, min(some - 2, shape.count) + 1))
         quality = model_quality(SampleRange(learn, 0, some), numbers, generator=generator)
     metrics = measured(model, quality, test, test_colors)
-    save(model, settings, metrics, count, gathered.held_out)
-    draw(model, settings, quality, learn, test, say)
+    folds = 0
+    if not gathered.held_out and count >= _FEWEST_FOLDS:
+        folds = min(count, _FOLDS)
+        say(f"leaving heads out in {folds} turns")
+        metrics |= cross_validated(learn, folds, settings.components)
+    save(model, settings, metrics, count, gathered.held_out, folds)
+    draw(model, settings.pictures or settings.out / "pictures", settings.seed, quality, learn, test, say)
     shutil.rmtree(work, ignore_errors=True)
     return Trained(model, metrics, quality)
+
+
+def _ict(settings: Settings, folder: Path, say: Callable[[str], None]) -> Trained:
+    """The model of ICT-FaceKit's own modes: nothing is learned, so nothing is held out."""
+    say("reading the modes and the expressions")
+    model = ict_head_model(folder, settings.part, settings.components)
+    spread = model.shape.modes.square().sum((0, 2)).sqrt()
+    metrics = {
+        "shape components": float(model.shape.count),
+        "heads from the mean, root mean square mm": float(spread.mean()),
+    }
+    save(model, settings, metrics, 0, 0, 0)
+    draw(model, settings.pictures or settings.out / "pictures", settings.seed, None, None, None, say)
+    return Trained(model, metrics, None)
+
+
+def cross_validated(heads: Samples, folds: int, components: int | None) -> dict[str, float]:
+    """How far heads lie from models of the others: each is left out once, in so many turns.
+
+    All heads were laid on each other together.
+    """
+    samples = torch.cat([heads.read(*block) for block in blocks(heads)])
+    turn = torch.arange(len(samples)) % folds
+    far, mean = [], []
+    for fold in range(folds):  # a model a turn
+        others, left = samples[turn != fold], samples[turn == fold]
+        model = MorphableModel.fit(others, None if components is None else min(components, len(others) - 1))
+        far.append((model(model.project(left)) - left).norm(dim=-1).mean(1))
+        mean.append((left - model.mean).norm(dim=-1).mean(1))
+    each, base = torch.cat(far), torch.cat(mean)
+    return {
+        "left out in turn, heads": float(len(each)),
+        "left out in turn, mean error mm": float(each.mean()),
+        "left out in turn, worst head mm": float(each.max()),
+        "left out in turn, of the mean head's error": float(each.mean() / base.mean()),
+    }
 
 
 def measured(
@@ -162,18 +210,24 @@ def measured(
     return metrics
 
 
-def save(model: HeadModel, settings: Settings, metrics: dict[str, float], count: int, held_out: int) -> None:
+def save(
+    model: HeadModel, settings: Settings, metrics: dict[str, float], count: int, held_out: int, folds: int
+) -> None:
     """Writes the model with its effective settings, measured errors and card."""
     effective = {key: value for key, value in asdict(settings).items() if value is not None}
     effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     if settings.performers:
         data = f"{count} embedded performers, heads and complexions drawn by seed {settings.seed}; no person's face."
         flags = f"--performers {settings.performers} --seed {settings.seed}"
+    elif settings.ict is not None:
+        data = f"{model.shape.count} identity modes of ICT-FaceKit's FaceXModel, made of light-stage scans of people."
+        flags = f"--ict {settings.ict.name}"
     else:
         data = f"{count} registered meshes of {settings.scans and settings.scans.name}."
         flags = f"--scans {settings.scans and settings.scans.name}"
-    for name in ("held_out", "components", "color_components", "variance"):
+    for name in ("template", "part", "held_out", "components", "color_components", "variance"):
         value = getattr(settings, name)
+        value = value.name if isinstance(value, Path) else value
         flags += "" if value is None else f" --{name.replace('_', '-')} {value}"
     flags += (
         " --scale" * settings.scale + " --no-white-balance" * (not settings.white_balance) + " --half" * settings.half
@@ -183,71 +237,49 @@ def save(model: HeadModel, settings: Settings, metrics: dict[str, float], count:
         if model.color is not None
         else "The meshes brought no colours, so the model has none."
     )
+    if folds:
+        tested = f"Tested on all {count} heads, each left out of the model once, in {folds} turns{_MEASURES}"
+    elif settings.ict is not None:
+        tested = "Nothing was held out: the modes are as their authors give them."
+    else:
+        tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
+    carried = f"A rig of {len(model.rig_names)} shapes travels with it. " if model.rig_names else ""
+    free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
     zoo.save_model(
         model,
         settings.out,
-        licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
+        licence=settings.licence or free,
         data=data,
         metrics=metrics,
         recipe=f"python -m train.morphable {flags} --out models/{settings.out.name}",
         card=(
             f"Neutral heads as a linear model: a mean and {model.shape.count} components, coefficients in standard "
-            f"deviations, millimetres. Good for drawing heads, for holding a registration or a fit to photographs to "
-            f"what heads look like, for filling in what a scan does not show. {colors} Tested on {held_out} heads that "
-            "it has not learned from; generalisation leaves one head out at a time; specificity is how far its random "
-            "heads lie from the nearest it has learned from (root mean squares over the vertices). It knows no "
-            "expressions, and no heads unlike those it has learned from: beyond 3 standard deviations it only guesses."
+            "deviations, millimetres. Good for drawing heads, for holding a registration or a fit to photographs to "
+            f"what heads look like, for filling in what a scan does not show. {colors} {carried}{tested} It "
+            "knows no heads unlike those it has learned from: beyond 3 standard deviations it only guesses."
         ),
         settings=effective,
         half=[name for name in _HALF if settings.half and name in model.state_dict()],
     )
 
 
-def draw(
-    model: HeadModel,
-    settings: Settings,
-    quality: ModelQuality | None,
-    learn: Samples,
-    test: Samples,
-    say: Callable[[str], None],
-) -> None:
-    """Writes the pictures."""
-    folder = settings.pictures or settings.out / "pictures"
-    folder.mkdir(parents=True, exist_ok=True)
-    say("drawing")
-    known, others = (
-        torch.cat([model.shape.project(part.read(*block)) for block in blocks(part)]) if part.shape[0] else None
-        for part in (learn, test)
-    )
-    assert known is not None
-    pictures = {
-        "modes": modes_picture(model),
-        "random": random_picture(model, seed=settings.seed),
-        "morph": morph_picture(model, seed=settings.seed),
-        "far": far_picture(model, seed=settings.seed),
-        "components": scatter_picture(model.shape, known, others),
-    }
-    if model.color is not None:
-        pictures["color_modes"] = color_modes_picture(model)
-    if quality is not None:
-        pictures["quality"] = quality_picture(quality)
-    for name, picture in pictures.items():
-        save_picture(picture, folder / f"{name}.png")
+def _check_one_source(settings: Settings) -> None:
+    if (settings.scans is not None) + (settings.ict is not None) + (settings.performers > 0) != 1:
+        raise TorchfaceError(
+            f"found scans={settings.scans}, ict={settings.ict} and performers={settings.performers}; expected a folder "
+            "of registered meshes, ICT-FaceKit's FaceXModel, or a number of performers, one of them"
+        )
 
 
 def _source(settings: Settings) -> tuple[Source, int]:
     """The meshes, and how many of them are held out; what cannot work is refused before anything is read."""
-    if (settings.scans is None) == (settings.performers <= 0):
-        raise TorchfaceError(
-            f"found scans={settings.scans} and performers={settings.performers}; expected a folder of registered "
-            "meshes, or a number of performers"
-        )
     if settings.scans is None:
         held_out = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out
         source = performers(settings.performers + held_out, settings.seed)
     else:
         source = registered(settings.scans)
-        held_out = len(source.names) // 10 if settings.held_out is None else settings.held_out
+        few = len(source.names) < _MANY
+        held_out = (0 if few else len(source.names) // 10) if settings.held_out is None else settings.held_out
     count = len(source.names) - held_out
     if count < 2 or held_out < 0:
         raise TorchfaceError(

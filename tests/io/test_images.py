@@ -59,7 +59,15 @@ def test_what_is_no_picture_is_told(tmp_path: Path) -> None:
 def test_a_mutated_picture_is_read_or_refused(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
     seeds = []
-    for kind, options in (("PNG", {}), ("JPEG", {"quality": 80}), ("WEBP", {}), ("BMP", {}), ("TIFF", {}), ("TGA", {})):
+    for kind, options in (
+        ("PNG", {}),
+        ("JPEG", {"quality": 80}),
+        ("WEBP", {}),
+        ("BMP", {}),
+        ("TIFF", {}),
+        ("TGA", {}),
+        ("PPM", {}),
+    ):
         buffer = io.BytesIO()
         Image.fromarray(noise).save(buffer, kind, **options)
         seeds.append(tmp_path / f"good.{kind.lower()}")

@@ -59,12 +59,15 @@ def portraits(face: Tensor, rig: BlendshapeRig) -> list[Camera]:
     return [look_at(centre, yaw, 3.0, span=300.0, width=SIZE[0], height=SIZE[1]) for yaw in (-40.0, 0.0, 40.0)]
 
 
-def person(rig: BlendshapeRig, model: HeadModel, seed: int, noise: float = 0.5) -> Person:
+def person(
+    rig: BlendshapeRig, model: HeadModel, seed: int, noise: float = 0.5, weights: Tensor | None = None
+) -> Person:
     """Three portraits of a head of the model, as landmarks."""
     generator = torch.Generator().manual_seed(seed)
     coefficients = torch.randn(model.shape.count, generator=generator)
-    weights = torch.zeros(len(rig.names))
-    weights[rig.index(list(EXPRESSION))] = torch.tensor(list(EXPRESSION.values()))
+    if weights is None:
+        weights = torch.zeros(len(rig.names))
+        weights[rig.index(list(EXPRESSION))] = torch.tensor(list(EXPRESSION.values()))
     rest = model.shape(coefficients[None])[0]
     face = rest + rig(weights[None])[0] - rig.vertices
     cameras = portraits(face, rig)
@@ -105,6 +108,15 @@ def test_the_mouth_opens_as_far_as_it_is_open(planted: list[tuple[Person, ImageF
     for p, fit in planted:
         found, true = ((v[upper] - v[lower]).norm(dim=-1) for v in (fit.posed.vertices, p.face))
         assert float((found - true).mean().abs()) < 0.3
+
+
+def test_a_lopsided_smile_stays_lopsided(rig: BlendshapeRig, model: HeadModel) -> None:
+    left, right = rig.index(["mouthSmileLeft", "mouthSmileRight"])
+    weights = torch.zeros(len(rig.names))
+    weights[left] = 0.7
+    p = person(rig, model, 3, weights=weights)
+    fit = fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=FIXED, transfers=0)
+    assert float(fit.weights[left] - fit.weights[right]) > 0.5
 
 
 def test_residuals_are_what_the_cameras_see(planted: list[tuple[Person, ImageFit]], rig: BlendshapeRig) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from sklearn.decomposition import PCA
 
+from torchface import zoo
 from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
+from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, head
 
 
@@ -191,3 +194,36 @@ def test_coefficients_are_differentiated_through(model: MorphableModel) -> None:
     a = torch.randn(2, 13, generator=torch.Generator().manual_seed(9), dtype=torch.float64, requires_grad=True)
     small = MorphableModel(model.mean[:4], model.components[:, :4], model.standard_deviations)
     assert torch.autograd.gradcheck(small, a)
+
+
+def test_a_part_of_a_model_draws_the_same_heads(dome_rig: BlendshapeRig) -> None:
+    model = MorphableModel(dome_rig.vertices, torch.nn.functional.normalize(dome_rig.deltas, dim=(1, 2)), torch.ones(4))
+    keep = dome_rig.vertices[:, 1] > 10
+    ids = keep.nonzero()[:, 0]
+    part = HeadModel.on(dome_rig.neutral, model, rig=dome_rig).part(keep)
+    basis = part.shape.components.flatten(1)
+    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis)), rtol=0, atol=1e-5)
+    whole, cut = (m.modes.flatten(1).double() for m in (model, part.shape))
+    columns = (3 * ids[:, None] + torch.arange(3)).flatten()
+    torch.testing.assert_close(cut.T @ cut, (whole.T @ whole)[columns][:, columns], rtol=0, atol=1e-6)
+    assert part.rig is not None
+    torch.testing.assert_close(part.rig.deltas, dome_rig.deltas[:, ids])
+
+
+def test_a_rig_travels_with_a_head_model(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    people = dome_rig.vertices + torch.randn(6, *dome_rig.vertices.shape, generator=torch.Generator().manual_seed(0))
+    elsewhere = BlendshapeRig(dome_rig.neutral.with_vertices(dome_rig.vertices + 5), dome_rig.deltas, dome_rig.names)
+    model = HeadModel.on(dome_rig.neutral, MorphableModel.fit(people), rig=elsewhere)
+    zoo.save_model(model, tmp_path / "heads", licence="MIT", data="noise", metrics={}, recipe="none")
+    again = zoo.get_model(tmp_path / "heads").rig
+    assert again.names == elsewhere.names
+    assert torch.equal(again.deltas, elsewhere.deltas)
+    assert torch.equal(again.vertices, elsewhere.vertices)
+    assert again.neutral.fingerprint() == elsewhere.neutral.fingerprint()
+    text = (tmp_path / "heads" / "model.toml").read_text()
+    (tmp_path / "heads" / "model.toml").write_text(text.replace('"jawOpen"', "7"))
+    with pytest.raises(FileFormatError, match="found a rig of shapes"):
+        zoo.get_model(tmp_path / "heads")
+    other = replace(dome_rig.neutral, faces=dome_rig.neutral.faces.flip(0), polygons=None)
+    with pytest.raises(TopologyError, match="found a rig of 625 vertices and 1152 triangles, expected the heads' 625"):
+        HeadModel.on(other, MorphableModel.fit(people), rig=elsewhere)

@@ -10,15 +10,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchface import Mesh, save_mesh, zoo
+from torchface import Mesh, load_mesh, save_mesh, zoo
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
+from torchface.geometry.alignment import similarity_transform
+from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.synthetic import draw_identities, head
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.viz import model_pictures
+from torchface.workflows.fit import fit_photographs
 from train import morphable as recipe
-from train.head_samples import registered, upright
+from train.head_samples import registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train
 
 
@@ -176,3 +179,54 @@ def test_meshes_without_colours_make_a_model_of_shape(
     result = train(Settings(scans=tmp_path, out=tmp_path / "model", held_out=0), said.append)
     assert result.model.color is None
     assert "2.glb has no colours: the model will have none" in said
+
+
+def test_few_heads_are_each_left_out_once(folder: Path, tmp_path: Path, without_pictures: None) -> None:
+    result = train(Settings(scans=folder, out=tmp_path / "people"))
+    assert result.metrics["left out in turn, heads"] == 9
+    assert result.model.shape.count == 8  # all of them are in the model
+    heads = [upright(vertex_colored(load_mesh(path))) for path in sorted(folder.iterdir())]
+    laid = torch.stack([m.vertices for m in heads])
+    laid = similarity_transform(laid, laid[:1].expand(laid.shape), scale=False).apply(laid)
+    far = []
+    for number in range(9):
+        others = MorphableModel.fit(laid[torch.arange(9) != number])
+        own = laid[number : number + 1]
+        far.append((others(others.project(own)) - own).norm(dim=-1).mean())
+    assert result.metrics["left out in turn, mean error mm"] == pytest.approx(float(torch.stack(far).mean()), rel=0.05)
+    card = (tmp_path / "people" / "CARD.md").read_text()
+    assert "Tested on all 9 heads, each left out of the model once, in 9 turns" in card
+
+
+@pytest.mark.real
+def test_the_real_heads_model_in_one_command(ict_folder: Path, tmp_path: Path, without_pictures: None) -> None:
+    result = train(Settings(ict=ict_folder, out=tmp_path / "people", components=6))
+    model = zoo.get_model(tmp_path / "people")
+    modes = load_identity_modes(ict_folder, 6)
+    a = torch.randn(6, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(model(a[None]).vertices[0], modes.head(a).vertices, rtol=0, atol=1e-3)
+    assert len(model.rig.names) == 53
+    assert torch.equal(model.rig.vertices, modes.neutral.vertices)
+    assert "MIT" in zoo.describe(tmp_path / "people").licence
+    assert result.metrics["shape components"] == 6
+
+
+@pytest.mark.real
+def test_from_registered_faces_to_a_photograph_without_naming_the_template_again(
+    ict_folder: Path, data: Path, tmp_path: Path, without_pictures: None
+) -> None:
+    """What `register FaceXModel --part face` leaves, learned from, fitted."""
+    modes = load_identity_modes(ict_folder, 8, part="face")
+    (tmp_path / "registered").mkdir()
+    for seed in range(6):
+        save_mesh(modes.random_head(seed), tmp_path / "registered" / f"scan_{seed}.glb")
+    settings = Settings(scans=tmp_path / "registered", template=ict_folder, part="face", out=tmp_path / "people")
+    model = train(settings).model
+    assert model.rig is not None
+    photograph = data / "images" / "people" / "lfpw_1.png"
+    made = fit_photographs(
+        [photograph], [photograph.with_suffix(".pts")], tmp_path / "people", tmp_path / "rig.glb", texture_size=0
+    )
+    assert len(made.rig.vertices) == 9409
+    assert len(made.rig.names) == 53
+    assert float(made.fit.errors[0] / (made.fit.landmarks[0, 36] - made.fit.landmarks[0, 45]).norm()) < 0.06

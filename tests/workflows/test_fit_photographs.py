@@ -23,7 +23,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.identity import anatomy
-from torchface.workflows.fit import fit_photographs, landmarks_of, matching_template
+from torchface.workflows.fit import fit_photographs, landmarks_of, load_head_model, matching
 from torchface.workflows.found_landmarks import FoundLandmarks
 
 YAWS = (-35.0, 0.0, 35.0)
@@ -43,8 +43,11 @@ def studio(tmp_path_factory: pytest.TempPathFactory, actor: BlendshapeRig) -> Pa
     heads = torch.stack([anatomy(who).vertices for who in draw_identities(60, generator)]).float()
     colors = complexion_colors(draw_complexions(30, generator))
     model = HeadModel.on(actor.neutral, MorphableModel.fit(heads, 15), MorphableModel.fit(colors, 4))
-    zoo.save_model(model, folder / "heads", licence="MIT", data="performers", metrics={}, recipe="none")
-    save_rig(performer().select(SHAPES), folder / "template.glb")
+    template = performer().select(SHAPES)
+    carrying = HeadModel.on(actor.neutral, model.shape, model.color, template)
+    for name, saved in (("heads", model), ("heads_with_rig", carrying)):
+        zoo.save_model(saved, folder / name, licence="MIT", data="performers", metrics={}, recipe="none")
+    save_rig(template, folder / "template.glb")
     weights = torch.zeros(1, len(actor.names))
     weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
     smiling = actor.neutral.with_vertices(actor(weights)[0])
@@ -137,6 +140,30 @@ def test_unsure_landmarks_are_left_out(studio: Path) -> None:
     assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
 
 
+def test_a_rig_that_travels_with_the_model_needs_no_template(studio: Path, tmp_path: Path) -> None:
+    photographs, marks = [studio / "p1.png"], [studio / "p1.pts"]
+    plain = fit_photographs(photographs, marks, studio / "heads", tmp_path / "a.glb", studio / "template.glb")
+    own = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "b.glb")
+    assert own.rig.names == tuple(SHAPES)
+    torch.testing.assert_close(own.rig.deltas, plain.rig.deltas, rtol=0, atol=0.02)
+    skin = performer(texture=False).neutral.annotations
+    assert skin is not None
+    face = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "c.glb", part="face")
+    assert len(face.rig.vertices) == int(skin.regions["face"].sum())
+    assert aligned_error(face.rig.vertices, own.rig.vertices[skin.regions["face"]]) < 0.5
+
+
+def test_a_model_of_a_part_says_which_part_of_the_template_it_meets(studio: Path) -> None:
+    template = performer(texture=False)
+    assert template.neutral.annotations is not None
+    heads = load_head_model(studio / "heads").part(template.neutral.annotations.regions["face"])
+    with pytest.raises(TopologyError, match=r"found 6419 vertices .*; try --part face"):
+        matching(heads, studio / "template.glb")
+    model, rig = matching(heads, studio / "template.glb", "face")
+    assert model is heads
+    assert len(rig.vertices) == len(heads.shape.mean)
+
+
 def dlib_xml(path: Path, faces: list[tuple[str, int]]) -> Path:
     boxes = "".join(
         f"<image file='{name}'><box top='1' left='{k}' width='9' height='9'>"
@@ -174,4 +201,4 @@ def test_files_that_do_not_belong_together_are_named(studio: Path, tmp_path: Pat
         fit_photographs(photographs, [], studio / "heads", tmp_path / "rig.obj")
     dome = HeadModel.on(dome_rig.neutral, MorphableModel(dome_rig.vertices, dome_rig.deltas[:1], torch.ones(1)))
     with pytest.raises(TopologyError, match="name a rig with --template"):
-        matching_template(dome, None)
+        matching(dome)

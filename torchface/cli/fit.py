@@ -17,6 +17,7 @@ def fit(
     landmarks: tuple[Path, ...] = (),
     landmark_model: str = "face_landmarks",
     template: Path | None = None,
+    part: str | None = None,
     focal: float | None = None,
     inner_weight: float | None = None,
     face: int | None = None,
@@ -40,7 +41,9 @@ def fit(
         landmark_model: What finds them, a model of the zoo by name, or its folder.
         model: A head model of the zoo by name, or its folder.
         out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
-        template: The rig whose shapes the head is given, with the model's topology; the embedded performer if absent.
+        template: The rig whose shapes the head is given, with the model's topology; if absent the one that travels with
+            the model, or the embedded performer.
+        part: Keep this region of model and template, such as face of ICT-FaceKit's head.
         focal: Focal length in pixels where it is known; estimated if absent.
         inner_weight: Weight of landmarks at brows, eyes, nose and mouth beside those of the face's contour.
         face: Which face of a photograph, from 0, where it shows several (the largest first) or an .xml holds several.
@@ -68,6 +71,7 @@ def fit(
             step,
             landmark_model,
             names,
+            part,
         )
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False, markup=False)

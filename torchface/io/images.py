@@ -17,7 +17,7 @@ from torchface.io.png16 import encode_png16, from_steps, holds_png16, read_png16
 
 _PIXELS_ALWAYS = 4096 * 4096
 _PIXELS_PER_BYTE = 100
-_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "PPM")
 
 
 def load_image(path: str | Path) -> Tensor:

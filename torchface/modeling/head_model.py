@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.mesh import Annotations, Mesh
+from torchface.mesh import Annotations, Mesh, submesh
 from torchface.modeling.morphable import MorphableModel, size
+from torchface.rig import BlendshapeRig
 
+_LARGEST = 2**31
+_MOST_SHAPES = 1000
 _TOPOLOGY = ("faces", "polygons", "uvs", "uv_faces", "landmarks", "mirror", "contacts")
 
 
@@ -33,9 +37,10 @@ class HeadModel(nn.Module):
         uvs: texture coordinates (U,2).
         uv_faces: their rows at each triangle's corners (F,3).
         annotations: landmarks, regions, mirror map and contact pairs.
+        rig: the template whose shapes heads of this model are given, on the same topology; it may stand elsewhere.
 
     Raises:
-        TopologyError: shape, colour and faces have different vertices.
+        TopologyError: shape, colour, faces and rig have different vertices.
         ShapeError: a tensor has the wrong shape.
 
     Source: thesis 3.2.4.
@@ -49,6 +54,9 @@ class HeadModel(nn.Module):
     mirror: Tensor | None
     contacts: Tensor | None
     regions: Tensor | None
+    rig_vertices: Tensor | None
+    rig_deltas: Tensor | None
+    rig_colors: Tensor | None
 
     def __init__(
         self,
@@ -60,6 +68,7 @@ class HeadModel(nn.Module):
         uvs: Tensor | None = None,
         uv_faces: Tensor | None = None,
         annotations: Annotations | None = None,
+        rig: BlendshapeRig | None = None,
     ) -> None:
         super().__init__()
         for name, model in (("shape", shape), ("color", color)):
@@ -77,10 +86,39 @@ class HeadModel(nn.Module):
         self.region_names = sorted(annotations.regions)
         masks = [annotations.regions[name].to(shape.mean.device) for name in self.region_names]
         self.register_buffer("regions", torch.stack(masks) if masks else None)
+        if rig is not None and rig.vertices.shape != shape.mean.shape:
+            raise TopologyError(f"head model: found a rig of {len(rig.vertices)}, expected {len(shape.mean)} vertices")
+        if rig is None:
+            self._carry((), None, None, None)
+        else:
+            self._carry(rig.names, rig.vertices, rig.deltas, rig.neutral.colors)
+
+    def _carry(
+        self, names: Sequence[str], vertices: Tensor | None, deltas: Tensor | None, colors: Tensor | None
+    ) -> None:
+        self.rig_names = tuple(names)
+        for name, tensor in (("rig_vertices", vertices), ("rig_deltas", deltas), ("rig_colors", colors)):
+            kept = None if tensor is None else tensor.detach().float().to(self.shape.mean.device).clone()
+            self.register_buffer(name, kept)
 
     @classmethod
-    def on(cls, template: Mesh, shape: MorphableModel, color: MorphableModel | None = None) -> HeadModel:
-        """The models with the topology and annotations of a mesh."""
+    def on(
+        cls,
+        template: Mesh,
+        shape: MorphableModel,
+        color: MorphableModel | None = None,
+        rig: BlendshapeRig | None = None,
+    ) -> HeadModel:
+        """The models with the topology and annotations of a mesh, and a rig of that topology.
+
+        Raises:
+            TopologyError: other triangles than the rig's.
+        """
+        if rig is not None and not torch.equal(rig.neutral.faces.cpu(), template.faces.cpu()):
+            raise TopologyError(
+                f"head model: found a rig of {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, "
+                f"expected the heads' {len(template.vertices)} and {len(template.faces)}"
+            )
         model = cls(
             shape,
             color,
@@ -89,6 +127,7 @@ class HeadModel(nn.Module):
             uvs=template.uvs,
             uv_faces=template.uv_faces,
             annotations=template.annotations,
+            rig=rig,
         )
         model.template()  # refuses what makes no mesh
         return model
@@ -110,6 +149,24 @@ class HeadModel(nn.Module):
             colors,
             polygons=self.polygons,
             annotations=self.annotations,
+        )
+
+    @property
+    def rig(self) -> BlendshapeRig | None:
+        """The template rig that travels with the model; None where the model has none."""
+        if self.rig_vertices is None or self.rig_deltas is None:
+            return None
+        neutral = replace(self.template(), vertices=self.rig_vertices, colors=self.rig_colors)
+        return BlendshapeRig(neutral, self.rig_deltas, self.rig_names)
+
+    def part(self, keep: Tensor) -> HeadModel:
+        """The model of some vertices only: a mask (V,) or ids; see ``torchface.mesh.submesh``."""
+        piece, rig = submesh(self.template(), keep), self.rig
+        return HeadModel.on(
+            piece.mesh,
+            self.shape.part(piece.vertex_ids),
+            None if self.color is None else self.color.part(piece.vertex_ids),
+            None if rig is None else rig.part(keep),
         )
 
     def forward(self, shape_coefficients: Tensor, color_coefficients: Tensor | None = None) -> Heads:
@@ -139,8 +196,9 @@ class HeadModel(nn.Module):
         )
 
     def check_state(self) -> None:
-        """Raises ``TorchfaceError`` where a loaded state makes no mesh."""
+        """Raises ``TorchfaceError`` where a loaded state makes no mesh or no rig."""
         self.template()
+        _ = self.rig
 
     @property
     def config(self) -> dict[str, Any]:
@@ -149,6 +207,8 @@ class HeadModel(nn.Module):
         config: dict[str, Any] = {"shape": self.shape.config, "sizes": sizes, "regions": list(self.region_names)}
         if self.color is not None:
             config["color"] = self.color.config
+        if self.rig_names:
+            config["rig"] = {"shapes": list(self.rig_names), "colors": self.rig_colors is not None}
         return config
 
     @classmethod
@@ -166,11 +226,12 @@ class HeadModel(nn.Module):
         tensors = {name: _zeros(name, found) for name, found in sizes.items() if name in _TOPOLOGY}
         if "faces" not in tensors:
             raise FileFormatError("head model: found no size of the faces in the config, expected one")
-        masks = torch.zeros(size(shape, "vertices"), dtype=torch.bool)
+        count = size(shape, "vertices")
+        masks = torch.zeros(count, dtype=torch.bool)
         annotations = Annotations(
             tensors.get("landmarks"), dict.fromkeys(names, masks), tensors.get("mirror"), tensors.get("contacts")
         )
-        return cls(
+        model = cls(
             MorphableModel.from_config(shape),
             None if color is None else MorphableModel.from_config(color),
             tensors["faces"],
@@ -179,6 +240,24 @@ class HeadModel(nn.Module):
             uv_faces=tensors.get("uv_faces"),
             annotations=annotations,
         )
+        if "rig" in config:
+            shapes, colored = _rig_of(config["rig"], count)
+            rest = torch.zeros(count, 3)
+            model._carry(shapes, rest, torch.zeros(len(shapes), count, 3), rest.clone() if colored else None)
+        return model
+
+
+def _rig_of(found: Any, vertices: int) -> tuple[list[str], bool]:
+    """A rig's shapes by name, and whether it has colours."""
+    names = found.get("shapes") if isinstance(found, Mapping) else None
+    if (
+        not isinstance(names, list)
+        or not all(isinstance(name, str) for name in names)
+        or not 1 <= len(names) <= _MOST_SHAPES
+        or 12 * vertices * len(names) > _LARGEST
+    ):
+        raise FileFormatError(f"head model: found a rig of shapes {names!r:.80}, expected 1 to {_MOST_SHAPES} names")
+    return names, found.get("colors") is True
 
 
 def _zeros(name: str, found: Any) -> Tensor:

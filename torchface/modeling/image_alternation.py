@@ -26,7 +26,7 @@ def alternate(problem: Problem, state: State, rounds: int = 40) -> State:
     Source: thesis 3.2.5, algorithm 2, lines 6 to 8.
     """
     lower, upper = problem.bounds()
-    ridge, linear = problem.prior()
+    precision, linear = problem.prior()
     weights = torch.ones(LANDMARKS, dtype=torch.float64)
     weights[: len(problem.points.rows)] /= problem.settings.inner_weight
     groups = torch.arange(len(lower)) < problem.identities
@@ -46,6 +46,6 @@ def alternate(problem: Problem, state: State, rounds: int = 40) -> State:
             A, r = lines.by_coefficients.flatten(0, 2), lines.residual.flatten()
             x, H = state.coefficients, A.T @ A
             low, high = torch.where(free, lower, x), torch.where(free, upper, x)
-            found = box_qp(H + torch.diag(ridge), (A.T @ r - H @ x + linear)[None], low, high, start=x[None])
+            found = box_qp(H + precision, (A.T @ r - H @ x + linear)[None], low, high, start=x[None])
             state = replace(state, coefficients=found[0])
     return state

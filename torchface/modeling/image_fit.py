@@ -22,6 +22,7 @@ from torchface.modeling.landmark_view import JAW, LANDMARKS, LinearPoints, Views
 from torchface.modeling.texture import ColorFit
 from torchface.modeling.transfer import transfer_with_report
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mirror
 
 _TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks
 _UNLIKE = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
@@ -123,7 +124,8 @@ def fit_images(
     points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
     say("placing the cameras")
     pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
-    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings)
+    twins = len(modes) + _twins(rig.names)
+    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, twins)
     start = State(
         torch.zeros(len(points.basis), dtype=torch.float64),
         Views(intrinsics, pose.rotation, pose.translation),
@@ -182,6 +184,13 @@ def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
     if torch.allclose(rest, mean, atol=1e-3):
         return deltas.float()
     return similarity_transform(rest[None], mean[None]).apply_vectors(deltas).float()
+
+
+def _twins(names: Sequence[str]) -> Tensor:
+    """Pairs (K,2) of shapes that mirror each other; eyes look to one side together, so their shapes are none."""
+    twin = mirror(names)
+    first = [i for i, name in enumerate(names) if i < int(twin[i]) and not name.lower().startswith("eyelook")]
+    return torch.stack([torch.tensor(first, dtype=torch.int64), twin[first]], dim=1)
 
 
 def contour_curves(mean: Tensor, faces: Tensor, landmarks: Tensor) -> LevelCurves:

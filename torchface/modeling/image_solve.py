@@ -36,6 +36,8 @@ class FitSettings:
             False where they are vertices that may be hidden. Absent, what fits better is taken.
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
+        asymmetry: prior deviation of the difference between a shape's weight and its mirror image's. Faces move almost
+            alike on both sides, and 68 landmarks of a turned head hardly tell a lopsided smile from the turn.
         identity_bound: on each coefficient, standard deviations.
         noise: of an inner landmark, pixels; estimated from the residuals if absent.
         focal_spread: relative deviation of the true focal length from the given one; 0 takes it as known.
@@ -48,6 +50,7 @@ class FitSettings:
     sliding: bool | None = None
     expression_mean: float = 0.2
     expression_ridge: float = 0.5
+    asymmetry: float = 0.1
     identity_bound: float = 3.0
     noise: float | None = None
     focal_spread: float = 0.0
@@ -65,6 +68,7 @@ class Problem:
         found: landmarks, (I,68,2), NaN for missing.
         focal: the expected focal lengths, (I,), pixels.
         settings: see there.
+        twins: rows of the coefficients of shapes that mirror each other, (K,2); none if absent.
     """
 
     points: LinearPoints
@@ -72,6 +76,7 @@ class Problem:
     found: Tensor
     focal: Tensor
     settings: FitSettings
+    twins: Tensor | None = None
 
     @property
     def seen(self) -> Tensor:
@@ -91,12 +96,18 @@ class Problem:
         return lower, upper
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Of the energy ½ xᵀ diag(P) x + βᵀ x: P (D,) and β (D,)."""
+        """Of the energy ½ xᵀ P x + βᵀ x: P (D,D) and β (D,)."""
         count, k = len(self.points.basis), self.identities
         ridge, linear = torch.ones(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
         ridge[k:] = 1 / self.settings.expression_ridge**2
         linear[k:] = 1 / self.settings.expression_mean
-        return ridge, linear
+        precision = torch.diag(ridge)
+        if self.twins is not None and len(self.twins):
+            rows = torch.arange(len(self.twins))
+            apart = torch.zeros(len(self.twins), count, dtype=torch.float64)
+            apart[rows, self.twins[:, 0]], apart[rows, self.twins[:, 1]] = 1.0, -1.0
+            precision = precision + apart.T @ apart / self.settings.asymmetry**2
+        return precision, linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +186,10 @@ def normal_equations(problem: Problem, at: Linearised, views: Views) -> Normal:
 
 def energy(problem: Problem, state: State, picked: PickedPoints, factors: Tensor) -> float:
     """Minus the log posterior up to a constant, at fixed noise and chosen points."""
-    ridge, linear = problem.prior()
+    precision, linear = problem.prior()
     x = state.coefficients
     at = residuals(picked, x, state.views, problem.targets, factors)
-    total = 0.5 * at.square().sum() + 0.5 * (ridge * x * x).sum() + (linear * x).sum()
+    total = 0.5 * at.square().sum() + 0.5 * (x @ precision @ x) + (linear * x).sum()
     focal = step_focal(problem)
     if focal.shape[1]:
         logs = (state.views.intrinsics[:, 0, 0] / problem.focal).log()
@@ -222,7 +233,7 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
         free: which coefficients may change, (D,) bool; all if absent.
     """
     lower, upper = problem.bounds()
-    ridge, linear = problem.prior()
+    precision, linear = problem.prior()
     for _ in range(problem.settings.rounds):
         if problem.settings.sliding:
             rows = chosen_points(problem.points, state.coefficients, state.views)
@@ -232,7 +243,7 @@ def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
         at = linearised(picked, state.coefficients, state.views, problem.targets, factors)
         normal = normal_equations(problem, at, state.views)
         x = state.coefficients
-        H = normal.H + torch.diag(ridge)
+        H = normal.H + precision
         f = normal.g - normal.H @ x + linear
         low, high = (lower, upper) if free is None else (torch.where(free, lower, x), torch.where(free, upper, x))
         goal = box_qp(H, f[None], low, high, start=x[None])[0]
@@ -279,9 +290,10 @@ def _searched(
 def _noise(problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal) -> float:
     """What is left over, for each number that neither the cameras nor the coefficients can explain away."""
     r = residuals(picked, state.coefficients, state.views, problem.targets, factors)
-    ridge, _ = problem.prior()
-    scale = ridge.rsqrt()
-    values = torch.linalg.eigvalsh(normal.H * scale[:, None] * scale).clamp(min=0)
+    precision, _ = problem.prior()
+    factor = torch.linalg.cholesky(precision)
+    half = torch.linalg.solve_triangular(factor, normal.H, upper=False)
+    values = torch.linalg.eigvalsh(torch.linalg.solve_triangular(factor, half.T, upper=False)).clamp(min=0)
     used = float((values / (values + 1)).sum()) + len(normal.alone)
     # A contour landmark that slides tells hardly more than one number.
     told = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
@@ -295,8 +307,8 @@ def covariance(problem: Problem, state: State) -> Tensor:
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
     at = linearised(picked, state.coefficients, state.views, problem.targets, factors)
-    ridge, _ = problem.prior()
-    H = normal_equations(problem, at, state.views).H + torch.diag(ridge)
+    precision, _ = problem.prior()
+    H = normal_equations(problem, at, state.views).H + precision
     lower, upper = problem.bounds()
     x = state.coefficients
     inside = ((x > lower + 1e-9) & (x < upper - 1e-9)).nonzero()[:, 0]

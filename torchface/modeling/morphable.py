@@ -204,6 +204,18 @@ class MorphableModel(nn.Module):
             self.mean, self.components[:count], self.standard_deviations[:count], self.total_variance, self.samples
         )
 
+    def part(self, vertices: Tensor) -> MorphableModel:
+        """The same distribution seen at some vertices (N,) only; its components are orthonormal there."""
+        modes = self.modes[:, vertices].double().flatten(1)
+        _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
+        kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
+        return MorphableModel(
+            self.mean[vertices],
+            components[kept].reshape(-1, len(vertices), self.mean.shape[1]),
+            deviations[kept],
+            samples=self.samples,
+        )
+
     @property
     def config(self) -> dict[str, Any]:
         """Sizes from which :meth:`from_config` makes a model for the state to be loaded into."""

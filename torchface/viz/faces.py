@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.geometry.camera import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
-from torchface.rendering.shading import CLAY, render
+from torchface.rendering.shading import CLAY, DEFAULT_LIGHTING, Lighting, render
 
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 
@@ -41,10 +41,11 @@ def face_views(
     height: int = 500,
     samples: int = 2,
     framed_by: Mesh | None = None,
+    lighting: Lighting = DEFAULT_LIGHTING,
 ) -> Tensor:
     """The mesh from several sides in one row, (3,H,W); ``framed_by`` keeps the framing of another pose."""
     cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
-    row = sheet([render(mesh, camera, colors, samples=samples) for camera in cameras], len(cameras))
+    row = sheet([render(mesh, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
     return row if title is None else caption(row, title)
 
 

@@ -11,12 +11,14 @@ from torchface.modeling.head_model import HeadModel
 from torchface.modeling.model_quality import ModelQuality
 from torchface.modeling.morphable import MorphableModel
 from torchface.rendering.compositing import caption, from_figure, sheet
+from torchface.rendering.shading import Lighting
 from torchface.viz.faces import FRONT, THREE_QUARTER, face_views
 
 FAR = 5.0
 """Times as far from the mean as heads are: well outside the data."""
 
 _WIDTH, _HEIGHT = 220, 275
+_LIGHT = Lighting(occlusion_rays=0)  # seventy faces a model: shadows in creases would take most of the time
 
 
 def modes_picture(model: HeadModel, count: int = 5, deviations: float = 3.0) -> Tensor:
@@ -136,6 +138,13 @@ def _drawn(model: HeadModel, generator: torch.Generator) -> Mesh:
 
 
 def _face(model: HeadModel, mesh: Mesh, label: str | None, yaws: tuple[float, ...] = (FRONT, THREE_QUARTER)) -> Tensor:
-    """Always framed by the mean, so that size and place show."""
-    row = face_views(mesh, yaws, width=_WIDTH, height=_HEIGHT, framed_by=model.template())
+    """Always framed alike, so that size and place show, with room for the whole of every head."""
+    row = face_views(mesh, yaws, width=_WIDTH, height=_HEIGHT, framed_by=_room(model), lighting=_LIGHT)
     return row if label is None else caption(row, label)
+
+
+def _room(model: HeadModel) -> Mesh:
+    """A mesh as large as heads of the model get: the mean's vertices, three deviations of each out of its middle."""
+    mean = model.shape.mean
+    spread = model.shape.modes.square().sum(0).sqrt()
+    return Mesh(mean + 3 * spread * (mean - mean.mean(0)).sign(), model.faces)

@@ -14,6 +14,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Top
 from torchface.geometry.calibration import CameraCalibration
 from torchface.geometry.camera import Camera
 from torchface.io import load_rig, save_calibration, save_rig
+from torchface.io.ict_facekit import region
 from torchface.io.images import load_image
 from torchface.io.landmarks import load_landmark_points, save_pts
 from torchface.io.landmarks_dlib import load_dlib_faces
@@ -86,6 +87,7 @@ def fit_photographs(
     progress: Callable[[str], None] | None = None,
     landmark_model: str | Path = DEFAULT_LANDMARKS,
     names: Naming | None = None,
+    part: str | None = None,
 ) -> FittedHead:
     """Fits a head to photographs of one person with one expression and writes it as a rig.
 
@@ -95,7 +97,8 @@ def fit_photographs(
             where there are none they are found, and written as .pts beside ``out``.
         model: a head model by name or folder; see ``zoo.get_model``.
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
-        template: a rig with the model's topology; the embedded performer where its topology is the model's.
+        template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
+            topology is the model's.
         focal: length in pixels where it is known.
         settings: how landmarks are trusted.
         face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
@@ -103,6 +106,7 @@ def fit_photographs(
         progress: called with a line before each step.
         landmark_model: finds landmarks where no file gives them; by name or folder.
         names: of the written shapes; see ``rig_names.renamed``.
+        part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
 
     Raises:
         NoFaceError: landmarks are to be found where no face is.
@@ -113,8 +117,7 @@ def fit_photographs(
     say = progress or (lambda line: None)
     check_out(out)
     say("reading the model")
-    heads = load_head_model(model)
-    rig = matching_template(heads, template)
+    heads, rig = matching(load_head_model(model), template, part)
     say(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
     found: list[FoundLandmarks] = []
@@ -166,21 +169,45 @@ def load_head_model(name_or_path: str | Path) -> HeadModel:
     return found
 
 
-def matching_template(model: HeadModel, template: Path | None) -> BlendshapeRig:
-    """The rig whose shapes the head is to have.
+def matching(
+    model: HeadModel, template: Path | None = None, part: str | None = None
+) -> tuple[HeadModel, BlendshapeRig]:
+    """A model, and the rig whose shapes its heads are to have, of one topology.
+
+    Args:
+        model: of heads.
+        template: a rig; the one that travels with the model if absent, else the embedded performer.
+        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
 
     Raises:
-        TopologyError: the rig, or without one the embedded performer, has another topology than the model.
+        TopologyError: the rig has another topology than the model.
+        NameMismatchError: no such part.
     """
-    rig = performer() if template is None else load_rig(template)
-    if len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu()):
-        return rig
-    source = "the embedded performer" if template is None else str(template)
+    source, rig = "the model's own rig", model.rig
+    if template is not None:
+        source, rig = str(template), load_rig(template)
+    elif rig is None:
+        source, rig = "the embedded performer", performer()
+    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
+    if part is not None:
+        keep = region(rig.neutral, part)
+        if same_topology(model, rig):
+            model = model.part(keep)
+        rig = rig.part(keep)
+    if same_topology(model, rig):
+        return model, rig
+    count = len(model.shape.mean)
+    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
+    hint = "; name a rig with --template whose topology is the model's" if template is None else ""
     raise TopologyError(
         f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
-        f"{len(model.shape.mean)} and {len(model.faces)}"
-        + (" (name a rig with --template)" if template is None else "")
+        f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
     )
+
+
+def same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:
+    """Whether a model's heads have the rig's triangles."""
+    return len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu())
 
 
 def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int | None = None) -> list[Tensor]:

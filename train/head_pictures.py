@@ -1,0 +1,66 @@
+"""The pictures that lie beside a head model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.samples import Samples, blocks
+from torchface.modeling import HeadModel
+from torchface.modeling.model_quality import ModelQuality
+from torchface.rendering.compositing import save_picture
+from torchface.viz.model_pictures import (
+    color_modes_picture,
+    far_picture,
+    modes_picture,
+    morph_picture,
+    quality_picture,
+    random_picture,
+    scatter_picture,
+)
+
+
+def draw(
+    model: HeadModel,
+    folder: Path,
+    seed: int,
+    quality: ModelQuality | None,
+    learn: Samples | None,
+    test: Samples | None,
+    say: Callable[[str], None],
+) -> None:
+    """Writes the pictures into a folder.
+
+    Args:
+        model: of heads.
+        folder: made where it is missing.
+        seed: draws random heads.
+        quality: its curves, if it was measured.
+        learn, test: the heads that it has learned from and others, where there are any.
+        say: told which picture is drawn.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    known, others = (
+        torch.cat([model.shape.project(part.read(*block)) for block in blocks(part)])
+        if part is not None and part.shape[0]
+        else None
+        for part in (learn, test)
+    )
+    pictures: dict[str, Callable[[], Tensor]] = {
+        "modes": lambda: modes_picture(model),
+        "random": lambda: random_picture(model, seed=seed),
+        "morph": lambda: morph_picture(model, seed=seed),
+        "far": lambda: far_picture(model, seed=seed),
+    }
+    if known is not None:
+        pictures["components"] = lambda: scatter_picture(model.shape, known, others)
+    if model.color is not None:
+        pictures["color_modes"] = lambda: color_modes_picture(model)
+    if quality is not None:
+        pictures["quality"] = lambda: quality_picture(quality)
+    for number, (name, picture) in enumerate(pictures.items(), 1):
+        say(f"drawing {name}.png, picture {number} of {len(pictures)}")
+        save_picture(picture(), folder / f"{name}.png")
