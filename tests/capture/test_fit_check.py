@@ -25,9 +25,12 @@ def sites(rig: BlendshapeRig, attachment: Attachment) -> Tensor:
     return torch.cat([solver.rest[..., None], solver.basis], dim=2)
 
 
-def filmed(performance: Performance, flaws: StageFlaws = StageFlaws(missing=0.02)) -> Tensor:
+GAPS = StageFlaws(missing=0.02)
+
+
+def filmed(performance: Performance, flaws: StageFlaws = GAPS) -> Tensor:
     rig, attachment, takes = performance
-    take = record(rig, attachment, takes[0][::24], torch.Generator().manual_seed(0), flaws).take
+    take = record(rig, attachment, takes[0][::24], torch.Generator().manual_seed(0), flaws, fps=2.5).take
     assert take.markers is not None
     return take.markers.values
 
@@ -35,7 +38,7 @@ def filmed(performance: Performance, flaws: StageFlaws = StageFlaws(missing=0.02
 @pytest.mark.parametrize(
     "flaws",
     [
-        StageFlaws(missing=0.02),
+        GAPS,
         StageFlaws(noise=1.0),
         StageFlaws(missing=0.1, swaps=30, swap_seconds=3),
         StageFlaws(missing=0.6),

@@ -12,8 +12,8 @@ from torchface.capture.markers.rest_pose import pose_of_take, solve_weights
 from torchface.geometry.alignment import Similarity, similarity_transform
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
-# fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, label swaps and gaps included; those of another head's
-# rig, laid on it, and markers 3 mm off the skin within 0.03. A take moved by 5 mm has 0.03, one moved by 10 mm or turned
+# fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, swaps and gaps included; those of another head's rig,
+# laid on it, and markers 3 mm off the skin within 0.03. A take moved by 5 mm has 0.03, one moved by 10 mm or turned
 # by 5 degrees 0.05 to 0.06, sites 2 to 8 mm wrong 0.07, a helmet that slips by 10 mm 0.09, a take moved by 20 mm 0.13,
 # sites of the marker next to each 0.2, another head's attachment 0.8 to 1.3, centimetres or metres read as millimetres
 # 1.4 to 1.6.
@@ -54,7 +54,7 @@ class FitCheck:
 
     @property
     def unit(self) -> str:
-        """What the coordinates seem to be in, taken that they were read as millimetres; ``mm`` if they are too large."""
+        """What the coordinates seem to be in that were read as millimetres; ``mm`` if they are too large."""
         if self.similarity is None:
             return "mm"
         return unit_of_scale(float(self.similarity.scale[0])) or "mm"
@@ -63,10 +63,10 @@ class FitCheck:
 def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     """Solves some frames of a take for weights, and where markers stay far from the rig looks for the cause.
 
-    Weights are solved with hardly a price, so that nothing but what the rig cannot do is left. Where the median distance
-    is more than noise makes, the take is laid on the rig by one similarity, then by a rigid motion a frame; what leaves
-    less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Label swaps, spikes
-    and markers that fell off move the median little: they are no cause.
+    Weights are solved with hardly a price, so that nothing but what the rig cannot do is left. Where the median
+    distance is more than noise makes, the take is laid on the rig by one similarity, then by a rigid motion a frame;
+    what leaves less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Label
+    swaps, spikes and markers that fell off move the median little: they are no cause.
 
     Args:
         affine: where each marker's site goes with the weights, (M,3,N+1), mm: at rest, then what each shape adds.
@@ -97,12 +97,13 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         return _with_slip(affine, few, found)
     found = replace(found, similarity=pose)
     mended = _distance(affine, laid)
+    if mended > TRIED_SHARE * spread and not _is_elsewhere(pose, few, spread):
+        steady = _distance(affine, _without_motion(affine, laid))
+        if steady < _MENDED * mended:
+            return replace(found, cause="slip", mended=steady)
     if mended < _MENDED * apart:
         cause = "unit" if unit_of_scale(float(pose.scale[0])) else "alignment"
         return replace(found, cause=cause, mended=mended)
-    mended = _distance(affine, _without_motion(affine, laid))
-    if mended < _MENDED * apart:
-        return replace(found, cause="alignment" if slip else "slip", mended=mended)
     return _otherwise(found)
 
 
