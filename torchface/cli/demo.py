@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.table import Table
@@ -15,7 +16,6 @@ def demo(
     target: Path | None = None,
     out: Path = Path("out/demo"),
     seed: int = 1,
-    markers: int = 100,
     quiet: bool = False,
 ) -> None:
     """Run the main job from end to end and open the result in a browser: OUT/index.html.
@@ -30,19 +30,24 @@ def demo(
         target: Neutral mesh with the template's topology; ICT-FaceKit's folder needs none (a random head is drawn).
         out: Folder for the report, rig, take, weights, animation and solver.
         seed: Decides the random head, the noise and the gaps.
-        markers: How many markers the head wears.
         quiet: Show no progress.
     """
     from torchface.workflows.demo import run_demo, scene_from
-    from torchface.workflows.demo_page import result_rows, write_demo_page
+    from torchface.workflows.demo_page import result_rows, scene_rows, write_demo_page
 
     with steps(quiet) as step:
         step("preparing head and take")
         scene = scene_from(template, take, target, seed)
-        result = run_demo(scene, out, seed, markers, progress=step)
+        result = run_demo(scene, out, seed, progress=step)
         page = write_demo_page(result, out, step)
-    table = Table(title=scene.title, show_header=False)
-    for row in [*result_rows(result), *result.solver.rows()]:
-        table.add_row(*row)
-    console.print(table)
+    console.print(_table(scene.title, scene_rows(result)))
+    console.print(_table("against the truth", result_rows(result), ("", "whole take", "frame by frame")))
+    console.print(_table("solver.onnx", result.solver.rows()))
     print(page)
+
+
+def _table(title: str, rows: Sequence[Sequence[str]], heading: Sequence[str] = ("", "")) -> Table:
+    table = Table(*heading, title=title, show_header=any(heading))
+    for row in rows:
+        table.add_row(*row)
+    return table

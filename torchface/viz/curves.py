@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.rendering.compositing import from_figure
 
-SOLVED, TRUE = "#1f5fa8", "#d9822b"
+SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
@@ -42,6 +42,42 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
         axes.set_ylim(0, None if label == "sum of weights" else 1.02)
     rows[0].legend(loc="upper right", frameon=False, ncols=2, fontsize=8)
     rows[-1].set(xlabel="seconds", xlim=(0, float(seconds[-1])))
+    return from_figure(figure)
+
+
+def compared_curves(
+    true: Tensor,
+    smooth: Tensor,
+    single: Tensor,
+    names: Sequence[str],
+    fps: float,
+    first: int = 0,
+    last: int | None = None,
+) -> Tensor:
+    """True curves (T,N), those of the take solved at once and those of single frames, in two columns; (3,H,W).
+
+    Args:
+        true, smooth, single: weights (T,N).
+        names: of the shapes, N.
+        fps: frames a second.
+        first, last: the frames that are drawn.
+    """
+    lines = -(-len(names) // 2)
+    figure = Figure(figsize=(12, 1.7 * lines), dpi=100, layout="constrained")
+    grid = figure.subplots(lines, 2, sharex=True, squeeze=False).flatten()
+    stretch = slice(first, last)
+    seconds = torch.arange(len(true))[stretch] / fps
+    for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
+        axes.plot(seconds, single[stretch, i], color=SINGLE, linewidth=0.7, label="frame by frame")
+        axes.plot(seconds, true[stretch, i], color=TRUE, linewidth=2.4, alpha=0.85, label="true")
+        axes.plot(seconds, smooth[stretch, i], color=SOLVED, linewidth=1.1, label="solved at once")
+        axes.set_title(name, fontsize=9, loc="left")
+        axes.set(ylim=(0, 1.02), xlim=(float(seconds[0]), float(seconds[-1])))
+    for axes in grid[len(names) :]:
+        axes.axis("off")
+    for axes in grid[-2:]:
+        axes.set_xlabel("seconds")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False, ncols=3, fontsize=9)
     return from_figure(figure)
 
 

@@ -18,8 +18,11 @@ from torchface.rendering.shading import CLAY, DEFAULT_LIGHTING, Lighting, render
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 
 
-def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
-    """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh."""
+def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
+    """What to look at, (3,), and how many millimetres a picture of ``aspect`` (width over height) is to be high.
+
+    Round the landmarks or the ``face`` region where annotated, else the whole mesh.
+    """
     points, room, shift = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
         # Landmarks end at the brows: leave room for the forehead, and turn about a point inside the head.
@@ -28,7 +31,12 @@ def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 
         points, room = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
     centre = (low + high) / 2 + torch.tensor(shift).to(low) * float(high[1] - low[1])
-    span = room * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) * height / width))
+    return centre, room * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+
+
+def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
+    """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh."""
+    centre, span = framing(mesh, width / height)
     return look_at(centre, yaw, pitch, span=span, width=width, height=height)
 
 

@@ -23,16 +23,10 @@ _LIFT = 0.5
 
 def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] = (FRONT, THREE_QUARTER)) -> Tensor:
     """Sites before and after (M,3) on views of a face, joined by lines, those that face the viewer; (3,H,W)."""
-    normals = vertex_normals(mesh.vertices.double(), mesh.faces)
-    nearest = torch.cdist(after.double(), mesh.vertices.double()).argmin(1)
-    caster = RayCaster(mesh.vertices.double(), mesh.faces)
     pictures = []
     for yaw in yaws:
         camera = frame_face(mesh, yaw, width=560, height=700)
-        turn = math.radians(yaw)
-        toward = torch.tensor([math.sin(turn), 0.0, math.cos(turn)], dtype=torch.float64)
-        lifted = after.double() + _LIFT * normals[nearest]
-        shown = (normals[nearest] @ toward > 0) & ~caster.occluded(lifted, toward.expand_as(lifted))
+        shown = facing(mesh, after, yaw)
         old, new = camera.project(before[shown].double()), camera.project(after[shown].double())
         image = render(mesh, camera, clay_colors(mesh), samples=2)
         figure = Figure(figsize=(image.shape[2] / 100, image.shape[1] / 100), dpi=100)
@@ -47,6 +41,18 @@ def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] 
         axes.legend(loc="upper right", frameon=False)
         pictures.append(from_figure(figure))
     return sheet(pictures, len(pictures))
+
+
+def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
+    """Which points on a mesh, (M,3), a viewer sees who looks from ``yaw`` degrees, (M,) bool."""
+    normals = vertex_normals(mesh.vertices.double(), mesh.faces)
+    normals = normals[torch.cdist(points.double(), mesh.vertices.double()).argmin(1)]
+    turn = math.radians(yaw)
+    toward = torch.tensor([math.sin(turn), 0.0, math.cos(turn)], dtype=torch.float64)
+    lifted = points.double() + _LIFT * normals
+    return (normals @ toward > 0) & ~RayCaster(mesh.vertices.double(), mesh.faces).occluded(
+        lifted, toward.expand_as(lifted)
+    )
 
 
 def error_rounds(errors: Tensor) -> Tensor:

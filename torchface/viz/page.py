@@ -1,4 +1,4 @@
-"""A report as one HTML page with pictures beside it; opens in any browser, needs no script and no network."""
+"""A report as one HTML page with pictures beside it; opens in any browser, from disk, without a network."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ img { max-width: 100%; height: auto; display: block; margin: .6rem 0 }
 table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8rem .15rem 0; text-align: left }
 td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
 thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
-p { max-width: 60rem }
+p { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
 """
+# Characters beyond which a cell is text, not a figure.
+_LONG = 60
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,13 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading, a paragraph, then tables and pictures (3,H,W) by file name, in this order."""
+    """A heading, a paragraph, ready-made HTML, then tables and pictures (3,H,W) by file name, in this order."""
 
     title: str
     text: str = ""
     tables: Sequence[Table] = ()
     pictures: Sequence[tuple[str, Tensor]] = ()
+    markup: str = ""
 
 
 def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
@@ -57,6 +60,7 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
         parts.append(f"<h2>{html.escape(section.title)}</h2>\n")
         if section.text:
             parts.append(f"<p>{html.escape(section.text)}</p>\n")
+        parts.append(section.markup)
         parts.extend(_table(table) for table in section.tables)
         for name, picture in section.pictures:
             save_picture(picture, folder / name)
@@ -69,7 +73,10 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
 
 def _table(table: Table) -> str:
     def row(cells: Sequence[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+        tags = [f'{tag} class="long"' if len(cell) > _LONG else tag for cell in cells]
+        return (
+            "<tr>" + "".join(f"<{a}>{html.escape(cell)}</{tag}>" for a, cell in zip(tags, cells, strict=True)) + "</tr>"
+        )
 
     body = "\n".join(row(cells, "td") for cells in table.rows)
     return f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"

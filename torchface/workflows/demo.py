@@ -6,6 +6,7 @@ to disk as C3D, comes back, is solved with the transferred rig, and what came ba
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,10 +15,10 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture import MarkerSolver
+from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.capture.markers import Observability, observability
 from torchface.errors import TopologyError, ValueRangeError
-from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error
+from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error, weight_jitter
 from torchface.io import (
     IdentityModes,
     load_identity_modes,
@@ -31,14 +32,17 @@ from torchface.io import (
 )
 from torchface.io.ict_facekit import is_ict_folder
 from torchface.io.live_link import save_live_link
+from torchface.io.weights import save_weights_csv
 from torchface.mesh import Mesh
 from torchface.modeling.transfer import TransferReport, transfer_with_report
 from torchface.onnx import SolverReport, export_solver
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.makeup_layout import MakeupLayout, makeup_layout
 from torchface.synthetic.marker_stage import Recording, StageFlaws, place_markers, record
 from torchface.synthetic.performance import perform
-from torchface.take import Take, Track
+from torchface.take import Take
 
 Progress = Callable[[str], None]
 
@@ -68,6 +72,30 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
+class Solved:
+    """Weights beside the true ones.
+
+    Args:
+        weights: (T,N).
+        weight_error, mesh_error: against the truth; the mesh's over the face.
+        marker_rmse: (T,), millimetres, against the markers as seen.
+        jitter: how many times as much as the true weights they tremble; see ``torchface.evaluation.weight_jitter``.
+    """
+
+    weights: Tensor
+    weight_error: WeightError
+    mesh_error: MeshError
+    marker_rmse: Tensor
+    jitter: float
+
+    @property
+    def correlation(self) -> float:
+        """Pearson's, of the median curve with the true one; of those that move at all."""
+        known = self.weight_error.correlation
+        return float(known[torch.isfinite(known)].median())
+
+
+@dataclass(frozen=True, eq=False)
 class DemoResult:
     """What came out, beside what was true.
 
@@ -76,11 +104,12 @@ class DemoResult:
         rig: the template transferred to the head.
         transfer: how that went.
         attachment: where the markers sat.
+        layout: the make-up artist's, which has names for it; none where the rig has too little for one.
         recording: the take with its truth.
-        weights: solved, (T,N).
-        weight_error, mesh_error: against the truth; the mesh's over ``face`` (V,).
-        marker_rmse: (T,), millimetres, against the markers as seen.
-        face: mask (V,) of the vertices that ``mesh_error`` is about.
+        solved: the take solved at once, which is what the files hold.
+        frame_by_frame: every frame on its own.
+        seconds: what the solve at once took.
+        face: mask (V,) of the vertices that the mesh errors are about.
         seen: what the markers can tell of the rig.
         solver: how the exported solver compares.
         files: what was written, by purpose.
@@ -90,11 +119,11 @@ class DemoResult:
     rig: BlendshapeRig
     transfer: TransferReport
     attachment: Attachment
+    layout: MakeupLayout | None
     recording: Recording
-    weights: Tensor
-    weight_error: WeightError
-    mesh_error: MeshError
-    marker_rmse: Tensor
+    solved: Solved
+    frame_by_frame: Solved
+    seconds: float
     face: Tensor
     seen: Observability
     solver: SolverReport
@@ -168,7 +197,6 @@ def run_demo(
     scene: Scene,
     out: Path,
     seed: int = 0,
-    markers: int = 100,
     flaws: StageFlaws = FLAWS,
     progress: Progress | None = None,
 ) -> DemoResult:
@@ -178,7 +206,6 @@ def run_demo(
         scene: see ``embedded_scene`` and ``scene_from``.
         out: the folder; made if absent.
         seed: of noise and gaps.
-        markers: how many, M.
         flaws: of the stage.
         progress: called with a line before each step.
 
@@ -204,36 +231,51 @@ def run_demo(
     save_mesh(replace(scene.head, texture=None), files["new head"])
     save_rig(rig, files["transferred rig"])
     say("filming the markers")
-    attachment = place_markers(scene.truth, markers)
+    layout = _layout(scene.truth)
+    attachment = place_markers(scene.truth) if layout is None else layout.attachment
     attachment.save(files["marker sites"])
     generator = torch.Generator().manual_seed(seed)
     recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
     save_take(recording.take, files["marker take"])
     say("solving the take")
     marker_solver = MarkerSolver(rig, attachment)
-    solved = marker_solver.solve_take(load_take(files["marker take"]))
-    weights = solved.weights
-    markers_seen = recording.take.markers
-    assert weights is not None
-    assert markers_seen is not None
+    filmed = load_take(files["marker take"])
+    started = time.perf_counter()
+    solved = WholeTakeSolver(marker_solver).solve_take(filmed)
+    seconds = time.perf_counter() - started
+    single = marker_solver.solve_take(filmed)
     say("writing weights, animation and solver")
-    save_live_link(solved, files["solved weights"])
+    live = bool(mapping(rig.names, ARKIT).any())
+    (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
     save_animation(rig, solved, files["animated rig"])
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
     seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
     solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
     say("comparing with the truth")
     face = face_mask(scene.head)
+
+    def compared(take: Take) -> Solved:
+        assert take.weights is not None
+        assert recording.take.markers is not None
+        weights = take.weights.values[..., 0].float()
+        return Solved(
+            weights,
+            weight_error(weights, scene.weights),
+            mesh_error(rig, weights, scene.truth, scene.weights, face),
+            marker_rmse(rig, attachment, weights, recording.take.markers.values),
+            weight_jitter(weights) / max(weight_jitter(scene.weights), 1e-12),
+        )
+
     return DemoResult(
         scene,
         rig,
         transferred.report,
         attachment,
+        layout,
         recording,
-        weights.values[..., 0],
-        weight_error(weights.values[..., 0], scene.weights),
-        mesh_error(rig, weights.values[..., 0], scene.truth, scene.weights, face),
-        marker_rmse(rig, attachment, weights.values[..., 0], markers_seen.values),
+        compared(solved),
+        compared(single),
+        seconds,
         face,
         observability(marker_solver),
         solver,
@@ -241,13 +283,15 @@ def run_demo(
     )
 
 
+def _layout(rig: BlendshapeRig) -> MakeupLayout | None:
+    try:
+        return makeup_layout(rig)
+    except ValueRangeError:  # neither landmarks nor names to go by
+        return None
+
+
 def face_mask(mesh: Mesh) -> Tensor:
     """The annotated region ``face`` (V,), or every vertex where there is none."""
     if mesh.annotations is not None and "face" in mesh.annotations.regions:
         return mesh.annotations.regions["face"]
     return torch.ones(len(mesh.vertices), dtype=torch.bool)
-
-
-def as_take(weights: Tensor, names: tuple[str, ...], fps: float) -> Take:
-    """Weights (T,N) as a take."""
-    return Take(fps, weights=Track(names, weights[..., None]))

@@ -1,8 +1,8 @@
-"""The demo's report: what was true, what came back, in pictures, curves and one table."""
+"""The demo's report: what was true and what came back, as a performance that plays, in pictures, curves and tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,11 +11,13 @@ from torch import Tensor
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, headed, sheet
 from torchface.shape_names import ARKIT, mapping
-from torchface.viz.curves import error_curve, named_bars, weight_curves
+from torchface.viz.curves import compared_curves, error_curve, named_bars
 from torchface.viz.faces import FRONT, THREE_QUARTER, face_views, heat_map
+from torchface.viz.marker_maps import marker_regions
 from torchface.viz.markers import marker_views
 from torchface.viz.page import Section, Table, write_page
-from torchface.workflows.demo import FLAWS, DemoResult
+from torchface.viz.player import Markers, Panel, Played, Player, write_player
+from torchface.workflows.demo import FLAWS, DemoResult, Solved
 
 _POSES: dict[str, dict[str, float]] = {
     "neutral": {},
@@ -24,32 +26,54 @@ _POSES: dict[str, dict[str, float]] = {
     "jaw open": {"jawOpen": 1.0},
     "pucker": {"mouthPucker": 1.0},
 }
+_ACTIVE = 8
+_CURVE_SECONDS = 8.0
+_HEAT_MAXIMUM = 2.0
 
 
-def result_rows(result: DemoResult) -> list[tuple[str, str]]:
-    """The figures of a demo, one a row: what, value."""
-    weights, mesh = result.weight_error, result.mesh_error
-    names = result.scene.truth.names
+def result_rows(result: DemoResult) -> list[tuple[str, str, str]]:
+    """The figures of a demo, one a row: what, of the take solved at once, frame by frame."""
+    names = result.rig.names
+    told = _told_apart(result)
+    solves = (result.solved, result.frame_by_frame)
+
+    def row(what: str, value: Callable[[Solved], str]) -> tuple[str, str, str]:
+        return (what, value(solves[0]), value(solves[1]))
+
+    def worst(solved: Solved) -> str:
+        shape = int(told[solved.weight_error.mean[told].argmax()])
+        return f"{float(solved.weight_error.mean[shape]):.3f} ({names[shape]})"
+
+    def median(values: Tensor) -> str:
+        return f"{float(values[torch.isfinite(values)].median()):.3f}"
+
+    return [
+        row("mesh error, mean over face and take", lambda s: f"{s.mesh_error.mean:.3f} mm"),
+        row("mesh error as a share of the motion", lambda s: f"{100 * s.mesh_error.relative:.1f} %"),
+        row("mesh error, worst vertex of any frame", lambda s: f"{float(s.mesh_error.vertex_largest.max()):.2f} mm"),
+        row("jitter of the curves, times the true ones'", lambda s: f"{s.jitter:.1f}"),
+        row("correlation with the true curve, median shape", lambda s: f"{s.correlation:.3f}"),
+        row("the same of the shapes told apart", lambda s: median(s.weight_error.correlation[told])),
+        row("weight error, mean", lambda s: f"{float(s.weight_error.mean.mean()):.4f}"),
+        row("weight error of the shapes told apart, mean", lambda s: f"{float(s.weight_error.mean[told].mean()):.4f}"),
+        row("weight error of those, worst shape", worst),
+        row("marker RMSE, median frame", lambda s: f"{float(s.marker_rmse.nanmedian()):.3f} mm"),
+    ]
+
+
+def scene_rows(result: DemoResult) -> list[tuple[str, str]]:
+    """What was played, one a row: what, value."""
     markers = result.recording.take.markers
     assert markers is not None
-    sampled = torch.isfinite(markers.values).all(-1).float()
-    told = _told_apart(result)
-    worst = int(told[weights.mean[told].argmax()])
-    curves = weights.correlation[told]
-    noise = (3**0.5) * FLAWS.noise
+    missing = 1 - float(torch.isfinite(markers.values).all(-1).float().mean())
+    scene = result.scene
     return [
-        ("frames", f"{len(result.weights)} at {result.scene.fps:g} a second"),
-        ("shapes, vertices", f"{len(names)}, {len(result.scene.head.vertices):,}"),
-        ("markers, share of samples missing", f"{sampled.shape[1]}, {100 * (1 - float(sampled.mean())):.1f} %"),
-        ("shapes that these markers tell apart", f"{len(told)}"),
-        ("weight error of those, mean", f"{float(weights.mean[told].mean()):.4f}"),
-        ("weight error of those, worst", f"{float(weights.mean[worst]):.4f} ({names[worst]})"),
-        ("their correlation with the true curve, median", f"{float(curves[torch.isfinite(curves)].median()):.4f}"),
-        ("weight error of all shapes, mean", f"{float(weights.mean.mean()):.4f}"),
-        ("marker RMSE, median frame", f"{float(result.marker_rmse.nanmedian()):.3f} mm (noise alone: {noise:.2f} mm)"),
-        ("mesh error, mean over face and take", f"{mesh.mean:.3f} mm"),
-        ("mesh error as a share of the motion", f"{100 * mesh.relative:.1f} %"),
-        ("mesh error, worst vertex of any frame", f"{float(mesh.vertex_largest.max()):.2f} mm"),
+        ("frames", f"{len(scene.weights):,} at {scene.fps:g} a second"),
+        ("shapes, vertices", f"{len(result.rig.names)}, {len(scene.head.vertices):,}"),
+        ("markers, share of samples missing", f"{len(markers.names)}, {100 * missing:.1f} %"),
+        ("marker noise, RMSE that it alone makes", f"{FLAWS.noise:g} mm a coordinate, {(3**0.5) * FLAWS.noise:.2f} mm"),
+        ("shapes that these markers tell apart", f"{len(_told_apart(result))} of {len(result.rig.names)}"),
+        ("the solve of the whole take", f"{result.seconds:.1f} s"),
     ]
 
 
@@ -64,25 +88,61 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
     """Renders the report of a demo into a folder and returns the page's path."""
     say = progress or (lambda line: None)
     scene = result.scene
+    names, told = result.rig.names, _told_apart(result)
+    telling = _telling_frame(result)
+    active = scene.weights[:, told].std(0).argsort(descending=True)[:_ACTIVE]
+    active = told[active]
+    say("writing the performance for the page")
+    markup = _player(result, out, telling, [names[i] for i in active.tolist()])
     say("rendering the rig")
     rig_picture = _rig_picture(result)
-    say("rendering the performance")
-    frames = _telling_frames(result)
-    performance = [(f"frame_{i + 1}.png", _frame_picture(result, frame)) for i, frame in enumerate(frames)]
-    say("drawing curves")
-    on_mesh = result.attachment.on(scene.head.faces, result.rig(result.weights[frames[:1]]))[0]
+    frame_picture = _frame_picture(result, telling)
+    say("drawing curves and markers")
+    solved, single = result.solved, result.frame_by_frame
+    first = _busiest(scene.weights[:, active], round(_CURVE_SECONDS * scene.fps))
+    curves = compared_curves(
+        *(weights[:, active] for weights in (scene.weights, solved.weights, single.weights)),
+        [names[i] for i in active.tolist()],
+        scene.fps,
+        first,
+        first + round(_CURVE_SECONDS * scene.fps),
+    )
     markers = result.recording.take.markers
     assert markers is not None
-    told = _told_apart(result)
-    names = [scene.truth.names[i] for i in told]
+    on_mesh = result.attachment.on(scene.head.faces, result.rig(solved.weights[telling : telling + 1]))[0]
     sections = [
+        Section("The performance", _story(result), markup=markup),
         Section(
-            "What was true and what came back",
-            "The take was filmed from the head's true rig; the solver knew only the rig transferred from the template. "
-            f"What no marker can show, no solve can return: {result.seen}.",
+            "One frame",
+            "The true and the solved face, and the distance between them.",
+            pictures=[("frame_1.png", frame_picture)],
+        ),
+        Section(
+            "How close it came",
+            "weights.csv and animation.glb hold the take solved at once; torchface solve --frame-by-frame gives the "
+            "other, which trembles with the markers' noise.",
             [
-                Table(("the solved take", "value"), result_rows(result)),
-                Table(("solver.onnx", ""), result.solver.rows()),
+                Table(("against the truth", "whole take", "frame by frame"), result_rows(result)),
+                Table(("what was played", ""), scene_rows(result)),
+            ],
+        ),
+        Section(
+            "Curves",
+            f"{_CURVE_SECONDS:g} s of the {len(active)} most active shapes that the markers tell apart.",
+            pictures=[("curves.png", curves)],
+        ),
+        Section(
+            "Markers",
+            _layout_text(result),
+            [Table(("the markers", "shapes"), _seen_rows(result))],
+            _layout_pictures(result),
+        ),
+        Section(
+            "Markers against the solved face",
+            f"Their distance; noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
+            pictures=[
+                ("markers.png", marker_views(markers.values[telling], on_mesh, f"frame {telling},")),
+                ("marker_rmse.png", error_curve(solved.marker_rmse, scene.fps)),
             ],
         ),
         Section(
@@ -91,34 +151,91 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
             pictures=[("rig.png", rig_picture)],
         ),
         Section(
-            "The performance",
-            "Above the true and the solved face, below the distance between them. Eyes that no marker follows stay "
-            "where they are.",
-            pictures=performance,
-        ),
-        Section(
-            "Markers",
-            "Seen markers and the points of the solved mesh that stand for them, then their distance over the take; "
-            f"noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
+            "Error of each shape",
+            "Of the shapes that the markers tell apart.",
             pictures=[
-                ("markers.png", marker_views(markers.values[frames[0]], on_mesh, f"frame {frames[0]},")),
-                ("marker_rmse.png", error_curve(result.marker_rmse, scene.fps)),
-            ],
-        ),
-        Section(
-            "Weights",
-            "The shapes that the markers tell apart: their sum, the curves that move most, the error of each.",
-            pictures=[
-                ("weights.png", weight_curves(result.weights[:, told], scene.weights[:, told], names, scene.fps)),
-                ("weight_error.png", named_bars(result.weight_error.mean[told], names, "mean absolute error")),
+                (
+                    "weight_error.png",
+                    named_bars(solved.weight_error.mean[told], [names[i] for i in told], "mean absolute error"),
+                )
             ],
         ),
         Section(
             "Files",
-            tables=[Table(("what it is", "file"), [(purpose, path.name) for purpose, path in result.files.items()])],
+            tables=[
+                Table(("what it is", "file"), [(purpose, path.name) for purpose, path in result.files.items()]),
+                Table(("solver.onnx", ""), result.solver.rows()),
+            ],
         ),
     ]
     return write_page(out, scene.title, sections)
+
+
+def _story(result: DemoResult) -> str:
+    """The demo in one sentence."""
+    mesh, markers = result.solved.mesh_error, len(result.attachment.triangles)
+    length = len(result.scene.weights) / result.scene.fps
+    return (
+        f"A head that nobody had rigged was given the template's {len(result.rig.names)} shapes and {markers} markers, "
+        f"and what it played in {length:.0f} s came back from the noisy markers, gaps and all, on average "
+        f"{mesh.mean:.2f} mm from the truth: {100 * mesh.relative:.0f} % of how far the face moved."
+    )
+
+
+def _player(result: DemoResult, out: Path, start: int, curves: Sequence[str]) -> str:
+    markers = result.recording.take.markers
+    assert markers is not None
+    scene = result.scene
+    takes = [
+        Played("true", scene.truth, scene.weights),
+        Played("whole take", result.rig, result.solved.weights),
+        Played("frame by frame", result.rig, result.frame_by_frame.weights),
+    ]
+    panels = [Panel("true, with its markers", 0, markers=True), Panel("solved"), Panel("distance", error=True)]
+    filmed = Markers(markers.select(result.attachment.labels or ()).values)
+    return write_player(Player(takes, panels, scene.fps, (1, 2), 0, curves, filmed, _HEAT_MAXIMUM, start), out)
+
+
+def _layout_text(result: DemoResult) -> str:
+    if result.layout is None:
+        return "Spread over the skin that moves: the rig has neither 68 landmarks nor ARKit's names to go by."
+    return "Set by muscles, as a make-up artist sets them for facial action coding; attachment.json has their names."
+
+
+def _layout_pictures(result: DemoResult) -> list[tuple[str, Tensor]]:
+    points = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices)
+    regions = ("markers",) * len(points) if result.layout is None else result.layout.regions
+    return [("layout.png", marker_regions(result.scene.head, points, regions))]
+
+
+def _seen_rows(result: DemoResult) -> list[tuple[str, str]]:
+    """What the markers see, what they mix up, what they do not see."""
+    seen = result.seen
+    told = [name for name in result.rig.names if name not in {*seen.unseen, *seen.ambiguous}]
+    rows = [("tell apart", told), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
+    return [(what, f"{len(shapes)}: {_both_sides(shapes)}") for what, shapes in rows if shapes]
+
+
+def _both_sides(names: Sequence[str]) -> str:
+    """Names in a row, those of both sides once."""
+    short = []
+    for name in names:
+        bare = name
+        for left, right in (("Left", "Right"), ("_L", "_R")):
+            for side, other in ((left, right), (right, left)):
+                if name.endswith(side) and name.removesuffix(side) + other in names:
+                    bare = name.removesuffix(side)
+        bare = name if bare.islower() else bare  # mouthLeft is no side of a shape called mouth
+        if bare not in short:
+            short.append(bare)
+    return ", ".join(short)
+
+
+def _busiest(weights: Tensor, frames: int) -> int:
+    """Where a window of so many frames begins in which the weights (T,N) vary most."""
+    if len(weights) <= frames:
+        return 0
+    return int(weights.unfold(0, frames, 1).std(-1).sum(1).argmax())
 
 
 def _posed(result: DemoResult, weights: dict[str, float]) -> tuple[Mesh, Mesh]:
@@ -145,25 +262,21 @@ def _rig_picture(result: DemoResult) -> Tensor:
     return sheet([*upper, *lower], len(upper))
 
 
-def _telling_frames(result: DemoResult, count: int = 3) -> list[int]:
-    """The frame in which the markers are farthest from rest, then those that differ most from the ones before."""
-    moved = result.recording.markers.flatten(1)
+def _telling_frame(result: DemoResult) -> int:
+    """The frame in which the markers are farthest from rest."""
     rest = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices).flatten()
-    chosen = [int((moved - rest).norm(dim=1).argmax())]
-    for _ in range(count - 1):  # each choice depends on the one before
-        chosen.append(int(torch.cdist(moved, moved[chosen]).amin(1).argmax()))
-    return chosen
+    return int((result.recording.markers.flatten(1) - rest).norm(dim=1).argmax())
 
 
 def _frame_picture(result: DemoResult, frame: int) -> Tensor:
     head = result.scene.head
     true = head.with_vertices(result.scene.truth(result.scene.weights[frame : frame + 1])[0])
-    solved = head.with_vertices(result.rig(result.weights[frame : frame + 1].to(result.rig.deltas))[0])
+    solved = head.with_vertices(result.rig(result.solved.weights[frame : frame + 1].to(result.rig.deltas))[0])
     error = (true.vertices - solved.vertices).norm(dim=1)
     views = (FRONT, THREE_QUARTER)
     row = [
         headed(face_views(true, views, width=240, height=300, framed_by=head), f"true, frame {frame}"),
         headed(face_views(solved, views, width=240, height=300, framed_by=head), "solved"),
     ]
-    heat = heat_map(solved, error, 2.0, "distance, mm", width=240, height=300)
+    heat = heat_map(solved, error, _HEAT_MAXIMUM, "distance, mm", width=240, height=300)
     return sheet([sheet(row, 2), headed(heat, "distance between them")], 1)
