@@ -145,6 +145,20 @@ def pull_term(targets: Tensor, strength: Tensor) -> Quadratic:
     return Quadratic(torch.diag_embed(2 * strength), -2 * strength * targets, (strength * targets.square()).sum(-1))
 
 
+def gaussian_term(mean: Tensor, variance: Tensor) -> Quadratic:
+    r"""How unlikely weights are under a Gaussian of each, :math:`E(w) = \tfrac12 \sum_i (w_i - m_i)^2 / V_i`.
+
+    Which is :math:`-\log p` without its constant.
+
+    Args:
+        mean: :math:`m`, (B,N).
+        variance: :math:`V`, (B,N), positive.
+
+    Source: thesis 4.2.10, equation 65 with its weight 1/V for each shape.
+    """
+    return Quadratic(torch.diag_embed(1 / variance), -mean / variance, 0.5 * (mean.square() / variance).sum(1))
+
+
 def _check_weight(name: str, weight: float | Tensor) -> None:
     if isinstance(weight, Tensor) and weight.is_meta:  # a solver that waits for its state
         return

@@ -10,16 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.energy import Quadratic
+from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.gaussian_process import GaussianProcesses
-from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts
+from torchface.capture.priors.learned_names import require_same_names
+from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts, same_rate
 from torchface.capture.priors.motion_noise import MotionNoise
-from torchface.capture.priors.shape_prior import require_same_names
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _LARGEST = 2**26
 _LONGEST = 120
-_SAME_RATE = 0.02  # relative
 
 
 @dataclass(frozen=True)
@@ -223,8 +222,7 @@ class DynamicsPrior(nn.Module):
 
         Source: thesis 4.2.10, equation 65 with its weight 1/V for each shape.
         """
-        mean, variance = self(windows)
-        return Quadratic(torch.diag_embed(1 / variance), -mean / variance, 0.5 * (mean.square() / variance).sum(1))
+        return gaussian_term(*self(windows))
 
     def require(self, names: Sequence[str]) -> None:
         """Checks that a rig's shapes are the prior's.
@@ -243,11 +241,11 @@ class DynamicsPrior(nn.Module):
         Returns:
             A sentence, or None where the rates are within 2 % of each other.
         """
-        if abs(fps - self.fps) <= _SAME_RATE * self.fps:
+        if same_rate(self.fps, fps):
             return None
         return (
             f"the dynamics prior has learned from {self.fps:g} frames a second and the video has {fps:g}: what it "
-            f"expects of a frame is off by as much (train.priors --fps {fps:g} makes one for this rate)"
+            "expects of a frame is off by as much (adapt_dynamics makes one for this rate)"
         )
 
     @property

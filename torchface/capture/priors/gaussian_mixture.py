@@ -110,6 +110,14 @@ class GaussianMixture(nn.Module):
         pulled = (precision @ self.means.to(samples)[..., None])[..., 0]
         return (share @ precision.flatten(1)).unflatten(1, precision.shape[1:]), -share @ pulled
 
+    def mapped(self, matrix: Tensor, floor: Tensor) -> GaussianMixture:
+        """The density of y = Mx with a variance added to each y; see ``StudentDensity.mapped``."""
+        factors, matrix = self.factors.double(), matrix.to(self.factors.device).double()
+        covariance = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factors @ factors.mT)) @ matrix.T
+        covariance.diagonal(dim1=1, dim2=2).add_(floor.to(covariance))
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+        return GaussianMixture(self.means.double() @ matrix.T, torch.linalg.cholesky(precision), self.log_shares)
+
     def _log_joint(self, samples: Tensor) -> Tensor:
         """:math:`\\log \\pi_k N(x \\mid \\mu_k, \\Sigma_k)`, (B,K)."""
         factors, means = self.factors.to(samples), self.means.to(samples)

@@ -12,6 +12,7 @@ from torchface.errors import ShapeError, ValueRangeError
 
 _REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
 _MOST_ORDERS = 3
+_SAME_RATE = 0.02  # relative
 
 
 def face_regions(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
@@ -83,6 +84,11 @@ def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
     if not len(frames):
         raise ValueRangeError(f"take: found NaN in every window of {window + 1} frames, expected some without")
     return frames[:, :window], frames[:, window]
+
+
+def same_rate(fps: float, other: float) -> bool:
+    """Whether two frame rates are as good as one: 59.94 and 60 frames a second are, 25 and 24 are not."""
+    return abs(fps - other) <= _SAME_RATE * fps
 
 
 def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:

@@ -79,6 +79,10 @@ class ParzenDensity(nn.Module):
         )
         return H, -precision * (share @ self.centers.to(samples))
 
+    def mapped(self, matrix: Tensor, floor: Tensor) -> ParzenDensity:
+        """The density with its centres at Mc, M (E,D); its bells are as wide in every direction, so no floor counts."""
+        return ParzenDensity(self.centers @ matrix.to(self.centers).T, self.bandwidth)
+
     def _log_bells(self, samples: Tensor) -> Tensor:
         squared = torch.cdist(samples, self.centers.to(samples)).square()
         return -0.5 * squared / self.bandwidth.to(samples).square()

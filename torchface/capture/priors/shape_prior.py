@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
+from torchface.capture.priors.learned_names import require_same_names, translation
 from torchface.capture.priors.parzen import ParzenDensity
-from torchface.capture.priors.student import StudentDensity
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.capture.priors.student import PARTING_VARIANCE, StudentDensity
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | GaussianMixture | StudentDensity
@@ -176,6 +177,39 @@ class ShapePrior(nn.Module):
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
 
+    def renamed(self, names: Sequence[str]) -> ShapePrior:
+        """The prior for a rig's shapes, which may have other names: itself where they are the same.
+
+        A whole shape becomes two halves that move together, two halves their mean, as far apart as ``StudentDensity``
+        lets shapes be that always moved together. What the prior has not learned stays near 0, as in a prior that
+        ``train.priors --rig`` learns for these names; see :func:`unlearned`.
+
+        Args:
+            names: of the rig's N shapes.
+
+        Raises:
+            NameMismatchError: less than half of them are among those learned.
+        """
+        if tuple(names) == self.names:
+            return self
+        _, back = translation(self.names, names)
+        home = back.argmax(1)
+        places = {row: place for place, group in enumerate(self.groups) for row in group}
+        # A shape that nothing is known of goes with the first group.
+        member = [places[int(row)] if bool(known) else 0 for row, known in zip(home, back.any(1), strict=True)]
+        split = ((back > 0) & ((back > 0).sum(0) > 1)).any(1)
+        groups, densities = [], []
+        for place, group in enumerate(self.groups):
+            rows = [row for row, found in enumerate(member) if found == place]
+            if rows:
+                floor = torch.where(split | ~back.any(1), PARTING_VARIANCE, 0.0)[rows]
+                groups.append(rows)
+                densities.append(self.densities[place].mapped(back[rows][:, list(group)], floor))  # type: ignore[operator]
+        config = {**self.config, "names": list(names), "groups": groups, "densities": [d.config for d in densities]}
+        other = type(self).from_config(config)
+        other.densities = nn.ModuleList(densities)
+        return other.to(next(self.buffers()))
+
     def require(self, names: Sequence[str]) -> None:
         """Checks that a rig's shapes are the prior's.
 
@@ -280,30 +314,6 @@ class ReciprocalPrior(ShapePrior):
         made = ShapePrior.from_config(config)
         densities: list[Any] = list(made.densities)
         return cls(made.names, made.groups, densities, made.strength, float(config.get("guard", 1e-2)))
-
-
-def require_same_names(learned: Sequence[str], names: Sequence[str]) -> None:
-    """Checks that a rig's shapes are those that a prior was learned for.
-
-    Raises:
-        NameMismatchError: they are others, or in another order.
-    """
-    if tuple(names) == tuple(learned):
-        return
-    lacking = [name for name in learned if name not in set(names)]
-    beyond = [name for name in names if name not in set(learned)]
-    found = []
-    if lacking:
-        found.append(f"{len(lacking)} that the rig lacks ({', '.join(lacking[:3])})")
-    if beyond:
-        found.append(f"none of {len(beyond)} that it has ({', '.join(beyond[:3])})")
-    if not found:
-        row = next(i for i, pair in enumerate(zip(learned, names, strict=False)) if pair[0] != pair[1])
-        found.append(f"{learned[row]} in place {row} where the rig has {names[row]}")
-    raise NameMismatchError(
-        f"prior: learned for other shapes than the rig has: {' and '.join(found)}; expected the same in the same order "
-        "(train.priors --names makes a prior for a rig's names)"
-    )
 
 
 def _chosen_mixture(takes: list[Tensor], seed: int) -> GaussianMixture:

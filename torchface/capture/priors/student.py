@@ -13,6 +13,8 @@ from torchface.capture.priors.parzen import checked_sizes
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _ROUNDS = 50
+PARTING_VARIANCE = 3e-5
+"""Of shapes that always moved together: how far they may part."""
 
 
 class StudentDensity(nn.Module):
@@ -42,7 +44,7 @@ class StudentDensity(nn.Module):
         self.register_buffer("freedom", torch.as_tensor(freedom).detach().float().reshape(()))
 
     @classmethod
-    def fit(cls, samples: Tensor, freedom: float = 10.0, floor: float = 3e-5) -> StudentDensity:
+    def fit(cls, samples: Tensor, freedom: float = 10.0, floor: float = PARTING_VARIANCE) -> StudentDensity:
         r"""The likeliest :math:`\Sigma`, by expectation maximisation in float64.
 
         Args:
@@ -95,6 +97,18 @@ class StudentDensity(nn.Module):
         distance = (samples @ factor).square().sum(1)
         share = (freedom + samples.shape[1]) / (freedom + distance)
         return share[:, None, None] * (factor @ factor.T), torch.zeros_like(samples)
+
+    def mapped(self, matrix: Tensor, floor: Tensor) -> StudentDensity:
+        """The density of y = Mx with a variance added to each y.
+
+        Args:
+            matrix: M, (E,D).
+            floor: (E,), not negative; positive where M makes entries of y depend on each other.
+        """
+        factor, matrix = self.factor.double(), matrix.to(self.factor.device).double()
+        spread = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factor @ factor.T)) @ matrix.T
+        spread.diagonal().add_(floor.to(spread))
+        return StudentDensity(torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(spread))), self.freedom)
 
     @property
     def config(self) -> dict[str, Any]:
