@@ -195,6 +195,30 @@ def test_a_rig_is_predicted_where_it_can_be_and_transferred_elsewhere(performers
         rig_from_neutral(model, template.select(["mouthClose"]), performers[6].neutral)
 
 
+def test_a_rig_of_other_names_is_predicted_too(performers: list[BlendshapeRig]) -> None:
+    """Other spellings are the same shapes; the halves of a whole add up to it, and split it as transfer does."""
+    names = ("jawOpen", "mouthClose", "mouthSmileLeft")
+    neutrals = torch.stack([rig.vertices for rig in performers])
+    shown = torch.stack([rig.vertices + rig.select(names).deltas for rig in performers])
+    model = ExpressionRegression.fit(neutrals[:6], shown[:6], names=names)
+    template = performers[0].select(names)
+    left = template.vertices[:, 0] < 0
+    lips = template.deltas[1]
+    halves = torch.stack([torch.where(left[:, None], lips, 0.0), torch.where(left[:, None], 0.0, lips)])
+    other = BlendshapeRig(
+        template.neutral,
+        torch.cat([template.deltas[[2, 0]], halves]),
+        ("mouthSmile_L", "JawOpen", "mouthClose_L", "mouthClose_R"),
+    )
+    made = rig_from_neutral(model, other, performers[6].neutral)
+    whole = rig_from_neutral(model, template, performers[6].neutral)
+    assert made.names == other.names
+    torch.testing.assert_close(made.deltas[:2], whole.deltas[[2, 0]])
+    torch.testing.assert_close(made.deltas[2:].sum(0), whole.deltas[1], rtol=0, atol=1e-3)
+    middle = template.vertices[:, 0].abs() > 8
+    assert made.deltas[2][middle & ~left].norm(dim=1).max() < 0.05 * whole.deltas[1].norm(dim=1).max()
+
+
 def test_saved_and_loaded(people: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     model = ExpressionRegression.fit(*people, names=["smile", "frown"])
     zoo.save_model(model, tmp_path / "m", licence="MIT", data="noise", metrics={}, recipe="")

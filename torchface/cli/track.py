@@ -47,8 +47,8 @@ def track(
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
         landmarks: Model that finds the 68 landmarks, by name or folder; see `python -m train.landmarks`.
         appearance: Model of the actor's own looks that refines them.
-        prior: What weights faces have, learned for the rig's shapes; see `python -m train.priors`.
-        dynamics: How weights go on from frame to frame, learned for the rig's shapes.
+        prior: What weights faces have, for names of shapes that the rig has too; see `python -m train.priors`.
+        dynamics: How weights go on from frame to frame, at any frame rate.
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
         texture: A picture to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.

@@ -15,6 +15,7 @@ from torchface.modeling.component_choice import choose_components
 from torchface.modeling.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mapping
 
 NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 Form = Literal["offsets", "expressions"]
@@ -219,7 +220,8 @@ class ExpressionRegression(nn.Module):
 def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, neutral: Mesh) -> BlendshapeRig:
     """A whole personal rig from one neutral face.
 
-    Shapes of the template that the regression knows by name are predicted; the others come by deformation transfer.
+    Shapes of the template that the regression knows, in any spelling that ``shape_names`` reads, are predicted; the
+    others come by deformation transfer. A predicted whole is divided between a template's halves as transfer does.
 
     Args:
         regression: in the template's topology.
@@ -247,19 +249,38 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
             f"rig_from_neutral: found a regression of {len(regression.neutral_mean)} vertices, expected the "
             f"neutral's {len(neutral.vertices)}"
         )
-    shared = [name for name in template.names if name in regression.names]
-    if not shared:
+    translation = mapping(regression.names, template.names)
+    known = translation.any(1)
+    if not known.any():
         raise NameMismatchError(
             f"rig_from_neutral: found a regression of {', '.join(regression.names[:5])}, expected some of the "
             f"template's shapes, {', '.join(template.names[:5])}, ..."
         )
     with torch.no_grad():
         predicted = regression.offsets(neutral.vertices[None].float())[0]
+    split = (translation > 0) & ((translation > 0).sum(0) > 1)
     # All of them: a shape that undoes another is transferred on top of it.
-    whole = len(shared) == len(template.names)
-    deltas = torch.zeros_like(template.deltas) if whole else transfer_deformation(template, neutral).deltas.clone()
-    deltas[template.index(shared)] = predicted[[regression.names.index(name) for name in shared]].to(deltas)
-    return BlendshapeRig(neutral, deltas, template.names)
+    needless = bool(known.all()) and not bool(split.any())
+    transferred = torch.zeros_like(template.deltas) if needless else transfer_deformation(template, neutral).deltas
+    # Deltas of halves add up to those of their whole.
+    found = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
+    found = found * _shares_of_the_whole(transferred, split)
+    return BlendshapeRig(neutral, torch.where(known[:, None, None], found.to(transferred), transferred), template.names)
+
+
+def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:
+    """What part of a predicted whole each shape moves at each vertex, (N,V,1): as the transferred halves divide it.
+
+    Args:
+        transferred: (N,V,3), millimetres.
+        split: where a shape is a half of a predicted one, (N,M) bool.
+    """
+    size = transferred.norm(dim=-1)
+    shares = torch.ones_like(size)
+    for column in split.any(0).nonzero()[:, 0]:  # one or two shapes of a rig are split
+        rows = split[:, column].nonzero()[:, 0]
+        shares[rows] = (size[rows] + _STILL) / (size[rows] + _STILL).sum(0)
+    return shares[..., None]
 
 
 def _laid_together(neutrals: Tensor) -> tuple[Tensor, Similarity]:

@@ -138,9 +138,11 @@ def track_live(
     """
     parse_address(address)
     actor = load_actor(rig, settings.part)
-    models = load_track_models(actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics)
     source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
     with source:
+        models = load_track_models(
+            actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.film.fps
+        )
         calibration = camera_of(source.film, settings.camera)
         solver = LiveSolver(actor, models, calibration, settings.face)
         rows: list[LiveFrame] = []

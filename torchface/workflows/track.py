@@ -38,7 +38,7 @@ from torchface.workflows.track_files import (
     summary,
     write_curves,
 )
-from torchface.workflows.track_models import DEFAULT_LANDMARKS, TrackModels, check_rate, load_track_models
+from torchface.workflows.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
 from torchface.workflows.track_overlay import video_light, write_overlay
 from torchface.workflows.track_result import FEWEST_STABLE, Tracked
 from torchface.workflows.track_state import TrackedFrames, TrackState, digest, file_digest
@@ -93,16 +93,17 @@ def track_video(
         FileFormatError: the video cannot be decoded, changes its size or has a variable frame rate; or another file
             is broken.
         ValueRangeError: there is no face in the video, never six stable landmarks, the rig has no 68 landmarks, or
-            the take is too short for the dynamics prior, or of another frame rate.
+            the take is too short for the dynamics prior.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
     film = open_video(video)
     film.check()
     actor = load_actor(rig, settings.part)
     calibration = camera_of(film, settings.camera)
-    models = load_track_models(actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics)
+    models = load_track_models(
+        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, film.fps
+    )
     check_length(film.count, models, film.path)
-    check_rate(film.fps, models, film.path)
     if settings.texture is not None:
         check_texture(actor, settings.texture)
     see_key = digest(_VERSION, file_digest(film.path), models.seeing, str(settings.face))
@@ -139,7 +140,9 @@ def track_video(
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
-    tracked = Tracked(film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products)
+    tracked = Tracked(
+        film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
+    )
     products |= write_curves(tracked, out)
     if settings.overlay:
         texture_key = "" if settings.texture is None else file_digest(settings.texture)

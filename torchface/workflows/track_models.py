@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -9,7 +10,7 @@ from typing import TypeVar
 from torch import nn
 
 from torchface import zoo
-from torchface.capture.priors import DynamicsPrior, ShapePrior
+from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import AppearanceModel, LandmarkTrees
 from torchface.model_files import read_record
@@ -20,6 +21,7 @@ DEFAULT_LANDMARKS = "face_landmarks"
 """The model of the zoo that finds landmarks where none is named."""
 
 _Model = TypeVar("_Model", bound=nn.Module)
+Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class TrackModels:
         appearance: refines them on the actor's own.
         prior: which weights faces have.
         dynamics: how weights go on.
+        unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
         seeing: changes when what finds landmarks does.
         solving: changes when what solves does.
     """
@@ -38,7 +41,8 @@ class TrackModels:
     trees: LandmarkTrees
     appearance: AppearanceModel | None = None
     prior: ShapePrior | None = None
-    dynamics: DynamicsPrior | None = None
+    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None
+    unlearned: tuple[str, ...] = ()
     seeing: str = ""
     solving: str = ""
 
@@ -49,44 +53,45 @@ def load_track_models(
     appearance: str | Path | None = None,
     prior: str | Path | None = None,
     dynamics: str | Path | None = None,
+    fps: float | None = None,
 ) -> TrackModels:
-    """Reads models by name or folder, see :func:`torchface.zoo.get_model`, and holds them against the rig.
+    """Reads models by name or folder, see :func:`torchface.zoo.get_model`, and makes priors fit the rig and the video.
+
+    Args:
+        rig: whose shapes' names the priors are brought to.
+        landmarks, appearance, prior, dynamics: the models.
+        fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
 
     Raises:
-        NameMismatchError: there is none of a name, one is of another kind, or a prior has learned other shapes than
-            the rig has.
-        ValueRangeError: the trees find other landmarks than the 68.
+        NameMismatchError: there is none of a name, one is of another kind, or a prior has learned less than half of
+            the rig's shapes.
+        ValueRangeError: the trees find other landmarks than the 68, or the dynamics prior is of a frame rate more than
+            eight times as high or as low.
         FileFormatError: a model is damaged.
     """
     trees = _read("--landmarks", landmarks, LandmarkTrees)
     if len(trees.mean) != 68:
         raise ValueRangeError(f"{landmarks}: found a model of {len(trees.mean)} landmarks, expected the 68 of iBUG")
-    found = TrackModels(
+    shapes = None if prior is None else _read("--prior", prior, ShapePrior)
+    motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
+    silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
+    return TrackModels(
         trees,
         None if appearance is None else _read("--appearance", appearance, AppearanceModel),
-        None if prior is None else _read("--prior", prior, ShapePrior),
-        None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior),
+        None if shapes is None else _fitted(prior, lambda: shapes.renamed(rig.names)),
+        None if motion is None else _fitted(dynamics, lambda: adapt_dynamics(motion, rig.names, fps)),
+        tuple(name for name in rig.names if name in silent),
         digest(*(_hash(name) for name in (landmarks, appearance))),
         digest(*(_hash(name) for name in (prior, dynamics))),
     )
-    for name, model in ((prior, found.prior), (dynamics, found.dynamics)):
-        if model is not None:
-            try:
-                model.require(rig.names)
-            except NameMismatchError as error:
-                raise NameMismatchError(f"{name}: {error}") from error
-    return found
 
 
-def check_rate(fps: float, models: TrackModels, path: Path) -> None:
-    """Refuses a dynamics prior of another frame rate than a video's: it spoils what is solved.
-
-    Raises:
-        ValueRangeError: the rates differ.
-    """
-    note = None if models.dynamics is None else models.dynamics.rate_note(fps)
-    if note is not None:
-        raise ValueRangeError(f"{path}: {note}")
+def _fitted(name: str | Path | None, fit: Callable[[], Fitted]) -> Fitted:
+    """A prior brought to a rig's names and a video's rate; an error says which model it is of."""
+    try:
+        return fit()
+    except (NameMismatchError, ValueRangeError) as error:
+        raise type(error)(f"{name}: {error}") from error
 
 
 def _read(option: str, name: str | Path, kind: type[_Model]) -> _Model:

@@ -39,6 +39,7 @@ class Tracked:
         reused: frames whose landmarks were known from an earlier run.
         seconds: what each step took, by its name.
         products: the files, by what they are.
+        unlearned: shapes that a prior says nothing of.
         light: of the video, where a texture was put on the face.
     """
 
@@ -53,6 +54,7 @@ class Tracked:
     reused: int
     seconds: dict[str, float]
     products: dict[str, Path]
+    unlearned: tuple[str, ...] = ()
     light: PointLight | None = None
 
     @property
@@ -115,6 +117,8 @@ class Tracked:
                 f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
                 "the eyes): is it this person's own?"
             )
+        if self.unlearned:
+            lines.append(f"the priors have not learned {', '.join(self.unlearned)}: they hold these near rest")
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
         lines.extend(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
+from torchface.capture.priors.adapted_dynamics import AdaptedDynamicsPrior
 from torchface.capture.priors.dynamics import DynamicsPrior
 from torchface.capture.priors.shape_prior import ShapePrior
 from torchface.capture.video.belief import Belief, Expectation
@@ -95,7 +96,7 @@ class VideoSolver(nn.Module):
         landmark_vertices: Tensor | None,
         intrinsics: Tensor,
         prior: ShapePrior | None = None,
-        dynamics: DynamicsPrior | None = None,
+        dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None,
         pixel_noise: float = 1.0,
         sparsity: float = SPARSITY,
         ridge: float = RIDGE,
