@@ -36,6 +36,15 @@ def test_length_is_the_number_of_frames() -> None:
     assert len(Take(60.0)) == 0
 
 
+def test_a_take_is_printed_in_a_line() -> None:
+    markers = Track(tuple(f"M{i:03d}" for i in range(100)), torch.zeros(500, 100, 3))
+    take = Take(60.0, markers, timecode=("01:00:00:00",) * 499 + ("01:00:08:19",), extras={"source": "a.c3d"})
+    assert str(take) == (
+        "Take(500 frames at 60 a second, 100 markers, timecode 01:00:00:00 to 01:00:08:19, extras source)"
+    )
+    assert repr(markers) == "Track(500 frames of 100 x 3: M000, M001, M002, ...)"
+
+
 def test_frames_without_a_marker_are_found() -> None:
     values = torch.zeros(5, 2, 3)
     values[1] = torch.nan

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import re
+import sys
+from importlib.metadata import PackageNotFoundError, requires
 from typing import Any
 
 from torchface.errors import MissingExtraError
@@ -24,5 +27,21 @@ def import_extra(module: str, package: str, extra: str, job: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f"{job} needs {package}, which is not installed ({error}); expected: pip install torchface[{extra}]"
+            f"{job} needs {package}, which is not installed ({error}); expected it beside torchface: "
+            f"{sys.executable} -m pip install '{_requirement(package, extra)}'"
         ) from error
+
+
+def _requirement(package: str, extra: str) -> str:
+    """The package with the versions that the extra asks for: what pip takes in a checkout and beside a wheel."""
+    try:
+        lines = requires("torchface") or []
+    except PackageNotFoundError:  # run from a folder that was never installed
+        lines = []
+    for line in lines:
+        requirement, _, marker = line.partition(";")
+        if re.search(rf"extra == .{re.escape(extra)}\W*$", marker) and re.match(
+            rf"{re.escape(package)}\b", requirement
+        ):
+            return requirement.replace(" ", "")
+    return package

@@ -45,6 +45,10 @@ class Track:
     def __len__(self) -> int:
         return len(self.values)
 
+    def __repr__(self) -> str:
+        names = ", ".join(self.names[:3]) + (", ..." if len(self.names) > 3 else "")
+        return f"Track({len(self)} frames of {len(self.names)} x {self.values.shape[2]}: {names})"
+
     def select(self, names: Sequence[str]) -> Track:
         """The channels of these names, in this order."""
         row = {name: i for i, name in enumerate(self.names)}
@@ -103,6 +107,18 @@ class Take:
             if track is not None:
                 return len(track)
         return 0
+
+    def __repr__(self) -> str:
+        parts = [f"{len(self)} frames at {self.fps:g} a second"]
+        for what in ("markers", "landmarks", "weights"):
+            track = getattr(self, what)
+            if track is not None:
+                parts.append(f"{len(track.names)} {what}")
+        if self.timecode:
+            parts.append(f"timecode {self.timecode[0]} to {self.timecode[-1]}")
+        if self.extras:
+            parts.append(f"extras {', '.join(map(str, self.extras))}")
+        return f"Take({', '.join(parts)})"
 
 
 def empty_frames(take: Take) -> Tensor:

@@ -44,7 +44,7 @@ class Settings:
         out: Folder for the model and its card.
         held_out: Faces of the data, the last ones, or rendered pictures of other people, that are kept for the test.
         seed: Draws people, poses and lights.
-        licence: Under which the model may be used.
+        licence: Under which the model may be used; MIT for performers alone, else that of the data, if absent.
         workers: Processes that render.
         trees: How trees are grown.
         pictures: What is rendered how widely.
@@ -55,7 +55,7 @@ class Settings:
     out: Path = Path("models/face_landmarks")
     held_out: int = 0
     seed: int = 1
-    licence: str = "MIT"
+    licence: str = ""
     workers: int = 1
     trees: TreeSettings = field(default_factory=TreeSettings)
     pictures: PictureSettings = field(default_factory=PictureSettings)
@@ -259,7 +259,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
     zoo.save_model(
         model,
         settings.out,
-        licence=settings.licence,
+        licence=settings.licence or ("that of the data" if settings.data else "MIT"),
         data=data,
         metrics=metrics,
         recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",

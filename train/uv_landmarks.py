@@ -51,7 +51,7 @@ class Settings:
             None if absent, and 20 performers.
         seed: Draws performers, and what their scanner does to them.
         size: Pixels a side of the unwrapped pictures.
-        licence: Under which the model may be used.
+        licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
         detector: How landmarks are matched.
     """
 
@@ -63,7 +63,7 @@ class Settings:
     held_out: int | None = None
     seed: int = 7
     size: int = 1024
-    licence: str = "MIT"
+    licence: str = ""
     detector: DetectorSettings = field(default_factory=DetectorSettings)
 
 
@@ -171,7 +171,7 @@ def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErro
     zoo.save_model(
         detector,
         settings.out,
-        licence=settings.licence,
+        licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
         data=data,
         metrics=error_table(errors),
         recipe=f"python -m train.uv_landmarks {flags} --out models/{settings.out.name}",

@@ -88,7 +88,7 @@ def test_error_beside_dlib(faces: tuple[Faces, Faces], tmp_path: Path) -> None:
     try:
         import dlib
     except ImportError:
-        pytest.skip("dlib is not installed: no comparison was made (pip install 'torchface[bench-dlib]')")
+        pytest.skip("dlib is not installed: no comparison was made (pip install '.[bench-dlib]')")
     peers = []
     for name in ("dlib, the same perturbed boxes", "dlib, its own oversampling"):
         begin = time.process_time()

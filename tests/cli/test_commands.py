@@ -7,13 +7,14 @@ import pytest
 import torch
 from rich.console import Console
 
+import torchface
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.cli import COMMANDS, main, progress
 from torchface.cli.export import EXPORTS
 from torchface.evaluation import weight_jitter
 from torchface.geometry.alignment import Similarity
-from torchface.io import load_rig, load_take, save_mesh, save_rig, save_take
+from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
 from torchface.io.picks import LandmarkVertices, save_landmarks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -118,6 +119,28 @@ def test_render_and_info_and_export(shoot: Path, capsys: pytest.CaptureFixture[s
     assert out.is_file()
     run("info", out)
     assert "markers (" in capsys.readouterr().err
+
+
+def test_info_tells_of_the_animation_in_a_file(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = torch.zeros(31, 4)
+    values[:, 2], values[5, 0] = torch.linspace(0, 0.75, 31), 0.25
+    take = Take(30.0, weights=Track(dome_rig.names, values[..., None]))
+    save_animation(dome_rig, take, shoot / "moving.glb")
+    run("info", shoot / "moving.glb")
+    told = capsys.readouterr().err
+    assert "31 frames at 30 a second, 1.0 s" in told
+    assert "mouthSmileLeft 0.75, jawOpen 0.25" in told
+    run("info", shoot / "rig.glb")
+    assert "animation" not in capsys.readouterr().err
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"torchface {torchface.__version__}\n"
 
 
 @pytest.mark.parametrize(

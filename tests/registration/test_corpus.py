@@ -243,7 +243,7 @@ def test_mistakes_are_told_before_anything_is_done(
         register_corpus(template, [scans], tmp_path / "out", landmarks=tmp_path / "none")
     assert not (tmp_path / "out").exists()
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"torchface\[cluster\]"):
+    with pytest.raises(MissingExtraError, match=r"-m pip install 'ray>=2.40'"):
         register_corpus(template, [scans], tmp_path / "out", cluster="auto")
 
 

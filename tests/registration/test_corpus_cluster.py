@@ -26,7 +26,7 @@ COUNT = 8
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Two nodes of one CPU each, on this machine; the second is ``cluster.second``."""
-    pytest.importorskip("ray", reason="ray is not installed: pip install torchface[cluster]")
+    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     from ray.cluster_utils import Cluster
 
@@ -76,7 +76,7 @@ def test_a_lost_node_costs_no_scan(
 
 
 def test_an_address_without_a_cluster_is_told(make_mask: Callable[[int, int], Mesh], tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason="ray is not installed: pip install torchface[cluster]")
+    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
     (tmp_path / "bad.ply").write_bytes(b"junk")
     with pytest.raises(ValueRangeError, match="found no Ray cluster at 'nonsense'"):
         register_corpus(make_mask(17, 23), [tmp_path / "bad.ply"], tmp_path / "out", cluster="nonsense")

@@ -93,6 +93,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
     assert record.metrics["median error, %"] == pytest.approx(100 * float(errors.median()))
     assert "--trees.cascades 3" in record.recipe
     assert "performer" not in record.data
+    assert record.licence == "that of the data"  # other people's photographs are not ours to license
     assert "14 faces to learn from, 4 to test on" in lines
     assert not (tmp_path / "faces" / "checkpoint.safetensors").exists()
 
@@ -119,6 +120,7 @@ def test_performers_are_learned_from(tmp_path: Path) -> None:
     assert len(errors) == 2
     record = zoo.describe(tmp_path / "made_up")
     assert record.data == "4 rendered pictures of the embedded performer; no person's face."
+    assert record.licence == "MIT"
     assert "--pictures.smallest 90" not in record.recipe  # the default
     assert "--pictures.largest 100" in record.recipe
     once = rendered_faces(3, 8, small)

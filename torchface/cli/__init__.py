@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from torchface import __version__
 from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
@@ -67,6 +68,9 @@ _EXPORT = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command; an error that the user can mend ends with its message and exit status 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if words in (["--version"], ["-V"]):
+        print(f"torchface {__version__}")
+        raise SystemExit(0)
     if not words or words in (["--help"], ["-h"]):
         _overview()
         raise SystemExit(0 if words else 2)
@@ -93,7 +97,7 @@ def _overview() -> None:
     page = Console()
     page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
     page.print(table, highlight=False)
-    page.print("\ntorchface COMMAND --help tells more of each.", highlight=False)
+    page.print("\ntorchface COMMAND --help tells more of each; torchface --version.", highlight=False)
 
 
 def _export_help() -> None:

@@ -27,7 +27,7 @@ def pick(
 
     Save writes into the folder OUT what has been picked: landmarks.json, annotated.glb (once every landmark is there),
     attachment.json for the markers, correspondences.json for pairs. The page is at 127.0.0.1 and no other machine can
-    open it. Needs the extra: pip install torchface[viewer].
+    open it. Needs the extra: pip install '.[viewer]' in a checkout.
 
     Args:
         mesh: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.

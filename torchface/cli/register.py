@@ -42,7 +42,7 @@ def register(
             template's annotated landmarks, or correspondences saved by `torchface pick`.
         jobs: How many processes, of one thread each.
         cluster: Address of a Ray cluster, or "auto" on one of its machines, instead of --jobs; scans and OUT must lie
-            where all its machines see them. Needs the extra: pip install torchface[cluster].
+            where all its machines see them. Needs the extra: pip install '.[cluster]' in a checkout.
         part: Keep this region of the template only, such as face.
         unit: Unit of the scans (mm, cm, m) where it is not the format's own.
         detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from

@@ -263,9 +263,9 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
     needless = bool(known.all()) and not bool(split.any())
     transferred = torch.zeros_like(template.deltas) if needless else transfer_deformation(template, neutral).deltas
     # Deltas of halves add up to those of their whole.
-    found = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
-    found = found * _shares_of_the_whole(transferred, split)
-    return BlendshapeRig(neutral, torch.where(known[:, None, None], found.to(transferred), transferred), template.names)
+    named = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
+    named = (named * _shares_of_the_whole(transferred, split)).to(transferred)
+    return BlendshapeRig(neutral, torch.where(known[:, None, None], named, transferred), template.names)
 
 
 def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:

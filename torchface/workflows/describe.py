@@ -12,6 +12,7 @@ from torchface.capture.markers import MarkerSolver, observability
 from torchface.errors import FileFormatError
 from torchface.files import read_file
 from torchface.io import load_mesh, load_rig, load_take
+from torchface.io.gltf.animation import read_gltf_weights
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -19,6 +20,7 @@ from torchface.take import Take
 Rows = list[tuple[str, str]]
 
 _LONGEST_VALUE = 240
+_MOST_NAMED = 8
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -42,7 +44,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
             if attachment is not None:
                 raise
             return _mesh_rows(load_mesh(path))
-        rows = _rig_rows(rig)
+        rows = [*_rig_rows(rig), *_animation_rows(path)]
         if attachment is not None:
             where = Attachment.load(attachment)
             where.check(rig.neutral, attachment, path)
@@ -90,6 +92,20 @@ def _rig_rows(rig: BlendshapeRig) -> Rows:
     reach = rig.deltas.norm(dim=-1).amax(1)
     shapes = ", ".join(f"{name} {float(r):.1f}" for name, r in zip(rig.names, reach, strict=True))
     return [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("farthest move, mm", shapes)]
+
+
+def _animation_rows(path: Path) -> Rows:
+    """What moves a glTF file's shapes, and how far."""
+    take = None if path.is_dir() else read_gltf_weights(path)
+    if take is None or take.weights is None:
+        return []
+    peaks = take.weights.values[..., 0].amax(0)
+    order = peaks.argsort(descending=True)[:_MOST_NAMED].tolist()
+    peak = ", ".join(f"{take.weights.names[row]} {float(peaks[row]):.2f}" for row in order if peaks[row] > 0)
+    return [
+        ("animation", f"{len(take)} frames at {take.fps:g} a second, {len(take) / take.fps:.1f} s"),
+        ("largest weights", peak or "none above 0"),
+    ]
 
 
 def _take_rows(take: Take) -> Rows:

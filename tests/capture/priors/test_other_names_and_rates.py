@@ -110,7 +110,9 @@ def learned() -> DynamicsPrior:
 
 
 def test_motion_in_other_names_is_the_same_motion(learned: DynamicsPrior) -> None:
-    halves = [half for name in learned.names for half in ((f"{name}_L", f"{name}_R") if name == "browInnerUp" else [name])]
+    halves = [
+        half for name in learned.names for half in ((f"{name}_L", f"{name}_R") if name == "browInnerUp" else [name])
+    ]
     names = [f"{name.removesuffix('Left')}_L" if name.endswith("Left") else name for name in halves]
     adapted = adapt_dynamics(learned, names)
     back = mapping(learned.names, names)
@@ -160,7 +162,7 @@ def test_a_saved_prior_of_another_rate_predicts_the_same(learned: DynamicsPrior)
 
 
 def test_rates_too_far_away_and_windows_too_short_are_refused(learned: DynamicsPrior) -> None:
-    with pytest.raises(ValueRangeError, match="found 2 frames a second, expected from 7.5 to 480"):
+    with pytest.raises(ValueRangeError, match=r"found 2 frames a second, expected from 7\.5 to 480"):
         adapt_dynamics(learned, learned.names, 2.0)
     adapted = adapt_dynamics(learned, learned.names, 120.0)
     with pytest.raises(ShapeError, match=r"expected \(B,5,"):

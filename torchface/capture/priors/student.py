@@ -108,7 +108,9 @@ class StudentDensity(nn.Module):
         factor, matrix = self.factor.double(), matrix.to(self.factor.device).double()
         spread = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factor @ factor.T)) @ matrix.T
         spread.diagonal().add_(floor.to(spread))
-        return StudentDensity(torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(spread))), self.freedom)
+        return StudentDensity(
+            torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(spread))), self.freedom
+        )
 
     @property
     def config(self) -> dict[str, Any]:
