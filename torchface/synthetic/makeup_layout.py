@@ -188,7 +188,7 @@ def _on_skin(mesh: Mesh, points: Tensor, names: list[str]) -> Attachment:
     rows = _outer_skin(mesh)
     found = SurfaceIndex(vertices, faces[rows]).nearest(points)
     triangles, corner = rows[found.triangle], found.barycentric.float()
-    return Attachment(triangles, corner, names, fingerprint=mesh.fingerprint())
+    return Attachment(triangles, corner, tuple(names), fingerprint=mesh.fingerprint())
 
 
 def _outer_skin(mesh: Mesh) -> Tensor:

@@ -26,9 +26,9 @@ def translation(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor, T
     if float(known.float().mean()) < _LEAST_SHARE:
         unknown = [name for name, found in zip(names, known.tolist(), strict=True) if not found]
         raise NameMismatchError(
-            f"prior: has learned {int(known.sum())} of the rig's {len(names)} shapes (none of "
-            f"{', '.join(unknown[:3])}, ...), expected at least half of them; it knows {', '.join(learned[:3])}, ... (train.priors --rig makes a "
-            "prior for a rig's names)"
+            f"prior: has learned {int(known.sum())} of the rig's {len(names)} shapes "
+            f"(none of {', '.join(unknown[:3])}, ...), expected at least half of them; it knows "
+            f"{', '.join(learned[:3])}, ... (train.priors --rig makes a prior for a rig's names)"
         )
     return there, back
 
