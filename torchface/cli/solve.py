@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -31,6 +31,8 @@ def solve(
     sparsity: float | None = None,
     ridge: float | None = None,
     part: str | None = None,
+    unit: Literal["mm", "cm", "m", "in"] | None = None,
+    insist: bool = False,
     quiet: bool = False,
 ) -> None:
     """Solve a marker take for blendshape weights and write them as Live Link Face CSV.
@@ -58,6 +60,8 @@ def solve(
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
+        unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
@@ -69,9 +73,9 @@ def solve(
     camera = None if video is None or action_units is None else HeadCamera(video, action_units, labels, table)
 
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
-    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms)
+    settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
     with steps(quiet) as step:
-        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step)
+        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step, unit)
     for line in done.lines():
-        console.print(line)
+        console.print(line, style="bold yellow" if line.startswith("warning: ") else None, highlight=False)
     print(out)

@@ -1,6 +1,7 @@
 """What time does to signals: smoothing and filtering along frames."""
 
 from torchface.temporal.adaptive import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
+from torchface.temporal.bridging import bridged, nearest_rows
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
 from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
@@ -16,10 +17,12 @@ __all__ = [
     "RotationFilter",
     "adaptive_filter",
     "adaptive_smoother",
+    "bridged",
     "estimate_settings",
     "filter_rotations",
     "kalman_filter",
     "kalman_smoother",
+    "nearest_rows",
     "one_euro_filter",
     "savitzky_golay",
     "smooth_rotations",

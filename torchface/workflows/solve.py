@@ -30,12 +30,14 @@ from torchface.io.live_link import save_live_link
 from torchface.io.live_link_stream import parse_address
 from torchface.onnx.live import LiveMarkerSolver
 from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track, require_seen
+from torchface.take import Take, Track, empty_frames
 from torchface.temporal import OneEuroFilter
 from torchface.workflows.head_camera import HeadCamera, Predicted, predicted_curves
 from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
+from torchface.workflows.take_check import check_coverage, check_explained, fit_warnings
 
 _SHOWN_DEFECTS = 12
+_SHOWN_SPANS = 6
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class SolveSettings:
         frame_by_frame: every frame on its own; otherwise the weights of the whole take at once, smooth over time. With
             what a head camera saw every frame is on its own.
         sparsity, ridge: see ``MarkerSolver``.
+        insist: solve what the rig does not explain, too.
     """
 
     neutral: int | None = None
@@ -61,6 +64,7 @@ class SolveSettings:
     frame_by_frame: bool = False
     sparsity: float = SPARSITY
     ridge: float = RIDGE
+    insist: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,7 @@ class Solution:
         alignment: marker space to rig space, where one was estimated.
         motion: the helmet's, where it was asked for.
         cleanup: what was wrong with the take, where that was asked for.
+        warnings: what the user should know before they use the weights.
     """
 
     take: Take
@@ -82,6 +87,7 @@ class Solution:
     alignment: Similarity | None
     motion: HelmetMotion | None
     cleanup: Cleanup | None
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +97,14 @@ class SolveReport:
     Args:
         take: the solved weights.
         rmse: marker RMSE a frame, (T,), millimetres.
-        seen: share of marker samples that were seen.
+        seen: share of the samples of the attachment's markers that were seen.
         alignment: the similarity from marker space to rig space, where one was estimated.
         seconds: what the solve itself took.
         motion: the helmet's, where it was asked for.
         cleanup: what was wrong with the take, where that was asked for.
         predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
+        warnings: what the user should know before they use the weights.
     """
 
     take: Take
@@ -109,12 +116,14 @@ class SolveReport:
     cleanup: Cleanup | None = None
     predicted: Predicted | None = None
     sent: StreamReport | None = None
+    warnings: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """For people to read."""
         frames, worst = len(self.rmse), float(self.rmse.nan_to_num().max())
         lines = [
-            f"{frames} frames at {self.take.fps:g} a second, {100 * self.seen:.1f} % of the marker samples seen",
+            f"{frames} frames at {self.take.fps:g} a second, {100 * self.seen:.1f} % of the attachment's "
+            "marker samples seen",
             f"marker RMSE: median {float(self.rmse.nanmedian()):.3f} mm, "
             f"95th percentile {float(self.rmse.nanquantile(0.95)):.3f} mm, worst {worst:.3f} mm",
             f"solved in {self.seconds:.2f} s, {1000 * self.seconds / max(frames, 1):.3f} ms a frame",
@@ -143,7 +152,7 @@ class SolveReport:
             lines.extend(f"  {note}" for note in self.predicted.notes)
         if self.sent is not None:
             lines.extend(self.sent.lines())
-        return lines
+        return [*(f"warning: {warning}" for warning in self.warnings), *lines]
 
 
 def solve_markers(
@@ -165,22 +174,28 @@ def solve_markers(
         progress: told what begins.
 
     Raises:
+        AlignmentError: the rig does not explain the markers, unless the settings insist.
         TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
     say = progress or (lambda line: None)
     whole = predicted is None and not settings.frame_by_frame
+    coverage = check_coverage(attachment, take, len(rig.names), settings.insist)
+    empty = empty_frames(take)
     alignment = None
     if settings.align or settings.neutral is not None:
         say("laying the take on the rig")
         alignment = align_take(rig, attachment, take, settings.neutral)
     terms = {"sparsity": settings.sparsity, "ridge": settings.ridge}
+    solver = MarkerSolver(rig, attachment, alignment, **terms)
+    fit = check_explained(solver, take, settings.slip, settings.insist)
+    warnings = [*coverage.warnings(), *fit_warnings(fit, alignment is not None)]
+    if len(empty):
+        warnings.append(f"{_frames_text(empty)} show no marker; their weights come from the frames before and after")
     cleanup = None
     if settings.clean:
         say("looking for what is wrong with the take")
-        cleanup = clean_take(MarkerSolver(rig, attachment, alignment, **terms), take, settings.slip)
+        cleanup = clean_take(solver, take, settings.slip)
         take = cleanup.take if whole else cleanup.filled
-    if not whole:
-        require_seen(take)
     say("solving")
     motion = None
     steady, space = take, alignment
@@ -205,15 +220,30 @@ def solve_markers(
     if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
         markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
     return Solution(
-        replace(take, weights=solved.weights), markers, attachment.select(labels), alignment, motion, cleanup
+        replace(take, weights=solved.weights),
+        markers,
+        attachment.select(labels),
+        alignment,
+        motion,
+        cleanup,
+        tuple(warnings),
     )
+
+
+def _frames_text(rows: Tensor) -> str:
+    """How many frames and which: ``10 frames (120–128, 340)``."""
+    breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
+    firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
+    spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]
+    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in spans[:_SHOWN_SPANS])
+    more = f" and {len(spans) - _SHOWN_SPANS} more stretches" if len(spans) > _SHOWN_SPANS else ""
+    return f"{len(rows)} frames ({shown}{more})"
 
 
 def _without_slip(
     rig: BlendshapeRig, attachment: Attachment, alignment: Similarity | None, settings: SolveSettings, take: Take
 ) -> tuple[Take, HelmetMotion]:
     """The take in rig space as a steady helmet would have seen it, and the helmet's motion."""
-    require_seen(take)
     _, motion = HelmetSolver(rig, attachment, alignment, settings.sparsity, settings.ridge).solve_take(take)
     assert take.markers is not None
     values = take.markers.values.double()
@@ -234,6 +264,7 @@ def solve_take(
     stream: str | None = None,
     camera: HeadCamera | None = None,
     progress: Callable[[str], None] | None = None,
+    unit: str | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
 
@@ -249,7 +280,7 @@ def solve_take(
     where = Attachment.load(attachment)
     where.check(loaded.neutral, attachment, rig)
     say("reading the take")
-    played = load_take(take)
+    played = load_take(take, unit)
     if played.markers is None:
         raise ValueRangeError(f"{take}: found no markers, expected a marker take (.c3d, .trc, .csv)")
     predicted = None if camera is None else predicted_curves(camera, played, loaded.names, say)
@@ -270,12 +301,13 @@ def solve_take(
     done = SolveReport(
         solved,
         rmse,
-        float(torch.isfinite(solution.markers).all(-1).float().mean()),
+        float(torch.isfinite(solution.markers).all(-1).sum()) / (len(solved) * len(where.triangles)),
         solution.alignment,
         seconds,
         solution.motion,
         solution.cleanup,
         predicted,
+        warnings=solution.warnings,
     )
     if report is not None:
         say("writing the report")

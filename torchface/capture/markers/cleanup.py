@@ -128,7 +128,7 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     masked[bad] = torch.nan
     # A marker that the take lacks has no gaps.
     present = [i for i, label in enumerate(labels) if label in track.names]
-    expected = prediction.expected if slip else _expected_over_time(solver, masked, take.fps)
+    expected = _expected_alone(prediction, masked) if slip else _expected_over_time(solver, masked, take.fps)
     filled, gaps = _fill(masked, bad, expected, labels, present, take.fps)
     defects += gaps
     back = alignment.inverse().apply if alignment is not None else (lambda points: points)
@@ -190,12 +190,18 @@ def _fill(
     for m in present:
         for first, last in _runs(missing[:, m]):
             inside = first > 0 and last + 1 < len(seen)
-            safe = inside and last - first < longest
+            safe = inside and last - first < longest and bool(torch.isfinite(expected[first : last + 1, m]).all())
             if safe:
                 filled[first : last + 1, m] = expected[first : last + 1, m]
             if last - first + 1 >= _LISTED_GAP and not bool(bad[first : last + 1, m].all()):
                 defects.append(Defect("gap", (labels[m],), first, last, 0.0, "filled" if safe else "left"))
     return filled, defects
+
+
+def _expected_alone(prediction: Prediction, seen: Tensor) -> Tensor:
+    """Where each frame's own markers have the others, (T,M,3); NaN in a frame that shows none."""
+    empty = torch.isnan(seen).any(-1).all(1)
+    return torch.where(empty[:, None, None], torch.nan, prediction.expected)
 
 
 def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tensor:

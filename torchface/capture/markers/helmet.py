@@ -9,12 +9,13 @@ from torch import Tensor, nn
 
 from torchface.attachment import Attachment
 from torchface.capture.energy import marker_term
-from torchface.capture.markers.solve import RIDGE, SPARSITY, MarkerSolver
+from torchface.capture.markers.solve import RIDGE, SPARSITY, MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.alignment import Similarity
 from torchface.optim import BoxQP, box_qp
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.temporal import bridged, nearest_rows
 
 # A turn counts by how far it moves a point this far from the pivot, so that all six columns are of one size.
 _ARM = 30.0
@@ -143,13 +144,20 @@ class HelmetSolver(nn.Module):
     def solve_take(self, take: Take) -> tuple[Take, HelmetMotion]:
         """The take with weights solved from its markers, matched by label; and the motion that is not in them.
 
+        A frame without any marker gets weights between those of the frames before and after, and the nearest's motion.
+
         Raises:
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
-            ValueRangeError: frames show no marker at all; the message names them.
+            ValueRangeError: no frame shows any marker.
         """
         if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
-        weights, motion = self(self.markers.arrange(take.markers))
+        markers = self.markers.arrange(take.markers)
+        rows = frames_seen(markers)
+        seen, steps = self(markers[rows])
+        weights = bridged(seen, rows, len(markers))
+        nearest = nearest_rows(rows, len(markers))
+        motion = HelmetMotion(steps.rotation[nearest], steps.translation[nearest], steps.pivot)
         return replace(take, weights=Track(self.names, weights[..., None])), motion
 
     def _solve(self, seen: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:

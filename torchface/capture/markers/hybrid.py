@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, pull_term
-from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.markers.solve import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.optim import box_qp
 from torchface.take import Take, Track
-from torchface.temporal import savitzky_golay
+from torchface.temporal import bridged, savitzky_golay
 
 GAMMA = 4.0
 """The classifier's greatest say, mm² over all markers for a squared weight of 1."""
@@ -110,7 +110,8 @@ class HybridSolver(nn.Module):
     def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:
         """The take with weights solved from its markers and from predicted curves, matched by name.
 
-        Shapes without a prediction are left to the markers.
+        Shapes without a prediction are left to the markers. A frame without any marker gets weights between those of
+        the frames before and after.
 
         Args:
             take: markers.
@@ -125,7 +126,10 @@ class HybridSolver(nn.Module):
                 f"hybrid solve: found {len(take)} frames of markers, {len(predicted)} of predictions, {len(gamma)} of "
                 "gamma, expected the same number"
             )
-        weights = self(self.markers.arrange(take.markers), self._in_rig_order(predicted), self._in_rig_order(gamma))
+        markers = self.markers.arrange(take.markers)
+        rows = frames_seen(markers)
+        seen = self(markers[rows], self._in_rig_order(predicted)[rows], self._in_rig_order(gamma)[rows])
+        weights = bridged(seen, rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
 
     def _in_rig_order(self, curves: Track) -> Tensor:

@@ -17,6 +17,7 @@ from torchface.optim import BoxQP, box_qp
 from torchface.optim.prepared import Prepared
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.temporal import bridged
 
 # On six real takes with 0.3 mm of noise the paper's rule (``sparsity_by_rule``) gives 0.03 to 0.07, where the weights
 # come out muted by a fifth. At 0.01, of the rule's order of magnitude still, as many shapes are active as in truth (25
@@ -213,15 +214,18 @@ class MarkerSolver(nn.Module):
     def solve_take(self, take: Take) -> Take:
         """The take with weights solved from its markers, matched by label.
 
-        A marker of the attachment that the take lacks counts as never seen.
+        A marker of the attachment that the take lacks counts as never seen. A frame without any marker gets weights
+        between those of the frames before and after.
 
         Raises:
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
-            ValueRangeError: frames show no marker at all; the message names them.
+            ValueRangeError: no frame shows any marker.
         """
         if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")
-        weights = self(self.arrange(take.markers))
+        markers = self.arrange(take.markers)
+        rows = frames_seen(markers)
+        weights = bridged(self(markers[rows]), rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
 
     def arrange(self, markers: Track) -> Tensor:
@@ -274,6 +278,18 @@ def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
             f"markers: found {shown}{' and others' if len(unknown) > 5 else ''}, expected labels of the attachment: "
             f"{', '.join(known[:5])}, ...; drop markers that are not of the face with Track.select"
         )
+
+
+def frames_seen(markers: Tensor) -> Tensor:
+    """The frames of markers (T,M,3) that show at least one, (K,) int64.
+
+    Raises:
+        ValueRangeError: there is none.
+    """
+    rows = (~torch.isnan(markers).any(-1)).any(-1).nonzero()[:, 0]
+    if not len(rows):
+        raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
+    return rows
 
 
 def _check_seen(missing: Tensor) -> None:

@@ -1,0 +1,144 @@
+"""Whether a marker take can be solved with a rig and an attachment at all: what is refused, what only doubted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from torchface.attachment import Attachment
+from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
+from torchface.capture.markers.fit_check import REFUSED_SHARE
+from torchface.errors import AlignmentError, NameMismatchError
+from torchface.take import Take
+
+_MOST_SHAPES_A_MARKER = 3  # a marker has three coordinates
+_FEW, _MOST_OF_THEM = 0.5, 0.9
+_INSIST = "--insist writes the weights all the same"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of an attachment a take shows.
+
+    Args:
+        markers: of the attachment.
+        present: of them, seen in some frame of the take.
+        shapes: of the rig.
+        poor: frames that show some markers, but fewer coordinates than the rig has shapes while most frames show more.
+    """
+
+    markers: int
+    present: int
+    shapes: int
+    poor: int
+
+    @property
+    def refused(self) -> bool:
+        """Most of the markers are not there, and the rest have fewer coordinates than the rig has shapes."""
+        return self._too_few and self.present < _FEW * self.markers
+
+    @property
+    def _too_few(self) -> bool:
+        return _MOST_SHAPES_A_MARKER * self.present < self.shapes
+
+    def warnings(self) -> list[str]:
+        """For people to read."""
+        said = []
+        if self._too_few or self.present < _MOST_OF_THEM * self.markers:
+            blind = f"; too few for {self.shapes} shapes, many of which are guessed" if self._too_few else ""
+            said.append(f"the take shows {self.present} of the attachment's {self.markers} markers{blind}")
+        if self.poor:
+            said.append(
+                f"{self.poor} frames show fewer than {math.ceil(self.shapes / _MOST_SHAPES_A_MARKER)} markers: too few "
+                f"for {self.shapes} shapes"
+            )
+        return said
+
+
+def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool = False) -> Coverage:
+    """Counts the attachment's markers in a take.
+
+    Raises:
+        NameMismatchError: they are too few for the rig's shapes, unless ``insist``.
+    """
+    assert take.markers is not None
+    labels = attachment.labels or ()
+    known = take.markers.select([name for name in take.markers.names if name in labels])
+    seen = ~torch.isnan(known.values).any(-1)
+    count = seen.sum(1)
+    enough = math.ceil(shapes / _MOST_SHAPES_A_MARKER)
+    usual = float(count.double().median()) if len(count) else 0.0
+    poor = int(((count > 0) & (count < enough)).sum()) if usual >= enough else 0
+    found = Coverage(len(labels), int(seen.any(0).sum()), shapes, poor)
+    if found.refused and not insist:
+        missing = [label for label in labels if label not in known.names]
+        raise NameMismatchError(
+            f"{_source(take)}: found {found.present} of the attachment's {found.markers} markers (not "
+            f"{', '.join(missing[:4])}, ...), expected at least {min(enough, found.markers)} for {shapes} shapes; are "
+            f"they called otherwise in the take (--labels map.csv)? {_INSIST}"
+        )
+    return found
+
+
+def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool = False) -> FitCheck:
+    """How well a rig explains a take's markers.
+
+    Args:
+        solver: rig, attachment and alignment.
+        take: markers, all known to the solver.
+        slip: the helmet's motion will be taken out.
+        insist: refuse nothing.
+
+    Raises:
+        AlignmentError: hardly at all, unless ``insist``; the message says what is the likely cause.
+    """
+    assert take.markers is not None
+    markers = solver.arrange(take.markers).double()
+    aligned = solver.alignment is not None
+    if solver.alignment is not None:
+        markers = solver.alignment.apply(markers)
+    fit = check_fit(torch.cat([solver.rest[..., None], solver.basis], dim=2), markers, slip)
+    if fit.refused and not insist:
+        raise AlignmentError(
+            f"{_source(take)}: the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm "
+            f"(median), expected at most {REFUSED_SHARE * fit.spread:.2g} mm; {_cause(fit, aligned)}; {_INSIST}"
+        )
+    return fit
+
+
+def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
+    """What to say of a take that the rig explains badly; nothing of one that it explains."""
+    if not fit.cause:
+        return []
+    return [
+        f"the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm (median); "
+        f"{_cause(fit, aligned)}"
+    ]
+
+
+def _cause(fit: FitCheck, aligned: bool) -> str:
+    if fit.cause == "unit":
+        assert fit.similarity is not None
+        factor = float(fit.similarity.scale[0])
+        sizes = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
+        names = {"m": "metres", "cm": "centimetres", "in": "inches", "mm": "millimetres"}
+        return (
+            f"{sizes} they lie {fit.mended:.2g} mm from it, so the take seems to be in {names[fit.unit]}: add "
+            f"--unit {fit.unit}, and --align if it is not in the rig's space"
+        )
+    if fit.cause == "alignment":
+        advice = "the frame of --neutral is not at rest: --align does without one" if aligned else "add --align"
+        return f"laid on the rig they lie {fit.mended:.2g} mm from it, so the take is in another space: {advice}"
+    if fit.cause == "slip":
+        return f"without the motion of the helmet against the head {fit.mended:.2g} mm are left: add --slip"
+    tried = "the take is laid on the rig" if aligned else "turning, moving and scaling the take does not help"
+    return (
+        f"{tried}, so the attachment or the rig is another one's, or labels are mixed up: look at the sites "
+        "(torchface view), find them anew (torchface attach)"
+    )
+
+
+def _source(take: Take) -> str:
+    return str(take.extras.get("source", "take"))
