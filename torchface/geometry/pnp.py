@@ -148,7 +148,7 @@ def _orthographic_start(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Ten
     if (singular[:, 1] <= 1e-6 * singular[:, 0]).any():
         raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
     flat = singular[:, 2] < _FLAT * singular[:, 0]
-    kept = torch.where(flat[:, None] & (torch.arange(3) == 2), torch.inf, singular)
+    kept = torch.where(flat[:, None] & (torch.arange(3, device=x.device) == 2), torch.inf, singular)
     inverse = vh.transpose(-1, -2) @ (u / kept[:, None, :]).transpose(-1, -2)
     normal = vh[:, 2]
     deeper = torch.zeros_like(x[..., 0])

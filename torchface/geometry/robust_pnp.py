@@ -78,15 +78,16 @@ def robust_pnp(
     Source: Fischler and Bolles 1981; Torr and Zisserman 2000; thesis 4.2.4.
     """
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
-    limit = _limits(threshold, len(q), hypotheses)
-    given = _given(start, len(q))
+    limit = _limits(threshold, q, hypotheses)
+    given = _given(start, q)
     size = max(1, _LARGEST // (hypotheses * 4 * len(x)))
     before = _squared(x, q, K, given[:, None, :, :3], given[:, None, :, 3])[:, 0]
     close = (before * w < limit[:, None].square()) & (w > 0)
     sure = close.sum(1) >= _SURE * (w > 0).sum(1)
     found = RobustPose(Pose(*(given.new_full(shape, torch.nan) for shape in _shapes(len(q)))), close)
     for draws, frames in ((0, sure.nonzero()[:, 0]), (hypotheses, (~sure).nonzero()[:, 0])):
-        order = torch.rand(draws, len(x), generator=torch.Generator().manual_seed(seed))
+        # Drawn on the CPU, so that every device draws the same.
+        order = torch.rand(draws, len(x), generator=torch.Generator().manual_seed(seed), device="cpu").to(x.device)
         for part in frames.split(size) if len(frames) else ():
             pose, inliers = _consensus(x, q[part], K, w[part], given[part], order, limit[part])
             found.pose.rotation[part], found.pose.translation[part] = pose.rotation, pose.translation
@@ -111,7 +112,7 @@ def _consensus(
     turned, moved = _hypotheses(x, q, K, w, order)
     turned = torch.cat([turned, given[enough, None, :, :3]], dim=1)
     moved = torch.cat([moved, given[enough, None, :, 3]], dim=1)
-    row = torch.arange(len(q))[:, None]
+    row = torch.arange(len(q), device=q.device)[:, None]
     if turned.shape[1] > _KEPT:
         # Single precision is enough to tell which are worth more work.
         rough = _scores(x.float(), q.float(), K.float(), w.float(), turned.float(), moved.float(), limit.float())
@@ -139,7 +140,8 @@ def _hypotheses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, order: Tensor) -> tu
     keys = torch.where((w > 0)[:, None], order, 2.0)
     drawn = keys.topk(3, dim=-1, largest=False).indices
     rays = torch.nn.functional.pad(q, (0, 1), value=1.0) @ torch.linalg.inv(K).T
-    rotation, translation = three_point_poses(x[drawn], rays[torch.arange(len(q))[:, None, None], drawn])
+    frame = torch.arange(len(q), device=q.device)[:, None, None]
+    rotation, translation = three_point_poses(x[drawn], rays[frame, drawn])
     return rotation.flatten(1, 2), translation.flatten(1, 2)
 
 
@@ -149,7 +151,7 @@ def _refined(
     """Poses (B,H) after least squares on their own inliers, chosen anew a few times."""
     shape = rotation.shape[:2]
     rotation, translation = rotation.clone(), translation.clone()
-    before = torch.zeros(*shape, len(x), dtype=torch.bool)
+    before = torch.zeros(*shape, len(x), dtype=torch.bool, device=x.device)
     for _ in range(_ROUNDS):
         squared = _squared(x, q, K, rotation, translation)
         agreed = (squared * w[:, None] < limit[:, None, None].square()) & (w > 0)[:, None]
@@ -183,9 +185,10 @@ def _squared(x: Tensor, q: Tensor, K: Tensor, rotation: Tensor, translation: Ten
     return torch.where(depth > near, u * u + v * v, torch.inf).nan_to_num(torch.inf)
 
 
-def _given(start: Pose | None, frames: int) -> Tensor:
+def _given(start: Pose | None, q: Tensor) -> Tensor:
+    frames = len(q)
     if start is None:
-        return torch.full((frames, 3, 4), torch.nan, dtype=torch.float64)
+        return q.new_full((frames, 3, 4), torch.nan)
     if start.rotation.shape != (frames, 3, 3) or start.translation.shape != (frames, 3):
         raise ShapeError(
             f"start: found rotation {tuple(start.rotation.shape)} and translation {tuple(start.translation.shape)}, "
@@ -194,8 +197,8 @@ def _given(start: Pose | None, frames: int) -> Tensor:
     return torch.cat([start.rotation.detach().double(), start.translation.detach().double()[..., None]], dim=-1)
 
 
-def _limits(threshold: float | Tensor, frames: int, hypotheses: int) -> Tensor:
-    limit = torch.as_tensor(threshold, dtype=torch.float64).detach()
+def _limits(threshold: float | Tensor, q: Tensor, hypotheses: int) -> Tensor:
+    limit, frames = torch.as_tensor(threshold, dtype=q.dtype, device=q.device).detach(), len(q)
     if limit.shape not in ((), (frames,)):
         raise ShapeError(f"threshold: found {tuple(limit.shape)}, expected one number or ({frames},)")
     if not ((limit > 0) & limit.isfinite()).all() or hypotheses < 1:

@@ -93,7 +93,8 @@ class AdaptiveFilter:
                 "adaptive filter: found an infinite measurement, expected numbers, or NaN for not seen"
             )
         every = measured.double().flatten().repeat(self._models)
-        running = self._filter
+        self.scores = self.scores.to(measured.device)
+        running = self._filter.to(measured.device)
         running.predict()
         variance = running.covariance[:, 0, 0] + running.variance
         off = every - running.state[:, 0]
@@ -144,7 +145,7 @@ def adaptive_smoother(values: Tensor, settings: AdaptiveSettings | None = None) 
 def _long_gaps(values: Tensor, longest: int) -> Tensor:
     """Where (T,P,D) is NaN for more than ``longest`` frames in succession."""
     unseen = values.isnan()
-    frames = torch.arange(len(values)).reshape(-1, 1, 1)
+    frames = torch.arange(len(values), device=values.device).reshape(-1, 1, 1)
     last = torch.where(unseen, -1, frames).cummax(0).values
     following = torch.where(unseen, len(values), frames).flip(0).cummin(0).values.flip(0)
     return unseen & (following - last - 1 > longest)

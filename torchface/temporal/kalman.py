@@ -79,6 +79,13 @@ class KalmanFilter:
         self._transition, noise = _model(each[0].fading)
         self._noise = noise * torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
 
+    def to(self, device: torch.device) -> KalmanFilter:
+        """The filter itself, with all that it holds on a device; ``step`` follows its measurements there."""
+        if self.state.device != device:
+            for name in ("variance", "state", "covariance", "_longest_gap", "_unseen", "_transition", "_noise"):
+                setattr(self, name, getattr(self, name).to(device))
+        return self
+
     def predict(self) -> None:
         """Goes one frame on."""
         self.state = self.state @ self._transition.T
@@ -94,7 +101,7 @@ class KalmanFilter:
         gain = torch.where((seen & ~fresh)[:, None], gain, 0.0)
         self.state = self.state + gain * innovation[:, None]
         # Joseph's form stays symmetric and positive, whatever is rounded.
-        keep = torch.eye(3, dtype=torch.float64) - gain[:, :, None] * torch.tensor([1.0, 0, 0], dtype=torch.float64)
+        keep = torch.eye(3, dtype=gain.dtype, device=gain.device) - gain[:, :, None] * gain.new_tensor([1.0, 0, 0])
         noise = self.variance[:, None, None] * gain[:, :, None] * gain[:, None]
         self.covariance = keep @ self.covariance @ keep.transpose(1, 2) + noise
         first, first_covariance = _first(measured.double(), self.variance)
@@ -113,7 +120,7 @@ class KalmanFilter:
             raise ShapeError(f"Kalman filter: found {tuple(measured.shape)}, expected ({len(self.state)},)")
         if measured.isinf().any():
             raise ValueRangeError("Kalman filter: found an infinite measurement, expected numbers, or NaN for not seen")
-        self.predict()
+        self.to(measured.device).predict()
         self.correct(measured)
         return self.state[:, 0]
 
@@ -155,6 +162,7 @@ def kalman_smoother(values: Tensor, settings: KalmanSettings | Sequence[KalmanSe
         running = KalmanFilter(curves.shape[1], replace(settings, longest_gap=frames))
     else:
         running = KalmanFilter(curves.shape[1], [replace(one, longest_gap=frames) for one in settings])
+    running.to(curves.device)
     transition = running._transition
     predicted, filtered = [], []
     for frame in curves:
@@ -200,8 +208,8 @@ def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) 
     channels, ratios = curves.shape[1], len(_RATIOS)
     # All ratios at once: each channel is filtered under every one.
     each = [KalmanSettings(1.0, ratio, len(curves)) for ratio in _RATIOS.tolist() for _ in range(channels)]
-    running = KalmanFilter(ratios * channels, each)
-    squares, logs, count = torch.zeros(ratios, dtype=torch.float64), torch.zeros(ratios, dtype=torch.float64), 0
+    running = KalmanFilter(ratios * channels, each).to(curves.device)
+    squares, logs, count = curves.new_zeros(ratios), curves.new_zeros(ratios), 0
     for frame in curves.repeat(1, ratios):
         running.predict()
         known = ~(frame.isnan() | running.state[:, 0].isnan())
@@ -229,14 +237,14 @@ def _model(fading: float) -> tuple[Tensor, Tensor]:
 def _first(measured: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """State and covariance of channels (C,) at their first measurement."""
     state = torch.nn.functional.pad(measured[:, None], (0, 2))
-    share = torch.tensor([1.0, _FIRST_VELOCITY**2, _FIRST_ACCELERATION**2], dtype=torch.float64)
+    share = variance.new_tensor([1.0, _FIRST_VELOCITY**2, _FIRST_ACCELERATION**2])
     return state, torch.diag_embed(variance[:, None] * share).expand(len(measured), 3, 3)
 
 
 def _regular(covariance: Tensor) -> Tensor:
     """Covariances (C,3,3) that can be inverted, also of channels not yet seen, which have none."""
     empty = (covariance[:, 0, 0] <= 0)[:, None, None]
-    return torch.where(empty, torch.eye(3, dtype=covariance.dtype), covariance)
+    return torch.where(empty, torch.eye(3, dtype=covariance.dtype, device=covariance.device), covariance)
 
 
 def _checked(values: Tensor) -> Tensor:
@@ -244,4 +252,4 @@ def _checked(values: Tensor) -> Tensor:
         raise ShapeError(f"Kalman filter: found values {tuple(values.shape)}, expected (T,...) with a frame at least")
     if values.isinf().any():
         raise ValueRangeError("Kalman filter: found infinite measurements, expected numbers, or NaN for not seen")
-    return values.detach().cpu().double().reshape(len(values), -1)
+    return values.detach().double().reshape(len(values), -1)

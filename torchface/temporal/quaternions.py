@@ -34,7 +34,7 @@ class RotationFilter:
             ValueRangeError: infinite, or of no length.
         """
         _check(measured[None] if measured.ndim == 1 else measured)
-        self._filter.predict()
+        self._filter.to(measured.device).predict()
         predicted = self._filter.state[:, 0]
         unit = torch.nn.functional.normalize(measured.double(), dim=0)
         self._filter.correct(torch.where((unit * predicted).sum() < 0, -unit, unit))

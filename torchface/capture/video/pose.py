@@ -115,9 +115,9 @@ class PoseTracker:
         """
         # Operations are many and small; what tensors keep for derivatives is a fifth of their price.
         with torch.inference_mode():
-            self._filter.predict()
+            self._filter.to(landmarks.device).predict()
             before = self._filter.likeliest()
-            start = Pose(before[0][None], before[1][None], torch.zeros(1))
+            start = Pose(before[0][None], before[1][None], before[1].new_zeros(1))
             weights = None if confidence is None else confidence[None]
             measured = _measured(self.points, landmarks[None], self.intrinsics, self.settings, weights, start)
             pose = _filtered_step(self._filter, measured, 0)
@@ -176,7 +176,7 @@ def filter_poses(poses: HeadPoses, settings: PoseSettings | None = None) -> Head
         torch.stack([step.rotation for step in steps]),
         torch.stack([step.translation for step in steps]),
         poses.errors,
-        torch.tensor([step.found for step in steps]),
+        torch.tensor([step.found for step in steps], device=poses.errors.device),
     )
 
 
@@ -237,8 +237,8 @@ def track_pose(
     poses = HeadPoses(
         torch.stack([step.rotation for step in steps]),
         torch.stack([step.translation for step in steps]),
-        torch.tensor([step.error for step in steps], dtype=torch.float64),
-        torch.tensor([step.found for step in steps]),
+        torch.tensor([step.error for step in steps], dtype=torch.float64, device=landmarks.device),
+        torch.tensor([step.found for step in steps], device=landmarks.device),
     )
     _check_found(poses, landmarks, chosen)
     return poses
@@ -253,9 +253,9 @@ def _measured(
     start: Pose | None,
 ) -> HeadPoses:
     _check_landmarks(landmarks, confidence)
-    stable = torch.tensor(STABLE_LANDMARKS)
+    stable = torch.tensor(STABLE_LANDMARKS, device=landmarks.device)
     x, q = points[stable], landmarks[:, stable].double()
-    weights = _TRUST.expand(len(q), -1)
+    weights = _TRUST.to(q).expand(len(q), -1)
     if confidence is not None:
         weights = weights * confidence[:, stable].double().nan_to_num(0.0).clamp(min=0)
     found = robust_pnp(x, q, intrinsics, _limits(x, q, settings), weights, start, seed=settings.seed)
@@ -268,7 +268,7 @@ def _judged(x: Tensor, intrinsics: Tensor, found: RobustPose, weights: Tensor, s
     w = torch.where(found.inliers, weights, 0.0)
     rotation = torch.where(enough[:, None, None], found.pose.rotation, torch.nan)
     translation = torch.where(enough[:, None], found.pose.translation, torch.nan)
-    covariance = torch.full((len(enough), 6, 6), torch.nan, dtype=torch.float64)
+    covariance = translation.new_full((len(enough), 6, 6), torch.nan)
     covariance[enough] = pose_covariance(x, rotation[enough], translation[enough], intrinsics, w[enough])
     return HeadPoses(rotation, translation, torch.where(enough, found.pose.errors, torch.nan), enough, covariance)
 
@@ -311,7 +311,7 @@ def _check_landmarks(landmarks: Tensor, confidence: Tensor | None) -> None:
 
 def _check_found(poses: HeadPoses, landmarks: Tensor, settings: PoseSettings) -> None:
     if not bool(poses.found.any()):
-        seen = torch.isfinite(landmarks[:, torch.tensor(STABLE_LANDMARKS)]).all(-1).sum(1)
+        seen = torch.isfinite(landmarks[:, list(STABLE_LANDMARKS)]).all(-1).sum(1)
         raise AlignmentError(
             f"head pose: found at most {int(seen.max())} of the {len(STABLE_LANDMARKS)} stable landmarks in any of "
             f"{len(seen)} frames, expected {settings.fewest} that agree with one pose in some frame"

@@ -110,6 +110,15 @@ class PoseFilter:
         """Whether the last frame began anew, whatever was before."""
         self._unseen = self._odd = 0
 
+    def to(self, device: torch.device) -> PoseFilter:
+        """The filter itself, with all that it holds on a device; ``correct`` follows its poses there."""
+        if self._steps.device != device:
+            for name in ("scores", "_variance", "_drift", "_steps"):
+                setattr(self, name, getattr(self, name).to(device))
+            if self.belief is not None:
+                self.belief = _Belief(*(part.to(device) for part in vars(self.belief).values()))
+        return self
+
     def predict(self) -> None:
         """Goes one frame on."""
         if self.belief is None:
@@ -130,7 +139,7 @@ class PoseFilter:
 
     def correct(self, rotation: Tensor, translation: Tensor, covariance: Tensor) -> None:
         """Takes in a frame's pose (3,3), (3,) with its covariance (6,6) at one pixel of noise; NaN where not found."""
-        self.began = False
+        self.to(translation.device).began = False
         if not bool(torch.isfinite(translation).all()):
             self._missed()
             return
@@ -166,7 +175,7 @@ class PoseFilter:
     def pose(self) -> tuple[Tensor, Tensor]:
         """Rotation (3,3) and translation (3,) as all models together have it; NaN where the head is lost."""
         if self.belief is None:
-            return torch.full((3, 3), torch.nan, dtype=torch.float64), torch.full((3,), torch.nan, dtype=torch.float64)
+            return self._steps.new_full((3, 3), torch.nan), self._steps.new_full((3,), torch.nan)
         share = self._shares()
         best = self.belief.rotation[int(share.argmax())]
         turns = rotation_vector(self.belief.rotation @ best.T)
@@ -192,17 +201,17 @@ class PoseFilter:
 
     def _begin(self, rotation: Tensor, translation: Tensor, noise: Tensor) -> None:
         models = len(noise)
-        known = torch.tensor([_FIRST_VELOCITY, _FIRST_ACCELERATION], dtype=torch.float64)
-        covariance = torch.zeros(models, 18, 18, dtype=torch.float64)
+        known = noise.new_tensor([_FIRST_VELOCITY, _FIRST_ACCELERATION])
+        covariance = noise.new_zeros(models, 18, 18)
         covariance[:, :6, :6] = _symmetric(noise)
         covariance[:, range(6, 18), range(6, 18)] = known.repeat_interleave(3, dim=1).flatten().square()
         rotation = _orthonormal(rotation.double()).expand(models, 3, 3)
-        rate = torch.zeros(models, 2, 6, dtype=torch.float64)
+        rate = noise.new_zeros(models, 2, 6)
         self.belief = _Belief(rotation, translation.double().expand(models, 3), rate, covariance)
         self._unseen = self._odd = 0
         self.began = True
         if not len(self.scores):
-            self.scores = torch.zeros(models, dtype=torch.float64)
+            self.scores = noise.new_zeros(models)
 
     def _missed(self) -> None:
         self._unseen += 1
@@ -212,7 +221,8 @@ class PoseFilter:
 
 def _orthonormal(rotations: Tensor) -> Tensor:
     """What is a rotation up to rounding, without it: a step of Newton's method for the polar factor."""
-    return rotations @ (3 * torch.eye(3, dtype=rotations.dtype) - rotations.transpose(-1, -2) @ rotations) / 2
+    identity = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+    return rotations @ (3 * identity - rotations.transpose(-1, -2) @ rotations) / 2
 
 
 def _symmetric(matrices: Tensor) -> Tensor:

@@ -51,7 +51,8 @@ def solve_whole_take(
         first = int(enough.nonzero()[0, 0])
         smoothed = _smoothed(solver, states[first:])
         head = _solved(solver, states[first:], smoothed)
-    rows = (torch.arange(len(landmarks)) - first).clamp(min=0)  # frames before the first face have its state
+    frames = torch.arange(len(landmarks), device=landmarks.device)
+    rows = (frames - first).clamp(min=0)  # frames before the first face have its state
     weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
     weights = interpolated(weights, enough)
     return VideoSolution(weights, turned, moved, solver.reprojection_errors(landmarks, weights, turned, moved), enough)
@@ -103,10 +104,9 @@ def _smoothed(solver: VideoSolver, states: list[VideoState]) -> Belief:
 
 def _solved(solver: VideoSolver, states: list[VideoState], smoothed: Belief) -> HeadState:
     """The frames' weights and poses under the prior; their landmarks are in what is expected already."""
-    expected = Belief(
-        smoothed.mean,
-        smoothed.covariance + _ROUNDING * torch.eye(smoothed.covariance.shape[1], dtype=smoothed.covariance.dtype),
-    ).expectation()
+    spread = smoothed.covariance
+    identity = torch.eye(spread.shape[1], dtype=spread.dtype, device=spread.device)
+    expected = Belief(smoothed.mean, spread + _ROUNDING * identity).expectation()
     count = len(states)
     like = smoothed.mean.weights
     none = like.new_zeros(count, LANDMARKS)
