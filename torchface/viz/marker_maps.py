@@ -69,13 +69,14 @@ def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str],
     axes.imshow(image.permute(1, 2, 0).numpy())
     shown = facing(mesh, points, yaw)
     at = camera.project(points.double())
-    axes.scatter(*at[shown].T, s=34, c=colors[shown.numpy()], edgecolors="black", linewidths=0.6)
+    x, y = at[shown].T
+    axes.scatter(x, y, s=34, c=colors[shown.numpy()], edgecolors="black", linewidths=0.6)
     for i in shown.nonzero()[:, 0].tolist():
         if labels[i]:
             left = float(at[i, 0]) < _WIDTH / 2
             axes.annotate(
                 labels[i],
-                at[i].tolist(),
+                (float(at[i, 0]), float(at[i, 1])),
                 xytext=(-6 if left else 6, 6),
                 textcoords="offset points",
                 ha="right" if left else "left",

@@ -17,7 +17,7 @@ body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240p
 h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
 img { max-width: 100%; height: auto; display: block; margin: .6rem 0 }
 table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8rem .15rem 0; text-align: left }
-td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
+td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right } summary { cursor: pointer; color: #1f5fa8 }
 thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
 p { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
 """
@@ -27,10 +27,11 @@ _LONG = 60
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under a heading row."""
+    """Rows of cells under a heading row; with a ``summary`` that alone shows until it is opened."""
 
     heading: Sequence[str]
     rows: Sequence[Sequence[str]]
+    summary: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,4 +80,5 @@ def _table(table: Table) -> str:
         )
 
     body = "\n".join(row(cells, "td") for cells in table.rows)
-    return f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"
+    text = f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"
+    return f"<details><summary>{html.escape(table.summary)}</summary>\n{text}</details>\n" if table.summary else text

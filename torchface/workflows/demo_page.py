@@ -101,7 +101,9 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
     solved, single = result.solved, result.frame_by_frame
     first = _busiest(scene.weights[:, active], round(_CURVE_SECONDS * scene.fps))
     curves = compared_curves(
-        *(weights[:, active] for weights in (scene.weights, solved.weights, single.weights)),
+        scene.weights[:, active],
+        solved.weights[:, active],
+        single.weights[:, active],
         [names[i] for i in active.tolist()],
         scene.fps,
         first,

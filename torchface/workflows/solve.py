@@ -313,7 +313,7 @@ def solve_take(
         say("writing the report")
         from torchface.workflows.solve_page import write_solve_page
 
-        write_solve_page(report, take.name, done)
+        write_solve_page(report, take.name, done, loaded, solution)
     if stream is not None:
         say(f"sending to {stream}")
         done = replace(done, sent=_sent(loaded, solution, settings, stream, predicted is not None))
