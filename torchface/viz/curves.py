@@ -22,7 +22,7 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
     median = float(error.nanmedian())
     axes.axhline(median, color="grey", linewidth=0.8, linestyle="--", label=f"median {median:.3f}")
     axes.set(xlabel="seconds", ylabel=label, ylim=(0, None), xlim=(0, float(seconds[-1])))
-    axes.legend(loc="upper right", frameon=False)
+    axes.legend(loc="lower right", frameon=False)
     return from_figure(figure)
 
 

@@ -17,7 +17,8 @@ body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240p
 h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
 img { max-width: 100%; height: auto; display: block; margin: .6rem 0 }
 table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8rem .15rem 0; text-align: left }
-td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right } summary { cursor: pointer; color: #1f5fa8 }
+td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
+summary { cursor: pointer; color: #1f5fa8 }
 thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
 p { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
 """

@@ -142,7 +142,7 @@ def _marker_sections(
     ]
     heading = ("marker", "RMSE", "constant part", "95th percentile", "seen")
     points = solution.attachment.on(rig.neutral.faces, rig.vertices)
-    picture = marker_map(rig.neutral, points, each, round_maximum(2 * float(each.nanmedian())), labels)
+    picture = marker_map(rig.neutral, points, each, round_maximum(1.5 * float(each.nanmedian())), labels)
     text = (
         "Worst first. A constant part that makes up most of an error speaks of a site that is wrong (see torchface "
         "attach), the rest of noise, swaps and shapes that the rig lacks."

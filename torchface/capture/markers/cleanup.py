@@ -19,6 +19,7 @@ from torchface.take import Take, Track
 _SPIKE_SECONDS, _GAP_SECONDS = 0.1, 0.25
 _DISPLACED_SHARE = 0.7
 _LISTED_GAP = 2
+_GRAVEST_FIRST = ("swap", "displaced", "spike", "gap")
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Cleanup:
     masked: Tensor
 
     def table(self, gaps: bool = True) -> list[tuple[str, ...]]:
-        """Rows for people to read: kind, markers, frames, size, action."""
+        """Rows for people to read, gravest kind first: kind, markers, frames, size, action."""
         return [
             (
                 defect.kind,
@@ -67,14 +68,14 @@ class Cleanup:
                 f"{defect.size:.1f} mm" if defect.size else "",
                 defect.action,
             )
-            for defect in self.defects
+            for defect in sorted(self.defects, key=lambda defect: _GRAVEST_FIRST.index(defect.kind))
             if gaps or defect.kind != "gap"
         ]
 
     def summary(self) -> str:
         """How many of each."""
         counts = Counter(defect.kind for defect in self.defects)
-        found = ", ".join(f"{kind}: {counts[kind]}" for kind in ("swap", "spike", "displaced", "gap") if counts[kind])
+        found = ", ".join(f"{kind}: {counts[kind]}" for kind in _GRAVEST_FIRST if counts[kind])
         share = 100 * float(self.masked.double().mean()) if self.masked.numel() else 0.0
         return f"{found or 'nothing wrong'}; {share:.2f} % of the samples masked"
 
