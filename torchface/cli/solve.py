@@ -54,7 +54,7 @@ def solve(
         action_units: The classifier for the video, by name or folder; see `python -m train.action_units`.
         labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if absent.
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
-        report: A folder for a page: the face playing, the error of each marker, what was wrong with the take, every curve.
+        report: A folder for a page: the face playing, the error of each marker, what was wrong, every curve.
         stream: Then send the frames in their own time, as Live Link Face does: udp://127.0.0.1:11111 for Unreal on
             this machine. Each is smoothed by those before it (not with --frame-by-frame).
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
