@@ -34,7 +34,7 @@ from torchface.rendering.compositing import caption, heat_colors, save_picture, 
 from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.workflows.fit import overlay
+from torchface.workflows.fit_overlay import overlay
 
 pytestmark = pytest.mark.real
 

@@ -13,6 +13,7 @@ from torchface.geometry.camera import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.photo_texture import PhotoTexture, photo_texture
+from torchface.modeling.skin_mask import skin_shares
 from torchface.modeling.texture import fit_colors
 from torchface.rendering.shading import Lighting, render
 from torchface.synthetic import head
@@ -155,3 +156,28 @@ def test_bad_input_is_named(
         photo_texture(subject, lit[:1], [away])
     with pytest.raises(TopologyError, match="without texture coordinates"):
         photo_texture(Mesh(subject.vertices, subject.faces), lit, cameras)
+
+
+def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras: list[Camera]) -> None:
+    """Dressed in a blue collar and black hair, the head wears skin there; its face stays as it was photographed."""
+    assert subject.annotations is not None
+    regions = subject.annotations.regions
+    hair, collar, cheeks = regions["cranium"], regions["neck"] & ~regions["face"], regions["cheek_left"]
+    blue, black = torch.tensor([0.1, 0.2, 0.7]), torch.tensor([0.08, 0.06, 0.05])
+    dressed = skins[40].clone()
+    dressed[hair], dressed[collar] = black, blue
+    pictures = [
+        render(replace(subject, colors=dressed), c, lighting=EVEN, background=GREEN, samples=1) for c in cameras
+    ]
+    painted = photo_texture(subject, pictures, cameras, 256)
+    masked = photo_texture(subject, pictures, cameras, 256, trust=skin_shares(subject, pictures, cameras))
+    skin = skins[40][regions["face"]].median(0).values
+    for cloth, color in ((hair, black), (collar, blue)):
+        assert float(((painted.colors[cloth] - color).norm(dim=-1) < 0.2).float().mean()) > 0.3
+        assert float(((masked.colors[cloth] - color).norm(dim=-1) < 0.2).float().mean()) < 0.02
+        assert float((masked.colors[cloth] - skin).norm(dim=-1).mean()) < 0.15
+    assert float((masked.colors - painted.colors)[cheeks].norm(dim=-1).quantile(0.95)) < 0.05
+    pairs = subject.faces[:, :2]  # nor is there a seam where the photographs end
+    outside = (hair | collar)[pairs].any(1)
+    jump = (masked.colors[pairs[:, 0]] - masked.colors[pairs[:, 1]]).norm(dim=-1)[outside]
+    assert float(jump.quantile(0.99)) < 0.06

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -10,20 +11,24 @@ from torch import Tensor
 
 from torchface import load_rig, save_rig, zoo
 from torchface.cli import main
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.alignment import similarity_transform
 from torchface.geometry.camera import look_at
+from torchface.io import load_identity_modes
 from torchface.io.cameras import load_calibration
 from torchface.io.images import load_image, save_image
 from torchface.io.landmarks import load_landmark_points
-from torchface.landmarks import NoFaceError, TrackedFace
-from torchface.modeling import HeadModel, MorphableModel
+from torchface.landmarks import NoFaceError, TrackedFace, find_faces
+from torchface.modeling import HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.identity import anatomy
-from torchface.workflows.fit import fit_photographs, landmarks_of, load_head_model, matching
+from torchface.workflows.fit import fit_photographs
+from torchface.workflows.fit_checks import one_person_lines
+from torchface.workflows.fit_landmarks import landmarks_of
+from torchface.workflows.fit_model import load_head_model, matching
 from torchface.workflows.found_landmarks import FoundLandmarks
 
 YAWS = (-35.0, 0.0, 35.0)
@@ -176,7 +181,9 @@ def dlib_xml(path: Path, faces: list[tuple[str, int]]) -> Path:
 
 
 def test_an_xml_tells_whose_face_is_meant(tmp_path: Path) -> None:
-    photographs = [Path("a.png"), Path("b.png")]
+    photographs = [tmp_path / name for name in ("a.png", "b.png")]
+    for path in photographs:
+        save_image(torch.full((3, 60, 80), 0.5), path)
     file = dlib_xml(tmp_path / "faces.xml", [("x/a.png", 68), ("b.png", 68), ("b.png", 68), ("c.png", 5)])
     with pytest.raises(NameMismatchError, match=r"found 2 faces in b\.png, choose one of --face 0: at \(1, 1\), 1: at"):
         landmarks_of(photographs, [file])
@@ -202,3 +209,87 @@ def test_files_that_do_not_belong_together_are_named(studio: Path, tmp_path: Pat
     dome = HeadModel.on(dome_rig.neutral, MorphableModel(dome_rig.vertices, dome_rig.deltas[:1], torch.ones(1)))
     with pytest.raises(TopologyError, match="name a rig with --template"):
         matching(dome)
+
+
+@pytest.mark.real
+def test_a_face_has_one_number_with_and_without_a_file(data: Path) -> None:
+    folder = data / "images" / "dlib_faces"
+    file, compared = folder / "training_with_face_landmarks.xml", 0
+    for photograph in sorted(folder.glob("*.jpg"))[::3]:
+        image = load_image(photograph)
+        detected = find_faces((image * 255).to(torch.uint8))
+        for number, box in enumerate(detected.boxes):
+            points = landmarks_of([photograph], [file], number)[0]
+            inside = ((points >= box[:2] - 0.3 * box[2:]) & (points <= box[:2] + 1.3 * box[2:])).all(1)
+            if not bool(((points.mean(0) >= box[:2]) & (points.mean(0) <= box[:2] + box[2:])).all()):
+                continue  # a face that the file does not label
+            assert float(inside.double().mean()) > 0.9
+            compared += 1
+    assert compared >= 6
+
+
+PEOPLE = ("einstein.jpg", "lfpw_1.png", "lfpw_2.png", "takeo.ppm")
+"""The second and third are one woman."""
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """A model of people, and photographs with their landmarks."""
+
+    model: Path
+    photographs: list[Path]
+    heads: HeadModel
+    rig: BlendshapeRig
+
+    def remarks(self, *which: int, insist: bool = False) -> list[str]:
+        photographs = [self.photographs[i] for i in which]
+        marks = torch.stack(landmarks_of(photographs, [path.with_suffix(".pts") for path in photographs]))
+        sizes = [load_image(path).shape[:0:-1] for path in photographs]
+
+        def bare(points: Tensor, rows: list[int]) -> ImageFit:
+            return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], transfers=0)
+
+        return one_person_lines(photographs, marks, bare, insist)
+
+
+@pytest.fixture(scope="module")
+def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> People:
+    modes, rig = load_identity_modes(ict_folder, part="face"), load_rig(ict_folder, part="face")
+    sizes = modes.deltas.flatten(1).norm(dim=1)
+    heads = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes.deltas / sizes[:, None, None], sizes), rig=rig)
+    model = tmp_path_factory.mktemp("models") / "people"
+    zoo.save_model(heads, model, licence="MIT", data="ICT", metrics={}, recipe="none")
+    return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
+
+
+@pytest.mark.real
+def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) -> None:
+    photographs, out = [people.photographs[0], people.photographs[3]], tmp_path / "rig.glb"
+    marks = [path.with_suffix(".pts") for path in photographs]
+    with pytest.raises(AlignmentError, match=r"shows another person than the rest.*einstein\.jpg -[45]\..*--insist"):
+        fit_photographs(photographs, marks, people.model, out)
+    assert not out.exists()
+    assert any("may show different people" in line for line in people.remarks(0, 3, insist=True))
+    for stranger in (0, 3):
+        for known in (1, 2):
+            assert any("may show different people" in line for line in people.remarks(stranger, known, insist=True))
+    assert people.remarks(1, 2) == []
+    with pytest.raises(AlignmentError, match=r"einstein\.jpg: shows another person"):
+        people.remarks(0, 1, 2)
+
+
+@pytest.mark.real
+def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path) -> None:
+    photograph = people.photographs[3]
+    files = [photograph.with_suffix(".pts")]
+    made = fit_photographs([photograph], files, people.model, tmp_path / "rig.glb", texture_size=0)
+    assert len(made.remarks) == 1
+    assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
+    assert "those that face_landmarks finds are" in made.remarks[0]
+    assert made.remarks[0] in made.lines([photograph])
+
+
+def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Path) -> None:
+    photographs, marks = ([studio / f"p{i}.{ending}" for i in range(3)] for ending in ("png", "pts"))
+    made = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "rig.glb", texture_size=0)
+    assert made.remarks == ()

@@ -23,6 +23,8 @@ def fit(
     face: int | None = None,
     texture_size: int = 1024,
     names: Literal["arkit"] | None = None,
+    everything: bool = False,
+    insist: bool = False,
     quiet: bool = False,
 ) -> None:
     """Make a person's rig from one or several photographs, and write it as .glb.
@@ -30,9 +32,9 @@ def fit(
     A head model is fitted to 68 landmarks in each photograph: identity, expression, poses and focal length at once.
     Landmarks that no file gives are found; they are written as .pts beside OUT, to be looked at and corrected.
     All photographs show one person with one expression; profiles beside a front view tell how far things stand out.
-    The photographs become the rig's texture. Beside OUT lies a picture for each photograph: it, the fit over it, and
-    the landmarks, found green and fitted red; and its camera as .toml, for `torchface track --camera` where the video
-    is from the same.
+    The skin that they show becomes the rig's texture. Beside OUT lies a picture for each photograph: it, the fit over
+    it, and the landmarks, found green and fitted red; and its camera as .toml, for `torchface track --camera` where the
+    video is from the same.
 
     Args:
         photographs: Image files.
@@ -46,10 +48,14 @@ def fit(
         part: Keep this region of model and template, such as face of ICT-FaceKit's head.
         focal: Focal length in pixels where it is known; estimated if absent.
         inner_weight: Weight of landmarks at brows, eyes, nose and mouth beside those of the face's contour.
-        face: Which face of a photograph, from 0, where it shows several (the largest first) or an .xml holds several.
+        face: Which face of a photograph that shows several, from 0: as faces are detected, the largest first, with and
+            without landmarks from a file.
         texture_size: Texels a side of the rig's texture; 0 makes none.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
+        everything: Paint hair, clothes and what else hangs before the head on it; skin, eyes, brows and mouth alone if
+            absent.
+        insist: Write a rig also where the photographs do not seem to show one person.
         quiet: Show no progress.
     """
     from torchface.modeling import FitSettings
@@ -72,6 +78,8 @@ def fit(
             landmark_model,
             names,
             part,
+            everything,
+            insist,
         )
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False, markup=False)

@@ -74,6 +74,7 @@ def fit_images(
     settings: FitSettings | None = None,
     transfers: int = 1,
     texture_size: int = 1024,
+    masked: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> ImageFit:
     r"""The head whose landmarks are seen where photographs show them.
@@ -98,6 +99,7 @@ def fit_images(
         settings: how landmarks are trusted; see ``FitSettings``.
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
+        masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
         progress: called with a line before each step.
 
     Returns:
@@ -146,7 +148,7 @@ def fit_images(
     if images is None:
         return fit
     say("laying the photographs on the head")
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size)
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size, masked)
     return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
 
 

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from torchface.geometry.camera import Camera
 from torchface.mesh import Mesh
+from torchface.modeling.landmark_view import LANDMARKS
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.photo_texture import photo_texture
+from torchface.modeling.skin_mask import skin_shares
 from torchface.modeling.texture import ColorFit, fit_colors
 from torchface.rendering.shading import sample_texture
 
@@ -31,7 +33,12 @@ class Skin:
 
 
 def photographed_skin(
-    posed: Mesh, color: MorphableModel | None, images: Sequence[Tensor], cameras: Sequence[Camera], size: int = 1024
+    posed: Mesh,
+    color: MorphableModel | None,
+    images: Sequence[Tensor],
+    cameras: Sequence[Camera],
+    size: int = 1024,
+    masked: bool = True,
 ) -> Skin:
     """What photographs and a colour model tell of a head's skin.
 
@@ -41,6 +48,7 @@ def photographed_skin(
         images: photographs, (3,H,W) each.
         cameras: one each.
         size: of the texture, texels a side; 0 makes none.
+        masked: lay only skin and the face's features on the head; else also hair, clothes and what stands behind.
 
     Returns:
         With texture coordinates: the photographs laid on the head, and where none shows it the colour model, else the
@@ -50,8 +58,14 @@ def photographed_skin(
     base = _own_colors(posed) if fit is None else fit.colors
     if posed.uvs is None or size == 0:
         return Skin(base, None, fit)
-    laid = photo_texture(posed, images, cameras, size, base)
+    trust = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
+    laid = photo_texture(posed, images, cameras, size, base, trust)
     return Skin(laid.colors, laid.image, fit)
+
+
+def _has_landmarks(mesh: Mesh) -> bool:
+    known = mesh.annotations
+    return known is not None and known.landmarks is not None and len(known.landmarks) == LANDMARKS
 
 
 def _own_colors(mesh: Mesh) -> Tensor | None:

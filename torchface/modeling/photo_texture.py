@@ -13,13 +13,16 @@ from torchface.geometry.camera import Camera
 from torchface.geometry.operators import border_vertices, components, edges, vertex_normals
 from torchface.geometry.uv_margin import laid_out
 from torchface.geometry.uv_raster import rasterise_uvs
+from torchface.geometry.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.visibility import Shown, shown_in
 
 _SQUARELY = 0.2
+_TRUSTED = 0.5
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
+_LOST = 0.01
 _MOST_GAIN = 4.0
 _DARK, _MOST_TONE = 0.05, 0.5
 _NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
@@ -46,6 +49,7 @@ def photo_texture(
     cameras: Sequence[Camera],
     size: int = 1024,
     base: Tensor | None = None,
+    trust: Tensor | None = None,
 ) -> PhotoTexture:
     """Lays photographs on a head.
 
@@ -61,6 +65,8 @@ def photo_texture(
         cameras: one each.
         size: texels a side.
         base: colours for what no photograph shows, (V,3), such as ``fit_colors`` gives; those nearby if absent.
+        trust: how far each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
+            everywhere if absent.
 
     Raises:
         ShapeError: not one camera an image, a picture of another size than its camera's, or a base of another shape.
@@ -76,12 +82,19 @@ def photo_texture(
     if base is not None and base.shape != mesh.vertices.shape:
         raise ShapeError(f"base: found {tuple(base.shape)}, expected {tuple(mesh.vertices.shape)}")
     vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-    normals, caster, graph = vertex_normals(vertices, faces), RayCaster(vertices, faces), _Graph(faces, len(vertices))
+    normals, caster, graph = (
+        vertex_normals(vertices, faces),
+        RayCaster(vertices, faces),
+        VertexGraph(faces, len(vertices)),
+    )
     at_vertices = [
         shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
     ]
     outside = _outer_border(vertices, faces)
-    weights = torch.stack([_faded(shown, graph, outside) for shown in at_vertices])
+    trusted = torch.ones(len(images), len(vertices), dtype=torch.float64) if trust is None else trust.cpu().double()
+    weights = torch.stack(
+        [_faded(shown, graph, (one < _TRUSTED) | outside) for shown, one in zip(at_vertices, trusted, strict=True)]
+    )
     seen = weights.sum(0)
     if float(seen.max()) <= 0:
         raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
@@ -108,36 +121,6 @@ def photo_texture(
     return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
 
 
-class _Graph:
-    """Which vertices are neighbours, for fading and filling over the mesh rather than over its layout."""
-
-    def __init__(self, faces: Tensor, count: int) -> None:
-        self.first, self.second = edges(faces).T
-        degree = torch.zeros(count, dtype=torch.float64)
-        one = torch.ones(len(self.first), dtype=torch.float64)
-        self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
-
-    def sum(self, values: Tensor) -> Tensor:
-        """Of each vertex's neighbours, (V,C)."""
-        total = torch.zeros_like(values).index_add_(0, self.first, values[self.second])
-        return total.index_add_(0, self.second, values[self.first])
-
-    def smoothed(self, values: Tensor, weights: Tensor, rounds: int) -> Tensor:
-        """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""
-        top, bottom = values * weights[:, None], weights[:, None]
-        for _ in range(rounds):
-            both = torch.cat([top, bottom], dim=1)
-            both = 0.5 * (both + self.sum(both) / self.degree[:, None])
-            top, bottom = both[:, :-1], both[:, -1:]
-        return top / bottom.clamp(min=1e-12)
-
-    def least(self, values: Tensor) -> Tensor:
-        """Of each vertex and its neighbours, (V,)."""
-        least = values.clone()
-        least.scatter_reduce_(0, self.first, values[self.second], "amin")
-        return least.scatter_reduce_(0, self.second, values[self.first], "amin")
-
-
 def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
     """The vertices (V,) of the widest opening, where the mesh ends but the person does not."""
     border = border_vertices(faces, len(vertices))
@@ -151,7 +134,7 @@ def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
     return result
 
 
-def _faded(shown: Shown, graph: _Graph, outside: Tensor) -> Tensor:
+def _faded(shown: Shown, graph: VertexGraph, outside: Tensor) -> Tensor:
     """A photograph's weight at each vertex, (V,): how squarely it is seen, fading to 0 before it ends."""
     weight = ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
     inner = ((weight > 0) & ~outside).double()
@@ -188,7 +171,7 @@ def _gains(shown: Sequence[Shown], weights: Tensor) -> Tensor:
     return torch.linalg.solve(H, g).exp().clamp(1 / _MOST_GAIN, _MOST_GAIN)
 
 
-def _blended(toned: Sequence[Tensor], weights: Tensor, graph: _Graph) -> tuple[Tensor, Tensor]:
+def _blended(toned: Sequence[Tensor], weights: Tensor, graph: VertexGraph) -> tuple[Tensor, Tensor]:
     """The vertices' colours (V,3), and what brings each photograph's broad tone to the mean, (I,V,3)."""
     colors = torch.stack(list(toned))
     mean = (weights[..., None] * colors).sum(0) / weights.sum(0).clamp(min=1e-12)[:, None]
@@ -199,7 +182,7 @@ def _blended(toned: Sequence[Tensor], weights: Tensor, graph: _Graph) -> tuple[T
     return corrected, offsets
 
 
-def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: _Graph) -> Tensor:
+def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: VertexGraph) -> Tensor:
     """Colours (V,3) where no photograph shows the skin: the mirror image, the base, else what is nearest, toned."""
     known, guess = alpha.clone(), colors * alpha[:, None]
     mirror = None if mesh.annotations is None else mesh.annotations.mirror
@@ -216,18 +199,24 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         edge = graph.smoothed(1 - known[:, None], torch.ones_like(known), _FEATHER)[:, 0]
         told = guess / known.clamp(min=1e-9)[:, None]
         return guess + (1 - known)[:, None] * _toned(under, told, known * (edge + 1e-3), graph, _FILL)
-    mean = (guess * alpha[:, None]).sum(0) / alpha.sum()
+    mean = (
+        colors[alpha > 0.5].median(0).values
+        if bool((alpha > 0.5).any())
+        else (guess * alpha[:, None]).sum(0) / alpha.sum()
+    )
     label = components(mesh.faces.cpu(), len(alpha))
     shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
     mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
     fixed = (known > 0.5)[:, None]
     guess = torch.where(fixed, guess / known.clamp(min=0.5)[:, None], mean)
-    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known
-        guess = torch.where(fixed, guess, graph.sum(guess) / graph.degree[:, None])
+    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known, and is lost on the way
+        guess = torch.where(fixed, guess, torch.lerp(graph.sum(guess) / graph.degree[:, None], mean, _LOST))
     return guess
 
 
-def _toned(colors: Tensor, goal: Tensor, weights: Tensor, graph: _Graph, rounds: int, apart: bool = True) -> Tensor:
+def _toned(
+    colors: Tensor, goal: Tensor, weights: Tensor, graph: VertexGraph, rounds: int, apart: bool = True
+) -> Tensor:
     """Colours (V,3) times what makes them as bright as a goal where weights (V,) compare them, carried on beyond."""
     ratio = goal.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()
     ratio = ratio if apart else ratio.mean(-1, keepdim=True)
