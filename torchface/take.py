@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -119,6 +119,35 @@ class Take:
         if self.extras:
             parts.append(f"extras {', '.join(map(str, self.extras))}")
         return f"Take({', '.join(parts)})"
+
+    def frames(self, rows: slice) -> Take:
+        """Consecutive frames, with what the file held for each of them and the numbers that they had."""
+        first, last, step = rows.indices(len(self))
+        if step != 1:
+            raise ValueRangeError(f"take: found a step of {step} frames, expected consecutive ones")
+        rows = slice(first, max(first, last))
+        tracks = {
+            name: None if track is None else track.frames(rows)
+            for name in ("markers", "landmarks", "weights")
+            for track in (getattr(self, name),)
+        }
+        timecode = None if self.timecode is None else self.timecode[rows]
+        return replace(self, **tracks, timecode=timecode, extras=_cut_extras(self.extras, rows, len(self)))
+
+
+def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, Any]:
+    """What readers keep a frame at a time, cut like the tracks."""
+    cut = dict(extras)
+    numbers = extras.get("frame_numbers")
+    if numbers is not None or rows.start > 0:
+        cut["frame_numbers"] = (torch.arange(count) if numbers is None else numbers)[rows]
+    if "columns" in extras:
+        cut["columns"] = {name: column[rows] for name, column in extras["columns"].items()}
+    if "blendshape_count" in extras:
+        cut["blendshape_count"] = extras["blendshape_count"][rows]
+    if "gaps" in extras:
+        cut["gaps"] = tuple((row - rows.start, lost) for row, lost in extras["gaps"] if rows.start < row < rows.stop)
+    return cut
 
 
 def empty_frames(take: Take) -> Tensor:

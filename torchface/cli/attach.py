@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import steps, told
 
 
 def attach(
@@ -18,6 +18,9 @@ def attach(
     standoff: bool = False,
     picture: Path | None = None,
     part: str | None = None,
+    labels: Path | None = None,
+    frames: str | None = None,
+    unit: Literal["mm", "cm", "m", "in"] | None = None,
     quiet: bool = False,
 ) -> None:
     """Find where markers sit on a rig from a range-of-motion take, and write them as attachment JSON.
@@ -31,12 +34,17 @@ def attach(
         standoff: Markers stand off the skin by one unknown distance: estimate it.
         picture: Also draw where each marker sat and sits, and its error after each round: .png or .jpg.
         part: Keep this region of the rig only, such as face.
+        labels: What the take's labels are called in INITIAL, and from then on: CSV, a row LABEL OF THE TAKE,LABEL
+            each; an empty second cell leaves the marker out. Unlabelled points and subjects' prefixes (Actor:M001)
+            are left out without it.
+        frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
+        unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         quiet: Show no progress.
     """
     from torchface.workflows.attach import attach as find_sites
+    from torchface.workflows.marker_input import MarkerOptions
 
     with steps(quiet) as step:
-        report = find_sites(rig, rom, out, initial, standoff, picture, part, step)
-    for line in report.lines():
-        console.print(line)
+        report = find_sites(rig, rom, out, initial, standoff, picture, part, step, MarkerOptions(unit, labels, frames))
+    told(report.lines())
     print(out)

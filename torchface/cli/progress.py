@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 console = Console(stderr=True)
+
+
+def told(lines: Iterable[str]) -> None:
+    """Prints a report, its warnings so that they are seen."""
+    for line in lines:
+        console.print(line, style="bold yellow" if line.startswith("warning: ") else None, markup=False)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import steps, told
 
 
 def solve(
@@ -24,13 +24,15 @@ def solve(
     frame_by_frame: bool = False,
     video: Path | None = None,
     action_units: str | None = None,
-    labels: Path | None = None,
+    video_labels: Path | None = None,
     table: Path | None = None,
     report: Path | None = None,
     stream: str | None = None,
     sparsity: float | None = None,
     ridge: float | None = None,
     part: str | None = None,
+    labels: Path | None = None,
+    frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     insist: bool = False,
     quiet: bool = False,
@@ -40,7 +42,8 @@ def solve(
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         take: Markers: .c3d, .trc or .csv.
-        attachment: Where the markers sit on the rig, as JSON; markers match by label.
+        attachment: Where the markers sit on the rig, as JSON. Markers match by label; a subject's prefix (Actor:M001)
+            and another case do not matter, labels that it does not know are left out.
         out: The weights to write: Live Link Face CSV.
         animation: Also write the rig with this animation as .glb.
         neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
@@ -52,7 +55,8 @@ def solve(
             solved at once: smooth curves, gaps bridged, fast motion keeps its height.
         video: What a head camera saw of painted patterns during the take; leads the shapes that markers hardly see.
         action_units: The classifier for the video, by name or folder; see `python -m train.action_units`.
-        labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if absent.
+        video_labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if
+            absent.
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.
         report: A folder for a page: the face playing, the error of each marker, what was wrong, every curve.
         stream: Then send the frames in their own time, as Live Link Face does: udp://127.0.0.1:11111 for Unreal on
@@ -60,22 +64,26 @@ def solve(
         sparsity: Pull of each weight toward zero, square millimetres; the default suits 0.3 mm noise.
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
+        labels: What the take's labels are called in the attachment: CSV, a row LABEL OF THE TAKE,LABEL OF THE
+            ATTACHMENT each; an empty second cell leaves the marker out.
+        frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
     from torchface.workflows.head_camera import HeadCamera
+    from torchface.workflows.marker_input import MarkerOptions
     from torchface.workflows.solve import SolveSettings, solve_take
 
     if (video is None) != (action_units is None):
         raise ValueRangeError("solve: found one of --video and --action-units, expected both or neither")
-    camera = None if video is None or action_units is None else HeadCamera(video, action_units, labels, table)
+    camera = None if video is None or action_units is None else HeadCamera(video, action_units, video_labels, table)
 
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
+    options = MarkerOptions(unit, labels, frames)
     with steps(quiet) as step:
-        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step, unit)
-    for line in done.lines():
-        console.print(line, style="bold yellow" if line.startswith("warning: ") else None, highlight=False)
+        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step, options)
+    told(done.lines())
     print(out)

@@ -12,12 +12,13 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture import fit_attachment
 from torchface.capture.markers import AttachmentFit, sites_by_shape
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io import load_rig, load_take
+from torchface.errors import FileFormatError
+from torchface.io import load_rig
 from torchface.io.picks import load_landmarks
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.viz.marker_sites import error_rounds, site_views
+from torchface.workflows.marker_input import AS_THEY_ARE, MarkerOptions, read_range_of_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +28,12 @@ class AttachReport:
     Args:
         fit: the sites and how they were found.
         moved: how far each marker's site is from the first guess, (M,), millimetres.
+        warnings: what the user should know before they use the sites.
     """
 
     fit: AttachmentFit
     moved: Tensor
+    warnings: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -45,7 +48,7 @@ class AttachReport:
         ]
         if self.fit.standoff:
             lines.append(f"markers stand {self.fit.standoff:.2f} mm off the skin")
-        return lines
+        return [*(f"warning: {warning}" for warning in self.warnings), *lines]
 
 
 def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attachment:
@@ -77,6 +80,7 @@ def attach(
     picture: Path | None = None,
     part: str | None = None,
     progress: Callable[[str], None] | None = None,
+    options: MarkerOptions = AS_THEY_ARE,
 ) -> AttachReport:
     """Reads, finds the sites, writes them; see ``torchface attach --help`` for the arguments.
 
@@ -87,14 +91,11 @@ def attach(
     say("reading the rig")
     loaded = load_rig(rig, part=part)
     say("reading the range of motion")
-    take = load_take(rom)
-    if take.markers is None:
-        raise ValueRangeError(f"{rom}: found no markers, expected a marker take (.c3d, .trc, .csv)")
-    if initial is None:
+    start = None if initial is None else load_sites(initial, loaded.neutral, rig)
+    take, start, notes = read_range_of_motion(rom, start, options)
+    if start is None:
         say("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
-    else:
-        start = load_sites(initial, loaded.neutral, rig)
     say("finding where the markers sit")
     fit = fit_attachment(loaded, take, start, standoff)
     faces, vertices = loaded.neutral.faces, loaded.vertices
@@ -104,4 +105,4 @@ def attach(
     fit.attachment.save(out)
     if picture is not None:
         save_picture(sheet([site_views(loaded.neutral, before, after), error_rounds(fit.errors)], 1), picture)
-    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1))
+    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), tuple(notes))

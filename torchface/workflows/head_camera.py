@@ -53,6 +53,10 @@ class Predicted:
     gamma: Track
     notes: tuple[str, ...]
 
+    def frames(self, rows: slice) -> Predicted:
+        """Some of the frames."""
+        return Predicted(self.weights.frames(rows), self.gamma.frames(rows), self.notes)
+
 
 def predicted_curves(
     camera: HeadCamera, take: Take, names: tuple[str, ...], progress: Callable[[str], None] | None = None

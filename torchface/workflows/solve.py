@@ -25,7 +25,7 @@ from torchface.capture.markers.solve import RIDGE, SPARSITY
 from torchface.errors import ValueRangeError
 from torchface.evaluation import marker_rmse
 from torchface.geometry.alignment import Similarity
-from torchface.io import load_rig, load_take, save_animation
+from torchface.io import load_rig, save_animation
 from torchface.io.live_link import save_live_link
 from torchface.io.live_link_stream import parse_address
 from torchface.onnx.live import LiveMarkerSolver
@@ -33,6 +33,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.temporal import OneEuroFilter
 from torchface.workflows.head_camera import HeadCamera, Predicted, predicted_curves
+from torchface.workflows.marker_input import AS_THEY_ARE, MarkerOptions, frame_span, read_markers
 from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
 from torchface.workflows.take_check import check_coverage, check_explained, fit_warnings
 
@@ -190,7 +191,8 @@ def solve_markers(
     fit = check_explained(solver, take, settings.slip, settings.insist)
     warnings = [*coverage.warnings(), *fit_warnings(fit, alignment is not None)]
     if len(empty):
-        warnings.append(f"{_frames_text(empty)} show no marker; their weights come from the frames before and after")
+        numbers = take.extras.get("frame_numbers", torch.arange(len(take)))[empty]
+        warnings.append(f"{_frames_text(numbers)} show no marker; their weights come from the frames before and after")
     cleanup = None
     if settings.clean:
         say("looking for what is wrong with the take")
@@ -264,7 +266,7 @@ def solve_take(
     stream: str | None = None,
     camera: HeadCamera | None = None,
     progress: Callable[[str], None] | None = None,
-    unit: str | None = None,
+    options: MarkerOptions = AS_THEY_ARE,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
 
@@ -280,10 +282,12 @@ def solve_take(
     where = Attachment.load(attachment)
     where.check(loaded.neutral, attachment, rig)
     say("reading the take")
-    played = load_take(take, unit)
-    if played.markers is None:
-        raise ValueRangeError(f"{take}: found no markers, expected a marker take (.c3d, .trc, .csv)")
-    predicted = None if camera is None else predicted_curves(camera, played, loaded.names, say)
+    played, notes = read_markers(take, where.labels or (), options)
+    span = frame_span(options.frames, len(played))
+    if settings.neutral is not None:
+        settings = replace(settings, neutral=_within(settings.neutral, span))
+    predicted = None if camera is None else predicted_curves(camera, played, loaded.names, say).frames(span)
+    played = played.frames(span)
     started = time.perf_counter()
     solution = solve_markers(loaded, where, played, settings, predicted, say)
     seconds = time.perf_counter() - started
@@ -307,7 +311,7 @@ def solve_take(
         solution.motion,
         solution.cleanup,
         predicted,
-        warnings=solution.warnings,
+        warnings=(*notes, *solution.warnings),
     )
     if report is not None:
         say("writing the report")
@@ -318,6 +322,15 @@ def solve_take(
         say(f"sending to {stream}")
         done = replace(done, sent=_sent(loaded, solution, settings, stream, predicted is not None))
     return done
+
+
+def _within(frame: int, span: slice) -> int:
+    """A frame of the file as a row of what is left of it."""
+    if not span.start <= frame < span.stop:
+        raise ValueRangeError(
+            f"--neutral: found frame {frame}, expected one of those that are solved, {span.start} to {span.stop - 1}"
+        )
+    return frame - span.start
 
 
 def _sent(

@@ -6,6 +6,7 @@ from torchface.capture.markers.fit_check import FitCheck, check_fit
 from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.initial_sites import sites_by_shape
+from torchface.capture.markers.labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.observability import Observability, observability
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
@@ -20,6 +21,7 @@ __all__ = [
     "HelmetMotion",
     "HelmetSolver",
     "HybridSolver",
+    "LabelMatch",
     "MarkerSolver",
     "Observability",
     "SparsityTrial",
@@ -29,7 +31,9 @@ __all__ = [
     "clean_take",
     "fit_attachment",
     "gamma_curves",
+    "match_labels",
     "observability",
+    "own_labels",
     "rest_residual",
     "sites_by_shape",
     "sparsity_by_rule",

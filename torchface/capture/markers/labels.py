@@ -1,0 +1,154 @@
+"""Which label of a take is which marker of an attachment, as recorders write labels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from torchface.errors import NameMismatchError
+
+_UNLABELLED = re.compile(r"\*\d*|un(label?led|named|known)[\s_*-]*\d*", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class LabelMatch:
+    """What a take's labels mean.
+
+    Args:
+        channels: of the take's labels, those that are markers of the attachment.
+        labels: what the attachment calls each of them.
+        strangers: the take's labels that are none of the attachment's.
+    """
+
+    channels: tuple[str, ...]
+    labels: tuple[str, ...]
+    strangers: tuple[str, ...]
+
+    def notes(self) -> list[str]:
+        """For people to read: what was left out."""
+        return [f"left out {_listed(self.strangers)}: not among the attachment's markers"] if self.strangers else []
+
+
+def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[str, str] | None = None) -> LabelMatch:
+    """Finds a take's labels among an attachment's: as they are, without a subject's prefix, in another case.
+
+    Args:
+        found: the take's.
+        known: the attachment's.
+        renamed: the attachment's label by the take's, which goes first; an empty one leaves the marker out.
+
+    Raises:
+        NameMismatchError: two labels mean one marker, none means any, or ``renamed`` names a label that is not there.
+
+    Example:
+        >>> match_labels(["Actor:M001", "m002", "*12"], ["M001", "M002"]).labels
+        ('M001', 'M002')
+    """
+    renamed = dict(renamed or {})
+    for side, names, there in (("the take", renamed, found), ("the attachment", renamed.values(), known)):
+        absent = [name for name in names if name and name not in there]
+        if absent:
+            raise NameMismatchError(
+                f"labels: found {_listed(absent)} in the map, expected labels of {side}: {_listed(there)}"
+            )
+    taken: dict[str, str] = {}  # channel by known label
+    for channel, label in renamed.items():
+        if label:
+            _take(taken, label, channel)
+    for fold in (False, True):
+        folded = {_spelled(label, fold): label for label in known}
+        bare = {_spelled(_bare(label), fold): label for label in known}
+        for strip in (False, True):
+            here: dict[str, str] = {}
+            for channel in found:
+                if channel in renamed or channel in taken.values():
+                    continue
+                label = _known_as(channel, folded, bare, fold, strip)
+                if label is None or label in taken:
+                    continue
+                _take(here, label, channel)
+            taken |= here
+    by_channel = {channel: label for label, channel in taken.items()}
+    channels = tuple(channel for channel in found if channel in by_channel)
+    if not channels:
+        raise NameMismatchError(
+            f"labels: found {_listed(found)}, expected some of the attachment's: {_listed(known)}; a table with a row "
+            "'label of the take,label of the attachment' for each marker maps them (--labels map.csv)"
+        )
+    return LabelMatch(
+        channels,
+        tuple(by_channel[channel] for channel in channels),
+        tuple(channel for channel in found if channel not in by_channel),
+    )
+
+
+def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -> LabelMatch:
+    """A take's labels where no attachment says what they should be: all but the unlabelled, without a common prefix.
+
+    Args:
+        found: the take's.
+        renamed: what to call a label; an empty one leaves the marker out.
+
+    Raises:
+        NameMismatchError: two labels become one, none is left, or ``renamed`` names a label that is not there.
+
+    Example:
+        >>> own_labels(["Actor:M001", "Actor:M002", "*12"]).labels
+        ('M001', 'M002')
+    """
+    renamed = dict(renamed or {})
+    absent = [name for name in renamed if name not in found]
+    if absent:
+        raise NameMismatchError(
+            f"labels: found {_listed(absent)} in the map, expected labels of the take: {_listed(found)}"
+        )
+    channels = [name for name in found if renamed.get(name, name) and not _UNLABELLED.fullmatch(_bare(name).strip())]
+    if not channels:
+        raise NameMismatchError(f"labels: found {_listed(found)}, expected labelled markers")
+    bare = [renamed.get(name, _bare(name)) for name in channels]
+    labels = bare if len(set(bare)) == len(bare) else [renamed.get(name, name) for name in channels]
+    taken: dict[str, str] = {}
+    for channel, label in zip(channels, labels, strict=True):
+        _take(taken, label, channel)
+    return LabelMatch(tuple(channels), tuple(labels), tuple(name for name in found if name not in channels))
+
+
+def _known_as(channel: str, known: Mapping[str, str], bare: Mapping[str, str], fold: bool, strip: bool) -> str | None:
+    """The known label of a channel, its whole name or what follows a separator in it."""
+    if not strip:
+        return known.get(_spelled(channel, fold))
+    for rest in _rests(channel):
+        label = known.get(_spelled(rest, fold)) or bare.get(_spelled(rest, fold))
+        if label is not None:
+            return label
+    return None
+
+
+def _rests(name: str) -> Iterable[str]:
+    """A name, then what follows each separator of a subject's prefix in it, the longest first."""
+    yield name
+    for separator in re.finditer(r"[:|/._-]", name):
+        yield name[separator.end() :]
+
+
+def _bare(name: str) -> str:
+    return name.rpartition(":")[2]
+
+
+def _spelled(name: str, fold: bool) -> str:
+    return name.strip().casefold() if fold else name.strip()
+
+
+def _take(taken: dict[str, str], label: str, channel: str) -> None:
+    if label in taken:
+        raise NameMismatchError(
+            f"labels: found {taken[label]!r} and {channel!r} for the marker {label!r}, expected one: leave the other "
+            "out by a table (--labels map.csv)"
+        )
+    taken[label] = channel
+
+
+def _listed(names: Iterable[str], most: int = 6) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

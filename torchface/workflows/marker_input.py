@@ -1,0 +1,107 @@
+"""A marker take from disk as a command wants it: in millimetres, with the attachment's labels, cut to some frames."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from torchface.attachment import Attachment
+from torchface.capture.markers import match_labels, own_labels
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.io import load_take
+from torchface.io.label_maps import load_label_map
+from torchface.take import Take, Track
+
+_SHOWN = 6
+_SPAN = re.compile(r"\s*(\d{0,9})\s*:\s*(\d{0,9})\s*")
+
+
+@dataclass(frozen=True)
+class MarkerOptions:
+    """How a marker file is read.
+
+    Args:
+        unit: of its coordinates; what the file says if absent.
+        labels: a table that maps the take's labels to the attachment's.
+        frames: ``A:B``, the frames from A up to, not including, B; all if absent.
+    """
+
+    unit: str | None = None
+    labels: Path | None = None
+    frames: str | None = None
+
+
+AS_THEY_ARE = MarkerOptions()
+"""In the file's own unit, by its own labels, all frames."""
+
+
+def read_markers(path: Path, known: Sequence[str] | None, options: MarkerOptions) -> tuple[Take, list[str]]:
+    """The take with the markers of an attachment alone, by its labels, all frames; and what to tell the user.
+
+    Args:
+        path: ``.c3d``, ``.trc`` or ``.csv``.
+        known: the attachment's labels; all labelled markers of the file where there is none.
+        options: unit and label map.
+
+    Raises:
+        ValueRangeError: the file holds no markers.
+        NameMismatchError: its labels are not the attachment's.
+        FileFormatError: a file is damaged.
+    """
+    take = load_take(path, options.unit)
+    if take.markers is None:
+        raise ValueRangeError(f"{path}: found no markers, expected a marker take (.c3d, .trc, .csv)")
+    renamed = None if options.labels is None else load_label_map(options.labels)
+    try:
+        found = take.markers.names
+        match = own_labels(found, renamed) if known is None else match_labels(found, known, renamed)
+    except NameMismatchError as error:
+        raise NameMismatchError(f"{path}: {error}") from error
+    chosen = take.markers.select(match.channels)
+    return replace(take, markers=Track(match.labels, chosen.values, chosen.confidence)), match.notes()
+
+
+def read_range_of_motion(
+    path: Path, start: Attachment | None, options: MarkerOptions
+) -> tuple[Take, Attachment | None, list[str]]:
+    """The frames of a range of motion with the markers that are seen in them, the sites of these, and what to tell.
+
+    Args:
+        path: ``.c3d``, ``.trc`` or ``.csv``.
+        start: sites to begin with, if there are any.
+        options: unit, label map, frames.
+
+    Raises:
+        TorchfaceError: as ``read_markers`` and ``frame_span``.
+    """
+    take, notes = read_markers(path, None if start is None else start.labels, options)
+    take = take.frames(frame_span(options.frames, len(take)))
+    assert take.markers is not None
+    seen = (~torch.isnan(take.markers.values).any(-1)).any(0).tolist()
+    labels = [name for name, shown in zip(take.markers.names, seen, strict=True) if shown]
+    unseen = [name for name in (take.markers.names if start is None else start.labels or ()) if name not in labels]
+    if unseen:
+        more = f" and {len(unseen) - _SHOWN} more" if len(unseen) > _SHOWN else ""
+        notes.append(f"no site for {', '.join(unseen[:_SHOWN])}{more}: seen in no frame")
+    return replace(take, markers=take.markers.select(labels)), None if start is None else start.select(labels), notes
+
+
+def frame_span(frames: str | None, count: int) -> slice:
+    """The rows that ``A:B`` means of a take of ``count`` frames.
+
+    Raises:
+        ValueRangeError: it is no such text, or leaves no frame.
+    """
+    if frames is None:
+        return slice(0, count)
+    match = _SPAN.fullmatch(frames)
+    if match is None:
+        raise ValueRangeError(f"--frames: found {frames!r}, expected A:B, such as 120:900, 120: or :900")
+    first, last = int(match[1] or 0), min(int(match[2] or count), count)
+    if first >= last:
+        raise ValueRangeError(f"--frames: found {frames!r} in a take of {count} frames, expected A < B and A < {count}")
+    return slice(first, last)
