@@ -11,7 +11,7 @@ import torch
 from torchface.io.frame_rates import FASTEST, SLOWEST, simplest_rate
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.container import Document, read_document, shown
-from torchface.io.gltf.primitives import read_part
+from torchface.io.gltf.primitives import read_target_names
 from torchface.io.numbered_csv import DEFAULT_RATE
 from torchface.take import Take, Track
 
@@ -65,17 +65,17 @@ def _channel(
         raise document.error(f"{place}.sampler", index, f"less than {len(samplers)}")
     sampler = document.record(samplers[index], f"{place}.sampler")
     node = document.item("nodes", target.get("node"), f"{place}.target.node")
-    part = read_part(document, document.integer(node, "mesh", f"{place}.target.node"))
-    if part is None or not part.names:
+    names = read_target_names(document, document.integer(node, "mesh", f"{place}.target.node"))
+    if not names:
         raise document.error(f"{place}.target.node", "a mesh without morph targets", "one with them")
     times = read_floats(document, sampler.get("input"), f"{place}.input", ("SCALAR",))[:, 0]
     each = 3 if sampler.get("interpolation") == _CUBIC else 1  # a cubic key is tangent, value, tangent
-    count = len(times) * len(part.names) * each
+    count = len(times) * len(names) * each
     values = read_floats(document, sampler.get("output"), f"{place}.output", ("SCALAR",), count)[:, 0]
-    values = values.reshape(len(times), each, len(part.names))[:, each // 2]
+    values = values.reshape(len(times), each, len(names))[:, each // 2]
     if len(times) == 0:
         raise document.error(f"{place}.input", "no key", "at least one")
-    return times, part.names, values
+    return times, names, values
 
 
 def _rate(document: Document, times: np.ndarray) -> float:

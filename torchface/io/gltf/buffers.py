@@ -20,6 +20,7 @@ class BufferWriter:
         self.accessors: list[dict[str, Any]] = []
         self._pieces: list[bytes] = []
         self._size = 0
+        self._still: dict[int, int] = {}
 
     @property
     def data(self) -> bytes:
@@ -51,6 +52,8 @@ class BufferWriter:
     def deltas(self, rows: NDArray[np.float32]) -> int:
         """An accessor (C,3) of a morph target: the rows that move and their numbers, or all rows if that is smaller."""
         moved = np.flatnonzero((rows != 0).any(1))
+        if len(moved) == 0 and len(rows) in self._still:
+            return self._still[len(rows)]
         indices = moved.astype("<u2" if len(rows) <= 65535 else "<u4")
         if len(moved) * (12 + indices.itemsize) >= len(rows) * 12:
             return self.vertices(rows)
@@ -60,7 +63,9 @@ class BufferWriter:
             "values": {"bufferView": 0},
         }
         accessor = self._accessor(rows, None, bounds=True)
-        if len(moved):  # without rows the accessor is all zeros, as wanted
+        if len(moved) == 0:  # without data the accessor is all zeros, as wanted
+            self._still[len(rows)] = accessor
+        else:
             sparse["indices"]["bufferView"] = self.view(indices.tobytes())  # type: ignore[index]
             sparse["values"]["bufferView"] = self.view(rows[moved].astype("<f4").tobytes())  # type: ignore[index]
             self.accessors[accessor]["sparse"] = sparse

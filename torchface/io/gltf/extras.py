@@ -31,6 +31,44 @@ def write_extras(mesh: Mesh) -> dict[str, Any]:
     return found
 
 
+def write_order(rows: Tensor, meshes: int) -> dict[str, Any]:
+    """The JSON of what parts do to the order of triangles: runs of rows that follow each other; none of one part.
+
+    Args:
+        rows: for each triangle, in the file's order, its row in the mesh, (F,).
+        meshes: how many meshes of the scene are parts of this one.
+    """
+    ids = rows.numpy()
+    start = np.flatnonzero(np.diff(ids, prepend=-2) != 1)
+    found: dict[str, Any] = {} if meshes == 1 else {"meshes": meshes}
+    if len(start) > 1:
+        found["triangles"] = np.stack([ids[start], np.diff(start, append=len(ids))], axis=1).tolist()
+    return found
+
+
+def read_mesh_count(document: Document, extras: object, place: str) -> int:
+    """How many meshes of the scene are one mesh's parts, this one the first; 1 where the file does not say."""
+    return document.integer(_record(document, extras, place), "meshes", place, 1)
+
+
+def read_order(document: Document, extras: object, place: str, count: int) -> NDArray[np.int64] | None:
+    """For each of ``count`` triangles its row in the mesh as authored; none where the file has them in that order.
+
+    Raises:
+        FileFormatError: the field is broken.
+    """
+    record = _record(document, extras, place)
+    if "triangles" not in record:
+        return None
+    runs = _integers(document, record, "triangles", place, (2,))
+    start, length = runs[:, 0], runs[:, 1]
+    if len(runs) == 0 or length.min() < 1 or length.max() > count or int(length.sum()) != count:
+        return None
+    begin = np.cumsum(length) - length
+    rows = np.repeat(start - begin, length) + np.arange(count)
+    return rows if np.array_equal(np.sort(rows), np.arange(count)) else None
+
+
 def read_polygons(document: Document, extras: object, place: str, triangles: NDArray[np.int64]) -> Tensor | None:
     """The polygons (P,K) whose fans the triangles (F,3) are; none where they are not, as after an edit elsewhere.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from torchface.io.gltf.accessors import read_floats, read_indices
 from torchface.io.gltf.container import Document, shown
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_LARGEST_EXACT_ID = 2**24
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,9 @@ def read_part(document: Document, index: int) -> Part | None:
             first += len(blocks[key].positions)
         corners = _read_triangles(document, primitive, f"{place}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
-        pictures.append((len(corners), _picture(document, primitive, f"{place}.primitives[{i}]")))
+        painted = _painted(primitive)  # the picture is not the mesh's
+        picture = None if painted else _texture(document, primitive, f"{place}.primitives[{i}]")[0]
+        pictures.append((len(corners), picture))
     if not blocks:
         return None
     rows = list(blocks.values())
@@ -76,8 +80,8 @@ def read_part(document: Document, index: int) -> Part | None:
         np.concatenate([block.deltas for block in rows], axis=1),
         _target_names(document, mesh, place, len(rows[0].deltas)),
         np.concatenate(triangles),
-        _stack([block.uvs for block in rows], rows, 0.0),
-        _stack([block.colors for block in rows], rows, 1.0),
+        filled([block.uvs for block in rows], [len(block.positions) for block in rows], 0.0),
+        filled([block.colors for block in rows], [len(block.positions) for block in rows], 1.0),
         None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
         next((picture for count, picture in pictures if has and count == max(has) and picture is not None), None),
         document.record(mesh.get("extras"), f"{place}.extras") if isinstance(mesh.get("extras"), dict) else {},
@@ -116,13 +120,14 @@ def _read_block(document: Document, primitive: dict[str, Any], place: str, first
     if uv_name in attributes:
         uvs = read_floats(document, attributes[uv_name], f"{place}.{uv_name}", ("VEC2",), count)
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
-    if "COLOR_0" in attributes:
-        colors = read_floats(document, attributes["COLOR_0"], f"{place}.COLOR_0", ("VEC3", "VEC4"), count)
+    color_name = "_COLOR" if "_COLOR" in attributes or _painted(primitive) else "COLOR_0"
+    if color_name in attributes:
+        colors = read_floats(document, attributes[color_name], f"{place}.{color_name}", ("VEC3", "VEC4"), count)
         colors = encode_srgb(colors[:, :3].clip(0, 1))
     if "_VERTEX_ID" in attributes:
         numbers = read_floats(document, attributes["_VERTEX_ID"], f"{place}._VERTEX_ID", ("SCALAR",), count)[:, 0]
         whole = numbers == np.floor(numbers)
-        ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < max(count, 1)))) else None
+        ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < _LARGEST_EXACT_ID))) else None
     return _Block(first, positions, deltas, uvs, colors, ids)
 
 
@@ -160,8 +165,20 @@ def _texture(document: Document, primitive: dict[str, Any], place: str) -> tuple
     return found, document.integer(texture, "texCoord", f"{place}.material.baseColorTexture", 0)
 
 
-def _picture(document: Document, primitive: dict[str, Any], place: str) -> int | None:
-    return _texture(document, primitive, place)[0]
+def _painted(primitive: dict[str, Any]) -> bool:
+    """Whether ``writing`` has made the colours of a part that had none."""
+    extras = primitive.get("extras")
+    ours = extras.get("torchface") if isinstance(extras, dict) else None
+    return isinstance(ours, dict) and ours.get("painted") is True
+
+
+def read_target_names(document: Document, index: int) -> tuple[str, ...]:
+    """The names of the morph targets of mesh ``index``."""
+    place = f"meshes[{index}]"
+    mesh = document.item("meshes", index, place)
+    rows = document.array(mesh, "primitives", place)
+    targets = [document.array(document.record(row, place), "targets", place) for row in rows[:1]]
+    return _target_names(document, mesh, place, len(targets[0]) if targets else 0)
 
 
 def _target_names(document: Document, mesh: dict[str, Any], place: str, count: int) -> tuple[str, ...]:
@@ -181,14 +198,16 @@ def _target_names(document: Document, mesh: dict[str, Any], place: str, count: i
     return tuple(f"target_{i}" for i in range(count))
 
 
-def _stack(arrays: list[NDArray[np.float32] | None], blocks: list[_Block], filler: float) -> NDArray[np.float32] | None:
-    """The arrays in a line; a block that lacks what another has gets the filler."""
+def filled(
+    arrays: Sequence[NDArray[np.float32] | None], counts: Sequence[int], filler: float
+) -> NDArray[np.float32] | None:
+    """The arrays in a line; one that is absent where another is not gets ``counts`` rows of the filler."""
     width = next((array.shape[1] for array in arrays if array is not None), None)
     if width is None:
         return None
     full = [
-        np.full((len(block.positions), width), filler, np.float32) if array is None else array
-        for array, block in zip(arrays, blocks, strict=True)
+        np.full((count, width), filler, np.float32) if array is None else array
+        for array, count in zip(arrays, counts, strict=True)
     ]
     return np.concatenate(full)
 

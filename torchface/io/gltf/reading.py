@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.io.gltf.container import Document, read_document
-from torchface.io.gltf.extras import read_annotations, read_polygons
+from torchface.io.gltf.extras import read_annotations, read_order, read_polygons
 from torchface.io.gltf.primitives import Part, read_part
+from torchface.io.gltf.rejoining import rejoined
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.gltf.welding import weld
 from torchface.io.images import decode_image
@@ -72,17 +73,19 @@ class _Piece:
 
 def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ...]]:
     parts: dict[int, Part | None] = {}
-    pieces, picture = [], None
+    found: list[tuple[Instance, Part]] = []
     for instance in instances(document):
         if instance.mesh not in parts:
             parts[instance.mesh] = read_part(document, instance.mesh)
         part = parts[instance.mesh]
         if part is not None and len(part.triangles):
             document.reserve(part.deltas.nbytes + part.positions.nbytes, f"nodes: {instance.name[:40]}")
-            pieces.append(_piece(document, instance, part, scale))
-            picture = part.picture if picture is None else picture
-    if not pieces:
+            found.append((instance, part))
+    if not found:
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
+    whole = rejoined(document, found)
+    pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
+    picture = next((part.picture for _, part in found if part.picture is not None), None)
     names = tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
     total = sum(len(piece.vertices) for piece in pieces)
     document.reserve((12 * len(names) + len(pieces)) * total, "the scene's morph targets")
@@ -103,12 +106,15 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     deltas = np.stack([_moved(delta[joined.row_of], linear) for delta in part.deltas]) if len(part.deltas) else None
     if not np.isfinite(vertices).all() or (deltas is not None and not np.isfinite(deltas).all()):
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
-    faces = joined.vertex_of[part.triangles]
+    extras, triangles = part.extras.get("torchface"), part.triangles
+    rows = read_order(document, extras, place, len(triangles)) if joined.authored else None
+    if rows is not None:
+        triangles = np.empty_like(triangles)
+        triangles[rows] = part.triangles
+    faces = joined.vertex_of[triangles]
     uvs = uv_faces = None
     if part.uvs is not None:
-        used, inverse = np.unique(part.triangles, return_inverse=True)
-        uvs, uv_faces = torch.from_numpy(part.uvs[used]), torch.from_numpy(inverse.reshape(-1, 3))
-    extras = part.extras.get("torchface")
+        uvs, uv_faces = _texture_coordinates(part.uvs, joined.vertex_of, triangles)
     return _Piece(
         instance.name,
         torch.from_numpy(vertices),
@@ -121,6 +127,21 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
         torch.zeros(0, len(vertices), 3) if deltas is None else torch.from_numpy(deltas),
         part.names,
     )
+
+
+def _texture_coordinates(
+    uvs: NDArray[np.float32], vertex_of: NDArray[np.int64], triangles: NDArray[np.int64]
+) -> tuple[Tensor, Tensor]:
+    """Each pair of vertex and coordinate once: what was split at the border of two primitives is no seam."""
+    used = np.unique(triangles)
+    keys = np.column_stack([vertex_of[used], (uvs[used] + np.float32(0)).view(np.int32)])
+    _, row_of, pair_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(row_of)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    row = np.zeros(len(uvs), np.int64)
+    row[used] = rank[pair_of.reshape(-1)]
+    return torch.from_numpy(uvs[used][row_of[order]]), torch.from_numpy(row[triangles])
 
 
 def _moved(

@@ -11,22 +11,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from torchface.io.region_materials import part_material
 from torchface.mesh import Mesh
 from torchface.rendering.shading import CLAY
-
-_REGION_COLORS: tuple[tuple[str, tuple[float, float, float] | None], ...] = (
-    ("eyeball", (0.93, 0.92, 0.90)),
-    ("teeth", (0.90, 0.87, 0.80)),
-    ("gums", (0.70, 0.42, 0.40)),
-    ("tongue", (0.72, 0.40, 0.40)),
-    ("socket", (0.55, 0.36, 0.33)),
-    ("eyelash", None),
-    ("lacrimal", None),
-    ("eye_blend", None),
-    ("eye_occlusion", None),
-)
-"""What a region's name says of its colour where the mesh brings none; clear shells over the eye, and lashes
-that are cards for a texture, are not drawn."""
 
 _MOST_COMPONENTS = 16
 _MOST_COLORS = 6
@@ -101,12 +88,11 @@ def _triangle_colors(mesh: Mesh) -> tuple[Tensor, Tensor]:
     colors = torch.tensor(CLAY).repeat(count, 1)
     regions = {} if mesh.annotations is None else mesh.annotations.regions
     for name, mask in regions.items():
-        color = next((color for word, color in _REGION_COLORS if word in name), CLAY)
-        inside = mask[mesh.faces].all(1)
-        if color is None:
-            shown &= ~inside
-        elif color is not CLAY:
-            colors[inside] = torch.tensor(color)
+        material, inside = part_material(name), mask[mesh.faces].all(1)
+        if material is not None and material.alpha == "BLEND":
+            shown &= ~inside  # clear shells over the eye, and lashes that are cards for a texture
+        elif material is not None:
+            colors[inside] = torch.tensor(material.color)
     return colors, shown
 
 

@@ -1,0 +1,70 @@
+"""Materials and pictures of a head's primitives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.primitives import decode_srgb
+from torchface.io.gltf.surfaces import Surface
+from torchface.io.images import encode_png
+from torchface.io.region_materials import SKIN
+from torchface.mesh import Mesh
+
+_LINEAR, _MIPMAPS = 9729, 9987
+
+
+class MaterialWriter:
+    """Collects the materials of one mesh; ``fields`` is what the document gets of them.
+
+    Args:
+        mesh: on the CPU.
+        buffers: where pictures go.
+    """
+
+    def __init__(self, mesh: Mesh, buffers: BufferWriter) -> None:
+        self.mesh, self.buffers = mesh, buffers
+        self.fields: dict[str, Any] = {"materials": []}
+        self._textures: dict[int, int] = {}
+
+    def add(self, surface: Surface) -> int:
+        """The index of the material of a primitive."""
+        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": surface.material.roughness}
+        material: dict[str, Any] = {"name": surface.material.name, "doubleSided": True}
+        if surface.worn == "texture":
+            assert self.mesh.texture is not None
+            look["baseColorTexture"] = {"index": self._texture(self.mesh.texture, "skin")}
+        elif surface.paint is not None and surface.paint.image is not None:
+            name = f"{surface.part}_{surface.material.name}" if surface.part else surface.material.name
+            look["baseColorTexture"] = {"index": self._texture(surface.paint.image, name)}
+        elif surface.worn == "material" and surface.paint is None:
+            look["baseColorFactor"] = [*self._plain(surface), surface.material.opacity]
+        if surface.material.alpha != "OPAQUE":
+            material["alphaMode"] = surface.material.alpha
+        material["pbrMetallicRoughness"] = look
+        materials = self.fields["materials"]
+        if material in materials and surface.material is not SKIN:  # normal maps lie on the first skin alone
+            return materials.index(material)
+        materials.append(material)
+        return len(materials) - 1
+
+    def _plain(self, surface: Surface) -> list[float]:
+        """One colour in light; skin without its texels wears the mean of those that have some."""
+        color = torch.tensor(surface.material.color)
+        if surface.material is SKIN and self.mesh.texture is not None:
+            color = self.mesh.texture.float().mean((1, 2))
+        return [float(value) for value in np.round(decode_srgb(color.numpy().astype(np.float32)), 4)]
+
+    def _texture(self, image: Tensor, name: str) -> int:
+        if id(image) not in self._textures:
+            view = self.buffers.view(encode_png(image))
+            images, textures = self.fields.setdefault("images", []), self.fields.setdefault("textures", [])
+            self.fields.setdefault("samplers", [{"magFilter": _LINEAR, "minFilter": _MIPMAPS}])
+            images.append({"bufferView": view, "mimeType": "image/png", "name": name})
+            textures.append({"source": len(images) - 1, "sampler": 0})
+            self._textures[id(image)] = len(textures) - 1
+        return self._textures[id(image)]

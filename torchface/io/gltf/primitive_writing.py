@@ -1,0 +1,156 @@
+"""Primitives and their morph targets: vertices split at seams and at the borders of parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchface.geometry.operators import vertex_normals
+from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.primitives import decode_srgb
+from torchface.io.gltf.surfaces import Surface
+from torchface.io.lengths import millimetres_per
+from torchface.mesh import Mesh
+
+STILL = 1e-4
+"""Millimetres; a vertex that a shape moves less than this is written as still."""
+STEADY = 1 / 256
+"""A normal that a shape turns less than this, in radians, is written as unturned: no light of 8 bits shows it."""
+_LARGEST_EXACT_ID = 2**24
+
+
+@dataclass(frozen=True)
+class Split:
+    """One row for each pair of vertex and texture coordinate that occurs, in the order of the coordinates.
+
+    Args:
+        vertex_of: the vertex of each, (C,); those that no face has come last.
+        uv_of: its row of ``uvs``, (C,); none without texture coordinates.
+        triangles: the mesh's, into these rows, (F,3).
+    """
+
+    vertex_of: NDArray[np.int64]
+    uv_of: NDArray[np.int64] | None
+    triangles: NDArray[np.int64]
+
+
+def split_at_seams(mesh: Mesh, mirrored: NDArray[np.bool_] | None = None) -> Split:
+    """Vertices as glTF wants them, with one texture coordinate each.
+
+    Args:
+        mesh: the mesh.
+        mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
+    """
+    count = len(mesh.vertices)
+    faces = mesh.faces.numpy()
+    if mesh.uvs is None or mesh.uv_faces is None:
+        return Split(np.arange(count), None, faces)
+    keys = mesh.uv_faces.numpy() * count + faces
+    sided = keys * 2 if mirrored is None else keys * 2 + mirrored
+    pairs, triangles = np.unique(sided, return_inverse=True)
+    vertex_of, uv_of = pairs // 2 % count, pairs // 2 // count
+    loose = np.setdiff1d(np.arange(count), vertex_of)
+    vertex_of, uv_of = np.append(vertex_of, loose), np.append(uv_of, np.zeros_like(loose))
+    return Split(vertex_of, uv_of, triangles.reshape(-1, 3))
+
+
+class PrimitiveWriter:
+    """Writes the primitives of one mesh into a buffer.
+
+    Args:
+        mesh: on the CPU.
+        split: of it.
+        buffers: where accessors go.
+        tangents: glTF's, at each triangle's corners, (F,3,4), for the first primitive; its material has a normal map.
+    """
+
+    def __init__(
+        self, mesh: Mesh, split: Split, buffers: BufferWriter, tangents: NDArray[np.float32] | None = None
+    ) -> None:
+        self.mesh, self.split, self.buffers, self.tangents = mesh, split, buffers, tangents
+        self.normals = _normals(mesh.vertices.detach().double(), mesh.faces)
+        self._written: list[tuple[dict[str, Any], NDArray[np.int64]]] = []
+
+    def add(self, surface: Surface, material: int, origin: Tensor) -> dict[str, Any]:
+        """A primitive without morph targets yet.
+
+        Args:
+            surface: its triangles.
+            material: index of its material.
+            origin: the node's place (3,), millimetres.
+        """
+        triangles = self.split.triangles[surface.triangles.numpy()]
+        rows, local = np.unique(triangles, return_inverse=True)
+        local = local.reshape(-1, 3)
+        if not self._written:  # vertices of no face go with the first
+            rows = np.append(rows, np.setdiff1d(np.arange(len(self.split.vertex_of)), self.split.triangles))
+        vertices = self.split.vertex_of[rows]
+        attributes = self._attributes(surface, rows, vertices, origin)
+        if self.tangents is not None and not self._written:
+            table = np.tile(np.array([1, 0, 0, 1], np.float32), (len(rows), 1))
+            table[local] = self.tangents[surface.triangles.numpy()]
+            attributes["TANGENT"] = self.buffers.vertices(table)
+        primitive: dict[str, Any] = {
+            "attributes": attributes,
+            "indices": self.buffers.triangles(local),
+            "material": material,
+        }
+        if surface.paint is not None:  # what readers of meshes must not take for the mesh's own
+            primitive["extras"] = {"torchface": {"painted": True}}
+        self._written.append((primitive, vertices))
+        return primitive
+
+    def add_targets(self, deltas: Tensor) -> None:
+        """Morph targets (N,V,3), millimetres, for all primitives: what moves and how it turns."""
+        still = self.mesh.vertices.detach().double()
+        for delta in deltas.detach().cpu().double():  # a shape a turn: all normals at once would fill the memory
+            turned = (_normals(still + delta, self.mesh.faces) - self.normals).float().numpy()
+            turned *= np.einsum("ij,ij->i", turned, turned)[:, None] >= STEADY * STEADY
+            moved = delta.float().numpy()
+            moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= STILL * STILL)
+            for primitive, vertices in self._written:
+                target = {
+                    "POSITION": self.buffers.deltas(metres(moved[vertices])),
+                    "NORMAL": self.buffers.deltas(turned[vertices]),
+                }
+                primitive.setdefault("targets", []).append(target)
+
+    def _attributes(
+        self, surface: Surface, rows: NDArray[np.int64], vertices: NDArray[np.int64], origin: Tensor
+    ) -> dict[str, int]:
+        mesh, buffers = self.mesh, self.buffers
+        places = (mesh.vertices.detach().double() - origin.double()).numpy()[vertices]
+        attributes = {
+            "POSITION": buffers.vertices(metres(places)),
+            "NORMAL": buffers.vertices(self.normals.float().numpy()[vertices]),
+        }
+        if mesh.uvs is not None and self.split.uv_of is not None:
+            uvs = mesh.uvs.detach().float().numpy()[self.split.uv_of[rows]]
+            attributes["TEXCOORD_0"] = buffers.vertices(np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1))
+        if mesh.colors is not None:
+            light = decode_srgb(mesh.colors.detach().float().clamp(0, 1).numpy())[vertices]
+            # Beside a texture COLOR_0 would be multiplied with it; under this name viewers leave it alone.
+            attributes["COLOR_0" if surface.worn == "colors" else "_COLOR"] = buffers.vertices(light)
+        if surface.paint is not None and surface.paint.colors is not None:
+            painted = surface.paint.colors.numpy()[vertices]
+            light = np.concatenate([decode_srgb(painted[:, :3]), painted[:, 3:]], axis=1)
+            attributes["COLOR_0"] = buffers.vertices(light)
+        if len(mesh.vertices) <= _LARGEST_EXACT_ID:
+            attributes["_VERTEX_ID"] = buffers.vertices(vertices.astype(np.float32))
+        return attributes
+
+
+def metres(millimetres: NDArray[Any]) -> NDArray[np.float32]:
+    """Lengths as glTF has them."""
+    return (millimetres / np.float64(millimetres_per("m"))).astype(np.float32)
+
+
+def _normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    normals = vertex_normals(vertices, faces)
+    normals[normals.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0], dtype=normals.dtype)  # loose, or without area
+    return normals
