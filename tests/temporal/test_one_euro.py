@@ -7,8 +7,11 @@ import math
 import pytest
 import torch
 
+from torchface import Attachment, BlendshapeRig
+from torchface.capture import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.evaluation import weight_jitter
+from torchface.synthetic.marker_stage import record
 from torchface.temporal import OneEuroFilter, OneEuroSettings, one_euro_filter
 
 FPS = 60.0
@@ -56,3 +59,20 @@ def test_what_is_not_seen_stays_and_bad_input_is_named() -> None:
         OneEuroFilter(0)
     with pytest.raises(ValueRangeError, match="expected positive cutoffs"):
         OneEuroSettings(cutoff=0)
+
+
+@pytest.mark.real
+def test_a_real_take_is_calmer_and_closer_at_a_lag_of_two_frames_at_most(
+    real_capture: tuple[BlendshapeRig, Attachment, list[torch.Tensor]],
+) -> None:
+    rig, attachment, takes = real_capture
+    true = takes[2][300:700].float()
+    take = record(rig, attachment, true, torch.Generator().manual_seed(1)).take
+    assert take.markers is not None
+    single = MarkerSolver(rig, attachment)(take.markers.values)
+    streamed = one_euro_filter(single, FPS)
+    assert weight_jitter(streamed) < 0.35 * weight_jitter(single)
+    assert (streamed - true).abs().mean() < 0.9 * (single - true).abs().mean()
+    active = true.std(0) > 0.03
+    off = [(streamed[10:, active] - true[10 - lag : len(true) - lag, active]).square().mean() for lag in range(6)]
+    assert off.index(min(off)) <= 2

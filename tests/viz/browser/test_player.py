@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from torchface.errors import ShapeError
-from torchface.mesh import Mesh
+from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.page import Section, write_page
 from torchface.viz.player import Markers, Panel, Played, Player, write_player
+from torchface.viz.region_colors import drawn_triangles, region_colors
 
 
 def written(rig: BlendshapeRig, folder: Path) -> Path:
@@ -61,3 +63,25 @@ def test_shapes_that_differ_are_refused(ball_rig: BlendshapeRig, two_balls: Mesh
     takes = [Played("a", ball_rig, torch.zeros(3, 8)), Played("b", other, torch.zeros(3, 2))]
     with pytest.raises(ShapeError, match=r"found weights \(3, 2\)"):
         write_player(Player(takes, [Panel("a", 0)], 30.0), tmp_path)
+
+
+def test_eyes_without_colour_show_where_they_look_and_clear_shells_do_not_hide_them() -> None:
+    def ball(radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+        sphere = trimesh.creation.icosphere(4, radius)
+        return torch.tensor(sphere.vertices).float() + torch.tensor([30.0, 0, 0]), torch.tensor(sphere.faces).long()
+
+    vertices, faces = ball(12.0)
+    shell, shell_faces = ball(13.0)
+    eye = torch.arange(len(vertices) + len(shell)) < len(vertices)
+    regions = {"eyeball_left": eye, "eye_occlusion_left": ~eye}
+    mesh = Mesh(
+        torch.cat([vertices, shell]),
+        torch.cat([faces, shell_faces + len(vertices)]),
+        annotations=Annotations(regions=regions),
+    )
+    assert torch.equal(drawn_triangles(mesh), torch.arange(len(mesh.faces)) < len(faces))
+    colors = region_colors(mesh)[eye]
+    dark = colors.amax(1) < 0.2
+    assert 0 < int(dark.sum()) < 0.05 * len(vertices)
+    assert bool((vertices[dark, 2] > 11).all())
+    assert bool((colors[vertices[:, 2] < 0].amin(1) > 0.85).all())
