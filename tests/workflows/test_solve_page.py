@@ -40,13 +40,14 @@ def page(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
     assert cleanup.take.markers is not None
     markers = cleanup.take.markers.values
     rmse = marker_rmse(dome_rig, sites, solved.weights.values[..., 0], markers)
-    report = SolveReport(solved, rmse, 0.9, None, 0.1, cleanup=cleanup)
-    solution = Solution(solved, markers, sites, None, None, cleanup)
+    report = SolveReport(solved, rmse, 0.9, None, 0.1, cleanup=cleanup, warnings=("M001 was never seen",))
+    solution = Solution(solved, markers, sites, None, None, cleanup, ())
     return write_solve_page(tmp_path_factory.mktemp("report"), "take.c3d", report, dome_rig, solution)
 
 
 def test_the_face_plays_and_stands_in_pictures(page: Path) -> None:
     text = page.read_text()
+    assert text.index("M001 was never seen") < text.index("<h2>The performance</h2>")
     for name in re.findall(r'src="([^"]+)"', text):
         assert (page.parent / name).stat().st_size > 1000, name
     assert {"player.js", "performance.js", "frames.png", "marker_map.png"} <= set(re.findall(r'src="([^"]+)"', text))

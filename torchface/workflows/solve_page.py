@@ -65,6 +65,8 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
         Section("What was done", done),
         *_marker_sections(rig, solution, offsets, report.rmse, take.fps),
     ]
+    if report.warnings:
+        sections.insert(0, Section("Warnings", "; ".join(report.warnings)))
     if report.cleanup is not None:
         sections.append(_defects(report.cleanup, take.fps))
     if report.motion is not None:
