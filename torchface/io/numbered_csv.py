@@ -73,8 +73,10 @@ def write_numbered(
     before: Mapping[str, Sequence[str]] = {},
     behind: Mapping[str, Sequence[str]] = {},
 ) -> None:
-    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none; columns of texts (T,)
-    stand before and behind them."""
+    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none.
+
+    Columns of texts, one a frame, stand before and behind them.
+    """
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     numbers = frame_numbers(take, first=0)
     cells = number_texts(values.reshape(-1))

@@ -67,8 +67,8 @@ def save_take(take: Take, path: str | Path) -> None:
     """Writes a performance in the format that ``path`` ends in.
 
     ``.c3d`` and ``.trc`` hold the markers, a ``.csv`` the weights of a take that has some, else its markers or its
-    landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case, become a
-    Live Link Face file; others a plain table that keeps their names
+    landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case,
+    become a Live Link Face file; others a plain table that keeps their names
     (:func:`torchface.io.live_link.save_live_link` maps them to ARKit's instead).
 
     Args:

@@ -24,8 +24,8 @@ def load_weights_csv(path: str | Path) -> Take:
     """Reads weights from CSV with the header ``frame,time,<shape>,...``.
 
     One row a frame; times in seconds; an empty cell is NaN. The rate is that of numbers and times; numbers other than
-    0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``. A column ``timecode`` and head and
-    eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
+    0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``. A column ``timecode`` and head
+    and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
     ``extras["columns"]``, where :func:`torchface.io.live_link.load_live_link` has them.
 
     Args:

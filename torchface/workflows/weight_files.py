@@ -14,12 +14,12 @@ from torchface.take import Take
 _SHOWN = 8
 
 
-def check_live_link(names: Sequence[str], path: Path | None) -> None:
-    """Raises ``NameMismatchError`` where Live Link Face's file is asked for and would hold no shape of the rig."""
-    if path is not None and not mapping(names, ARKIT).any():
+def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
+    """Raises ``NameMismatchError`` where Live Link Face's file or packets are asked for and could hold no shape."""
+    if target is not None and not mapping(names, ARKIT).any():
         raise NameMismatchError(
-            f"{path}: found a rig with {', '.join(names[:4])}, ..., expected at least one of ARKit's shapes for Live "
-            "Link Face's file; --out writes the rig's own names"
+            f"{target}: found a rig with {', '.join(names[:4])}, ..., expected at least one of ARKit's shapes for Live "
+            "Link Face; --out writes the rig's own names, and torchface retarget gives them ARKit's"
         )
 
 
@@ -44,4 +44,8 @@ def write_weights(take: Take, out: Path, live_link: Path | None = None) -> list[
     live_link.parent.mkdir(parents=True, exist_ok=True)
     save_live_link(take, live_link)
     more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-    return [f"{live_link}: halves merged or left out: {', '.join(lost[:_SHOWN])}{more}"] if lost else []
+    return (
+        [f"{live_link} does not give back (halves are merged, others left out): {', '.join(lost[:_SHOWN])}{more}"]
+        if lost
+        else []
+    )
