@@ -54,7 +54,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
     weights, names = take.weights.values[..., 0].float(), take.weights.names
     offsets = _offsets(rig, solution, weights)
     errors = offsets.norm(dim=-1)
-    done = "; ".join(line for line in report.lines() if not line.startswith("  "))
+    done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
     sections = [
         Section(
             "The performance",
