@@ -126,12 +126,11 @@ class Take:
         if step != 1:
             raise ValueRangeError(f"take: found a step of {step} frames, expected consecutive ones")
         rows = slice(first, max(first, last))
-        return Take(
-            self.fps,
-            *(None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)),
-            timecode=None if self.timecode is None else self.timecode[rows],
-            extras=_cut_extras(self.extras, rows, len(self)),
+        markers, landmarks, weights = (
+            None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)
         )
+        timecode = None if self.timecode is None else self.timecode[rows]
+        return Take(self.fps, markers, landmarks, weights, timecode, _cut_extras(self.extras, rows, len(self)))
 
 
 def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchface.capture.retarget import ShapeMap, load_shape_rules, retarget_take, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files import check_writable, make_folder
 from torchface.io import load_rig, load_take, save_animation
 from torchface.take import Take, Track
 from torchface.workflows.weight_files import check_live_link, write_weights
@@ -47,6 +48,7 @@ def retarget_weights(
         TorchfaceError: any file is broken.
     """
     say = progress or (lambda line: None)
+    check_writable(out, live_link, animation)
     say("reading")
     played = load_take(weights)
     if played.weights is None:
@@ -67,6 +69,6 @@ def retarget_weights(
     say("writing")
     written = write_weights(moved, out, live_link)
     if animation is not None:
-        animation.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(animation.parent)
         save_animation(target, moved, animation)
     return Retargeted(moved, shapes, tuple(written))

@@ -24,6 +24,7 @@ from torchface.capture.markers import Cleanup, HelmetMotion
 from torchface.capture.markers.solve import RIDGE, SPARSITY
 from torchface.errors import ValueRangeError
 from torchface.evaluation import marker_rmse
+from torchface.files import check_writable, make_folder
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, save_animation
 from torchface.io.live_link_stream import parse_address
@@ -276,6 +277,7 @@ def solve_take(
         TorchfaceError: any file is broken or does not fit the others.
     """
     say = progress or (lambda line: None)
+    check_writable(out, live_link, animation, report)
     if stream is not None:
         parse_address(stream)
     say("reading the rig")
@@ -300,7 +302,7 @@ def solve_take(
     say("writing")
     written = write_weights(solved, out, live_link)
     if animation is not None:
-        animation.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(animation.parent)
         save_animation(loaded, solved, animation)
     sites = solution.attachment
     offset = torch.zeros(len(sites.triangles), 3) if sites.residual is None else sites.residual

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchface.errors import NameMismatchError
+from torchface.files import make_folder
 from torchface.io.live_link import not_in_live_link, save_live_link
 from torchface.io.weights import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
@@ -37,11 +38,11 @@ def write_weights(take: Take, out: Path, live_link: Path | None = None) -> list[
     """
     assert take.weights is not None
     lost = not_in_live_link(take.weights.names)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
     (save_weights_csv if lost else save_live_link)(take, out)
     if live_link is None:
         return []
-    live_link.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(live_link.parent)
     save_live_link(take, live_link)
     more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
     return (
