@@ -6,7 +6,6 @@ intensity are found without labels.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -167,10 +166,7 @@ def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLab
 
 def main() -> None:
     """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
+    trained = train(tyro.cli(Settings, description=__doc__), print)
     for name, value in trained.metrics.items():
         print(f"{name:44} {value:8.2%}")
 

@@ -9,6 +9,9 @@ from torchface.modeling.image_solve import FitSettings
 from torchface.modeling.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.open_eyes import open_eyes
+from torchface.modeling.part_clearance import clear_parts
+from torchface.modeling.part_placement import place_parts
+from torchface.modeling.penetration import InnerParts, inner_parts, shape_depths
 from torchface.modeling.personalization import ExpressionRegression, rig_from_neutral
 from torchface.modeling.photo_texture import PhotoTexture, photo_texture
 from torchface.modeling.scan_alignment import ScanAlignment, align_scan
@@ -25,6 +28,7 @@ __all__ = [
     "HeadModel",
     "Heads",
     "ImageFit",
+    "InnerParts",
     "ModelQuality",
     "MorphableModel",
     "NormalMap",
@@ -35,16 +39,20 @@ __all__ = [
     "TransferredRig",
     "align_scan",
     "bake_normal_map",
+    "clear_parts",
     "color_casts",
     "detail_maps",
     "fit_colors",
     "fit_images",
     "fit_sequence",
+    "inner_parts",
     "model_quality",
     "open_eyes",
     "photo_texture",
+    "place_parts",
     "rig_from_examples",
     "rig_from_neutral",
+    "shape_depths",
     "texture_areas",
     "transfer_deformation",
     "transfer_with_report",

@@ -12,11 +12,16 @@ from torch import Tensor
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.alignment import Similarity
 from torchface.mesh import Mesh
+from torchface.modeling.part_clearance import clear_parts
+from torchface.modeling.penetration import inner_parts
 from torchface.modeling.shape_transfer import ShapeTransfer
 from torchface.rig import BlendshapeRig
 
 CONTACT_WEIGHT = 30.0
 """Weight of a contact pair beside the squared gradient error of one triangle, a square millimetre."""
+
+
+_ANOTHER_FACE = 0.01  # millimetres; a target that differs by less is the template, and has the template's own shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +76,13 @@ def transfer_deformation(
     for each shape, with the source's gradients S. The global similarity between the faces is removed first and carried
     by the deltas, so that a turned or scaled target has turned or scaled shapes. Vertices that a shape leaves still
     are pinned. Parts of a head that are not connected to the face (teeth, eyes, lashes) keep what offset to it they
-    keep in the source. Lids close and lips meet as the source's do.
+    keep in the source, and give way where they would come through the skin, also where the source's do. Lids close and
+    lips meet as the source's do. The source's own face gets the source's own shapes.
 
     Args:
         source: the template: N shapes, V vertices, millimetres.
         target: the new neutral, of the same topology, millimetres.
-        contact_weight: how firmly lids and lips keep their gap; 0 leaves that out.
+        contact_weight: how firmly lids and lips keep their gap; 0 leaves that out, and lets parts come through.
         progress: called with (shapes done, N).
 
     Returns:
@@ -105,6 +111,9 @@ def transfer_with_report(
     _check(source, target, contact_weight)
     job = ShapeTransfer(source, target, contact_weight)
     moved = job.transfer(progress)
+    if contact_weight > 0 and float((job.goal - job.rest).abs().max()) > _ANOTHER_FACE:
+        own = BlendshapeRig(target.to("cpu").with_vertices(job.goal), moved, source.names)
+        moved = clear_parts(own, inner_parts(source)).deltas
     return TransferredRig(job.rig(source, target, moved), transfer_report(job, source.names))
 
 

@@ -22,8 +22,11 @@ from torchface.modeling import (
     MorphableModel,
     NormalMap,
     bake_normal_map,
+    clear_parts,
     detail_maps,
+    inner_parts,
     open_eyes,
+    place_parts,
     rig_from_examples,
     transfer_with_report,
 )
@@ -33,6 +36,7 @@ from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.workflows.expressions import LAYOUT, Expression, expressions_in, neutral_in, weights_row
+from torchface.workflows.penetration import Penetration, penetration
 from torchface.workflows.register import in_place_of, load_shape_model
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 from torchface.workflows.skin import dressed_as, hidden_parts
@@ -80,6 +84,7 @@ class ActorReport:
         example_names: the examples used, in the order of ``examples.errors``.
         maps: the baked normal maps by name, the neutral's first.
         skipped: lines on scans that could not be used.
+        penetration: how far teeth, gums and eyes stand out of the skin.
     """
 
     rig: BlendshapeRig
@@ -89,6 +94,7 @@ class ActorReport:
     example_names: tuple[str, ...]
     maps: dict[str, NormalMap]
     skipped: tuple[str, ...]
+    penetration: Penetration | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -100,6 +106,7 @@ class ActorReport:
         lines += [f"  note: {note}" for note in record.notes]
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
+        lines += [] if self.penetration is None else [self.penetration.line()]
         if self.examples is not None:
             errors = self.examples.errors
             lines.append(
@@ -166,6 +173,8 @@ def rig_actor(
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
+    parts = inner_parts(rig)
+    neutral = place_parts(rig, neutral, parts)
     neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     say(f"transferring {len(rig.names)} shapes")
     transferred = transfer_with_report(rig, neutral)
@@ -174,12 +183,21 @@ def rig_actor(
     used: tuple[str, ...] = ()
     if expressions:
         learned, used = job.learned(actor, neutral, registration.matched, expressions)
-        actor = learned.rig
+        actor = clear_parts(learned.rig, parts)
     maps = job.baked(actor, fine)
     say("writing the rig")
     save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
     names = {label: baked for label, (_, baked) in maps.items()}
-    return ActorReport(actor, registration, transferred.report.summary(), learned, used, names, tuple(job.skipped))
+    return ActorReport(
+        actor,
+        registration,
+        transferred.report.summary(),
+        learned,
+        used,
+        names,
+        tuple(job.skipped),
+        penetration(actor, parts),
+    )
 
 
 class _Actor:
