@@ -47,3 +47,34 @@ def write_file(path: str | Path, data: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise FileFormatError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def make_folder(folder: str | Path) -> Path:
+    """The folder, made with those above it where it is not there yet.
+
+    Raises:
+        FileFormatError: it cannot be made.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise FileFormatError(
+            f"{folder}: found no folder, and none can be made ({getattr(error, 'strerror', error)}); expected a place "
+            "that can be written to"
+        ) from error
+    return folder
+
+
+def check_writable(*paths: Path | None) -> None:
+    """Looks whether files or folders could be made, before long work; makes nothing.
+
+    Raises:
+        FileFormatError: what is there above one of them is no folder, or may not be written to.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        above = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+        if not above.is_dir() or not os.access(above, os.W_OK):
+            raise FileFormatError(f"{path}: cannot be written ({above} is no folder that can be written to)")

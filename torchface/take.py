@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -126,13 +126,11 @@ class Take:
         if step != 1:
             raise ValueRangeError(f"take: found a step of {step} frames, expected consecutive ones")
         rows = slice(first, max(first, last))
-        tracks = {
-            name: None if track is None else track.frames(rows)
-            for name in ("markers", "landmarks", "weights")
-            for track in (getattr(self, name),)
-        }
+        markers, landmarks, weights = (
+            None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)
+        )
         timecode = None if self.timecode is None else self.timecode[rows]
-        return replace(self, **tracks, timecode=timecode, extras=_cut_extras(self.extras, rows, len(self)))
+        return Take(self.fps, markers, landmarks, weights, timecode, _cut_extras(self.extras, rows, len(self)))
 
 
 def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, Any]:

@@ -6,6 +6,7 @@ intensity are found without labels.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -166,7 +167,10 @@ def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLab
 
 def main() -> None:
     """Parses flags, trains, prints."""
-    trained = train(tyro.cli(Settings, description=__doc__), print)
+    try:
+        trained = train(tyro.cli(Settings, description=__doc__), print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
     for name, value in trained.metrics.items():
         print(f"{name:44} {value:8.2%}")
 

@@ -5,6 +5,7 @@ Without a rig it is that of the embedded performer with 100 markers.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from torchface import Attachment, BlendshapeRig, load_rig, zoo
+from torchface import Attachment, BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.capture import MarkerSolver
 from torchface.capture.markers.solve import RIDGE, SPARSITY
 from torchface.shape_names import mapping
@@ -108,8 +109,11 @@ def measure(solver: MarkerSolver, rig: BlendshapeRig, settings: Settings) -> dic
 
 def main() -> None:
     """Parses flags, builds, prints."""
-    settings = tyro.cli(Settings, description=__doc__)
-    train(settings, print)
+    try:
+        settings = tyro.cli(Settings, description=__doc__)
+        train(settings, print)
+    except TorchfaceError as error:
+        sys.exit(str(error))
     for key, value in zoo.describe(settings.out.resolve()).metrics.items():
         print(f"{key:50} {value:8.3f}")
 

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pygltflib
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from torchface.geometry.normal_maps import DetailMaps
@@ -205,6 +207,22 @@ def test_eyeballs_hang_on_pivots_at_their_centres(tmp_path: Path) -> None:
     assert (centre - torch.tensor([12.0, 5.0, 8.0])).abs().max() < 0.1
 
 
+def test_other_readers_find_the_parts_where_they_are(tmp_path: Path) -> None:
+    rig = head()
+    save_rig(rig, tmp_path / "head.glb")
+    other = pygltflib.GLTF2().load(tmp_path / "head.glb")
+    assert [node.name for node in other.nodes] == ["face", "eyeball_left"]
+    assert all(mesh.extras["targetNames"] == list(rig.names) for mesh in other.meshes)
+    scene = trimesh.load(tmp_path / "head.glb", process=False)
+    shown = torch.from_numpy(np.concatenate([piece.triangles for piece in scene.dump()])).float() * 1000
+    ours = rig.vertices[rig.neutral.faces]
+    found, expected = (
+        rows.reshape(len(ours), 9)[np.lexsort(rows.reshape(len(ours), 9).round(decimals=2).numpy().T)]
+        for rows in (shown, ours)
+    )
+    assert (found - expected).abs().max() < 1e-2
+
+
 def test_normals_of_a_shape_are_those_of_the_moved_surface(tmp_path: Path) -> None:
     rig = head()
     save_rig(rig, tmp_path / "head.glb")
@@ -316,6 +334,9 @@ def test_lashes_are_hairs_on_a_clear_ground() -> None:
     assert 0.2 < float(root.mean()) < 0.45
     assert float(tip.mean()) < 0.5 * float(root.mean())
     assert float(((inside > 0.05) & (inside < 0.95)).float().mean()) < 0.35
+    faded = painted_lashes(Mesh(vertices, faces), torch.arange(len(lid[1]), len(faces)), EYELASHES).colors
+    assert float(faded[len(lid[0]) + 3, 3]) == pytest.approx(0.6, abs=0.05)  # at the lid
+    assert float(faded[-4, 3]) < 0.1
 
 
 @pytest.mark.real

@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 import torch
 from rig_samples import quad_sheet, sheet_rig, sheet_take
+from test_gltf_parts import head
 
 from torchface.geometry.normal_maps import DetailMaps
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.tangent_space import tangent_space
 from torchface.io import load_rig, save_animation, save_mesh, save_rig
+from torchface.io.gltf.surfaces import surfaces
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 
 WEB = Path(__file__).resolve().parent / "web"
 pytestmark = pytest.mark.browser
@@ -72,6 +75,37 @@ def test_a_small_rig_is_valid_and_moves_alike_in_three(node: str, tmp_path: Path
     seen = run(node, "load.mjs", tmp_path / "rig.glb")
     assert seen["meshes"][0]["textured"]
     assert seen["pictures"] == 1
+
+
+def assert_parts_are_valid_and_three_moves_them(node: str, path: Path, rig: BlendshapeRig) -> None:
+    save_rig(rig, path)
+    assert_valid(node, path)
+    weights = torch.linspace(0.3, 0.9, len(rig.names))
+    seen = run(node, "load.mjs", path, *[f"{weight:.9g}" for weight in weights.tolist()])["meshes"]
+    parts = surfaces(rig.neutral, rig.neutral.texture is not None)
+    rows = [
+        part.triangles for name in dict.fromkeys(part.part for part in parts) for part in parts if part.part == name
+    ]
+    assert len(seen) == len(rows)
+    moved = rig(weights[None])[0].numpy() / 1000
+    for mesh, triangles in zip(seen, rows, strict=True):
+        assert tuple(mesh["names"]) == rig.names
+        corners = np.array(mesh["positions"]).reshape(-1, 3)[np.array(mesh["indices"]).reshape(-1, 3)]
+        assert np.abs(corners - moved[rig.neutral.faces[triangles]]).max() < 1e-5
+
+
+def test_a_head_of_parts_is_valid_and_moves_alike_in_three(node: str, tmp_path: Path) -> None:
+    assert_parts_are_valid_and_three_moves_them(node, tmp_path / "head.glb", head())
+    assert_parts_are_valid_and_three_moves_them(node, tmp_path / "plain.glb", head(textured=False, colored=False))
+    assert_parts_are_valid_and_three_moves_them(
+        node, tmp_path / "all.glb", performer().select(["jawOpen", "eyeBlinkLeft"])
+    )
+
+
+@pytest.mark.real
+def test_a_real_head_of_parts_is_valid_and_moves_alike_in_three(node: str, tmp_path: Path, ict_folder: Path) -> None:
+    rig = load_rig(ict_folder, shapes=["jawOpen", "eyeBlink_L"])
+    assert_parts_are_valid_and_three_moves_them(node, tmp_path / "ict.glb", rig)
 
 
 def test_a_bare_mesh_with_loose_vertices_is_valid(node: str, tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from mutation import check_reader
 from take_strategies import same, weight_takes
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.io.live_link import ROTATIONS, load_live_link, save_live_link
+from torchface.io.live_link import load_live_link, save_live_link
 from torchface.io.takes import load_take, save_take
+from torchface.io.weights import ROTATIONS
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 

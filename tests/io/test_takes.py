@@ -41,10 +41,16 @@ def test_only_arkits_whole_set_becomes_a_live_link_file(names: tuple[str, ...], 
     assert torch.equal(back.values, take.weights.values)  # type: ignore[union-attr]
 
 
-def test_a_csv_holds_one_track(tmp_path: Path) -> None:
-    take = Take(60.0, markers=_markers(), weights=Track(("smile",), torch.zeros(4, 1, 1)))
-    with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of markers and weights, expected one track"):
-        save_take(take, tmp_path / "take.csv")
+def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> None:
+    take = Take(60.0, markers=_markers(), weights=Track(("smile",), torch.full((4, 1, 1), 0.5)))
+    save_take(take, tmp_path / "take.csv")
+    back = load_take(tmp_path / "take.csv")
+    assert back.markers is None
+    assert back.weights is not None
+    assert back.weights.names == ("smile",)
+    landmarks = Track(("nose", "chin"), torch.zeros(4, 2, 2))
+    with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of markers and landmarks, expected one"):
+        save_take(Take(60.0, markers=_markers(), landmarks=landmarks), tmp_path / "take.csv")
     with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of no track"):
         save_take(Take(60.0), tmp_path / "take.csv")
     save_take(take, tmp_path / "take.c3d")

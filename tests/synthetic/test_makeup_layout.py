@@ -80,6 +80,9 @@ def test_without_landmarks_shapes_say_where_the_face_is(rig: BlendshapeRig) -> N
 @pytest.mark.real
 def test_on_a_real_rig_only_gaze_stays_unseen(ict_folder: Path) -> None:
     rig = load_rig(ict_folder, part="face")
+    faces, vertices = rig.neutral.faces, rig.vertices
+    a, b, c = vertices[faces[makeup_layout(rig).attachment.triangles]].unbind(1)
+    assert bool((torch.linalg.cross(b - a, c - a)[:, 2] > 0).all())  # none on the inside of a lid
     seen = observability(MarkerSolver(rig, makeup_layout(rig).attachment))
     assert not seen.unseen
     assert all(name.startswith("eyeLook") for name in seen.ambiguous)

@@ -63,3 +63,13 @@ def test_the_command_says_what_it_wants() -> None:
     )
     assert "--video" in shown.stdout
     assert "--labels" in shown.stdout
+
+
+def test_labels_that_are_not_there_end_in_a_line(tmp_path: Path) -> None:
+    words = ["--video", str(tmp_path / "film.mp4"), "--labels", str(tmp_path / "film.toml")]
+    told = subprocess.run(
+        [sys.executable, "-m", "train.action_units", *words], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert told.returncode != 0
+    assert "film.toml: found no such file" in told.stderr
+    assert "Traceback" not in told.stderr

@@ -21,13 +21,13 @@ from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
+from torchface.cli.ending import told_plainly
 from torchface.cli.evaluate import evaluate
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.pick import pick
-from torchface.cli.progress import console
 from torchface.cli.register import register
 from torchface.cli.render import render
 from torchface.cli.retarget import retarget
@@ -36,7 +36,6 @@ from torchface.cli.solve import solve
 from torchface.cli.track import track
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
-from torchface.errors import TorchfaceError
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
@@ -74,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not words or words in (["--help"], ["-h"]):
         _overview()
         raise SystemExit(0 if words else 2)
-    try:
+    with told_plainly():
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(export_model, prog="torchface export", args=words[1:])
         elif words[:1] == ["export"]:
@@ -83,9 +82,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             tyro.extras.subcommand_cli_from_dict(
                 COMMANDS | {"export": _export_help}, prog="torchface", description=DESCRIPTION, args=words
             )
-    except TorchfaceError as error:
-        console.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
-        raise SystemExit(2) from None
 
 
 def _overview() -> None:

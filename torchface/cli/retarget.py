@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import console, steps, told
 
 _MOST_NAMES = 12
 
@@ -18,6 +18,7 @@ def retarget(
     from_: Annotated[Path | None, arg(name="from")] = None,
     table: Path | None = None,
     out: Path = Path("out/retargeted.csv"),
+    live_link: Path | None = None,
     animation: Path | None = None,
     part: str | None = None,
     quiet: bool = False,
@@ -31,7 +32,10 @@ def retarget(
             it the names in WEIGHTS are taken as they are.
         table: Mapping table, TOML: a [shape] of the target rig each, with sum = {source = factor} and/or
             product = [sources], and gain, lower, upper.
-        out: The weights to write: CSV with the target's shape names.
+        out: The weights to write, with the timecode and the head and eye rotations of WEIGHTS: Live Link Face CSV if
+            each of the target's shapes is one of ARKit's, otherwise frame,time,<shape>,... with the target's own names.
+        live_link: Also write Live Link Face CSV whatever the target's names are: halves are merged, shapes that ARKit
+            does not have are left out.
         animation: Also write the target rig with this animation as .glb.
         part: Keep this region of the target rig only, such as face.
         quiet: Show no progress.
@@ -39,11 +43,12 @@ def retarget(
     from torchface.workflows.retarget import retarget_weights
 
     with steps(quiet) as step:
-        done = retarget_weights(weights, to, from_, table, out, animation, part, step)
+        done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, step)
     driven = len(done.shapes.to_names) - len(done.shapes.still)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
     for what, names in (("nothing drives", done.shapes.still), ("drives nothing:", done.shapes.unused)):
         if names:
             more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
             console.print(f"{what} {', '.join(names[:_MOST_NAMES])}{more}", highlight=False)
+    told(f"warning: {warning}" for warning in done.warnings)
     print(out)

@@ -15,6 +15,7 @@ def solve(
     take: Annotated[Positional[Path], arg(metavar="TAKE")],
     attachment: Path,
     out: Path = Path("out/weights.csv"),
+    live_link: Path | None = None,
     animation: Path | None = None,
     neutral: Annotated[int | None, arg(aliases=["--neutral-frame"])] = None,
     align: bool = False,
@@ -37,14 +38,17 @@ def solve(
     insist: bool = False,
     quiet: bool = False,
 ) -> None:
-    """Solve a marker take for blendshape weights and write them as Live Link Face CSV.
+    """Solve a marker take for blendshape weights.
 
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         take: Markers: .c3d, .trc or .csv.
         attachment: Where the markers sit on the rig, as JSON. Markers match by label; a subject's prefix (Actor:M001)
             and another case do not matter, labels that it does not know are left out.
-        out: The weights to write: Live Link Face CSV.
+        out: The weights to write: Live Link Face CSV if each of the rig's shapes is one of ARKit's, otherwise
+            frame,time,<shape>,... with the rig's own names.
+        live_link: Also write Live Link Face CSV whatever the rig's names are: halves are merged, shapes that ARKit does
+            not have are left out.
         animation: Also write the rig with this animation as .glb.
         neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
@@ -84,6 +88,8 @@ def solve(
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
     options = MarkerOptions(unit, labels, frames)
     with steps(quiet) as step:
-        done = solve_take(rig, take, attachment, out, animation, settings, part, report, stream, camera, step, options)
+        done = solve_take(
+            rig, take, attachment, out, animation, settings, part, report, stream, camera, step, options, live_link
+        )
     told(done.lines())
     print(out)

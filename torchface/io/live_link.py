@@ -12,13 +12,11 @@ import torch
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.csv_table import TableReader, parse_number, quoted, write_table
 from torchface.io.frame_rates import check_rate
+from torchface.io.numbered_csv import is_numbered
 from torchface.io.timecode import read_timecodes, write_timecodes
-from torchface.io.weights import weights_to_write
+from torchface.io.weights import ROTATIONS, weights_to_write
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
-
-ROTATIONS = tuple(part + axis for part in ("Head", "LeftEye", "RightEye") for axis in ("Yaw", "Pitch", "Roll"))
-"""The nine columns behind the weights, radians."""
 
 _TIMECODE, _COUNT = "timecode", "blendshapecount"
 _SHAPES = {name.lower() for name in ARKIT}
@@ -26,12 +24,23 @@ _SHAPES = {name.lower() for name in ARKIT}
 
 def is_live_link(header: Sequence[str]) -> bool:
     """Whether a header is Live Link Face's."""
-    return bool({_TIMECODE, _COUNT} & {name.lower() for name in header})
+    return not is_numbered(header) and bool({_TIMECODE, _COUNT} & {name.lower() for name in header})
 
 
 def are_live_link_shapes(names: Sequence[str]) -> bool:
     """Whether names are ARKit's 52, all of them and no other, in whatever order and case."""
     return len(names) == len(ARKIT) and {name.lower() for name in names} == _SHAPES
+
+
+def not_in_live_link(names: Sequence[str]) -> tuple[str, ...]:
+    """The names of shapes that Live Link Face's file would not give back: halves that it merges, and those it lacks.
+
+    Example:
+        >>> not_in_live_link(["jawOpen", "eyeBlink_L", "browInnerUp_L", "cheekRaiser_L"])
+        ('browInnerUp_L', 'cheekRaiser_L')
+    """
+    matrix = mapping(names, ARKIT)
+    return tuple(name for name, kept in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not kept)
 
 
 def load_live_link(path: str | Path) -> Take:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.io.live_link import ROTATIONS
+from torchface.io.weights import ROTATIONS
 from torchface.shape_names import ARKIT, mapping
 
 VALUES = len(ARKIT) + len(ROTATIONS)

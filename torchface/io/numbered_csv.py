@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,8 @@ def is_numbered(header: Sequence[str]) -> bool:
     return tuple(name.lower() for name in header[:2]) == COLUMNS
 
 
-def read_numbered(reader: TableReader) -> tuple[Table, float, dict[str, Any]]:
-    """All rows, the frame rate, and what to keep of the frame numbers.
+def read_numbered(reader: TableReader, texts: Sequence[str] = ()) -> tuple[Table, float, dict[str, Any]]:
+    """All rows, the frame rate, and what to keep of the frame numbers; the columns ``texts`` are kept as they stand.
 
     The rate is that of the first and last row's numbers and times. Numbers other than 0, 1, ... go to
     ``extras["frame_numbers"]``, dropped frames as (row, how many) to ``extras["gaps"]``.
@@ -36,7 +36,7 @@ def read_numbered(reader: TableReader) -> tuple[Table, float, dict[str, Any]]:
     """
     if not is_numbered(reader.header):
         raise FileFormatError(f"{reader.path}: found a header of other columns, expected it to begin with frame,time")
-    table = reader.read()
+    table = reader.read(texts)
     frames, times = table.numbers[:, 0], table.numbers[:, 1]
     return table, rate_of(frames, times, reader.path), numbering(frames, first=0, where=str(reader.path))
 
@@ -65,13 +65,30 @@ def rate_of(frames: np.ndarray, times: np.ndarray, path: Path) -> float:
     return rate
 
 
-def write_numbered(take: Take, path: Path, names: Sequence[str], values: np.ndarray) -> None:
-    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none."""
+def write_numbered(
+    take: Take,
+    path: Path,
+    names: Sequence[str],
+    values: np.ndarray,
+    before: Mapping[str, Sequence[str]] = {},
+    behind: Mapping[str, Sequence[str]] = {},
+) -> None:
+    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none.
+
+    Columns of texts, one a frame, stand before and behind them.
+    """
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     numbers = frame_numbers(take, first=0)
     cells = number_texts(values.reshape(-1))
     width = len(names)
     rows = (
-        [str(number), repr(number / fps), *cells[row * width : (row + 1) * width]] for row, number in enumerate(numbers)
+        [
+            str(number),
+            repr(number / fps),
+            *(texts[row] for texts in before.values()),
+            *cells[row * width : (row + 1) * width],
+            *(texts[row] for texts in behind.values()),
+        ]
+        for row, number in enumerate(numbers)
     )
-    write_table(path, [*COLUMNS, *names], rows)
+    write_table(path, [*COLUMNS, *before, *names, *behind], rows)

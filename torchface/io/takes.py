@@ -66,9 +66,9 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
 def save_take(take: Take, path: str | Path) -> None:
     """Writes a performance in the format that ``path`` ends in.
 
-    ``.c3d`` and ``.trc`` hold the markers; whatever else the take holds is left out. A ``.csv`` holds the take's one
-    track: markers, landmarks, or weights. Weights whose names are ARKit's 52, in whatever order and case, become a
-    Live Link Face file; others a plain table that keeps their names
+    ``.c3d`` and ``.trc`` hold the markers, a ``.csv`` the weights of a take that has some, else its markers or its
+    landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case,
+    become a Live Link Face file; others a plain table that keeps their names
     (:func:`torchface.io.live_link.save_live_link` maps them to ARKit's instead).
 
     Args:
@@ -77,7 +77,8 @@ def save_take(take: Take, path: str | Path) -> None:
 
     Raises:
         FileFormatError: the suffix is none of ``.c3d``, ``.trc``, ``.csv``.
-        ValueRangeError: the take holds nothing for this format, or too much for a ``.csv``, or infinite numbers.
+        ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
+            numbers.
         NameMismatchError: a name would not come back as it is.
     """
     path = Path(path)
@@ -88,16 +89,12 @@ def save_take(take: Take, path: str | Path) -> None:
         return save_trc(take, path)
     if suffix != ".csv":
         raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
-    held = [name for name in ("markers", "landmarks", "weights") if getattr(take, name) is not None]
+    if take.weights is not None:
+        return save_live_link(take, path) if are_live_link_shapes(take.weights.names) else save_weights_csv(take, path)
+    held = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]
     if len(held) != 1:
         raise ValueRangeError(
-            f"{path}: found a take of {' and '.join(held) or 'no track'}, expected one track for a .csv; "
-            "save_markers_csv, save_landmarks_csv, save_weights_csv and save_live_link each write theirs"
+            f"{path}: found a take of {' and '.join(held) or 'no track'}, expected one of them for a .csv; "
+            "save_markers_csv and save_landmarks_csv each write theirs"
         )
-    if take.markers is not None:
-        return save_markers_csv(take, path)
-    if take.landmarks is not None:
-        return save_landmarks_csv(take, path)
-    if take.weights is not None and are_live_link_shapes(take.weights.names):
-        return save_live_link(take, path)
-    return save_weights_csv(take, path)
+    return save_markers_csv(take, path) if take.markers is not None else save_landmarks_csv(take, path)

@@ -22,7 +22,7 @@ _SQUARELY = 0.2
 _TRUSTED = 0.5
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
-_LOST = 0.01
+_TYPICAL, _SPARSE, _LOST = 0.15, 0.05, 0.01
 _MOST_GAIN = 4.0
 _DARK, _MOST_TONE = 0.05, 0.5
 _NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
@@ -92,17 +92,19 @@ def photo_texture(
     ]
     outside = _outer_border(vertices, faces)
     trusted = torch.ones(len(images), len(vertices), dtype=torch.float64) if trust is None else trust.cpu().double()
-    weights = torch.stack(
-        [_faded(shown, graph, (one < _TRUSTED) | outside) for shown, one in zip(at_vertices, trusted, strict=True)]
-    )
+    weights = torch.stack([
+        _squareness(shown) * _inside((shown.cosine > _SQUARELY) & (one >= _TRUSTED) & ~outside, graph)
+        for shown, one in zip(at_vertices, trusted, strict=True)
+    ])  # fmt: skip
+    soft = torch.stack([_feathered((one >= _TRUSTED).double(), graph) for one in trusted]).amax(0)
     seen = weights.sum(0)
     if float(seen.max()) <= 0:
         raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
     gains = _gains(at_vertices, weights)
     toned = [shown.colors.double() * gain for shown, gain in zip(at_vertices, gains, strict=True)]
     blended, offsets = _blended(toned, weights, graph)
-    alpha = (seen / 0.05).clamp(max=1)
-    filled = _filled(mesh, blended, alpha, base, graph)
+    alpha = (seen / 0.05).clamp(max=1) * soft
+    filled = _filled(mesh, blended, alpha, base, graph, trust is not None)
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
     points = texels.interpolate(vertices, faces)
@@ -116,7 +118,7 @@ def photo_texture(
         values += weight * (shown.colors.double() * gains[i] + tone)
         total += weight
     under = texels.interpolate(filled, faces)
-    share = (total / 0.05).clamp(max=1)
+    share = (total / 0.05).clamp(max=1) * texels.interpolate(soft[:, None], faces)
     values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
     return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
 
@@ -134,16 +136,25 @@ def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
     return result
 
 
-def _faded(shown: Shown, graph: VertexGraph, outside: Tensor) -> Tensor:
-    """A photograph's weight at each vertex, (V,): how squarely it is seen, fading to 0 before it ends."""
-    weight = ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
-    inner = ((weight > 0) & ~outside).double()
+def _squareness(shown: Shown) -> Tensor:
+    """How squarely a photograph sees each vertex, (V,) in [0,1]."""
+    return ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
+
+
+def _inside(shown: Tensor, graph: VertexGraph) -> Tensor:
+    """1 well inside what a photograph shows of the head (V,) bool, falling to 0 before it ends."""
+    inner = shown.double()
     for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is off
         inner = graph.least(inner)
+    return _feathered(inner, graph)
+
+
+def _feathered(inner: Tensor, graph: VertexGraph) -> Tensor:
+    """What is 1 (V,), falling to 0 before it ends."""
     soft = inner
     for _ in range(_FEATHER):
         soft = torch.minimum(inner, 0.5 * (soft + graph.sum(soft[:, None])[:, 0] / graph.degree))
-    return weight * soft
+    return soft
 
 
 def _gains(shown: Sequence[Shown], weights: Tensor) -> Tensor:
@@ -182,8 +193,11 @@ def _blended(toned: Sequence[Tensor], weights: Tensor, graph: VertexGraph) -> tu
     return corrected, offsets
 
 
-def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: VertexGraph) -> Tensor:
-    """Colours (V,3) where no photograph shows the skin: the mirror image, the base, else what is nearest, toned."""
+def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: VertexGraph, masked: bool) -> Tensor:
+    """Colours (V,3) where no photograph shows the skin: the mirror image, the base, else what is nearest, toned.
+
+    What is nearest is the pixel at the edge where the photograph ends, and a broad mean where a mask ends it.
+    """
     known, guess = alpha.clone(), colors * alpha[:, None]
     mirror = None if mesh.annotations is None else mesh.annotations.mirror
     if mirror is not None:
@@ -208,10 +222,15 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
     mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
     fixed = (known > 0.5)[:, None]
-    guess = torch.where(fixed, guess / known.clamp(min=0.5)[:, None], mean)
+    told = guess / known.clamp(min=0.5)[:, None]
+    if masked:  # lips, brows and what the edge still shows of hair do not spread
+        typical = known * torch.exp(-0.5 * ((told - mean) / _TYPICAL).square().sum(-1))
+        weight = graph.smoothed(typical[:, None], torch.ones_like(known), _BROAD)
+        told = torch.lerp(mean, graph.smoothed(told, typical, _BROAD), weight / (weight + _SPARSE))
+    under = torch.where(fixed, told, mean)
     for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known, and is lost on the way
-        guess = torch.where(fixed, guess, torch.lerp(graph.sum(guess) / graph.degree[:, None], mean, _LOST))
-    return guess
+        under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, _LOST))
+    return guess + (1 - known)[:, None] * under
 
 
 def _toned(

@@ -17,11 +17,11 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rendering.visibility import Shown, shown_in
 
 _FEATURES = 0.10
-_SURE, _OUTER = 0.80, 1.12
+_SURE = 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
-_ALIKE, _UNLIKE = 2.2, 3.4
+_ALIKE, _UNLIKE = 1.8, 2.8
 _LEAST, _MOST = (0.25, 0.06, 0.06), (0.45, 0.14, 0.14)  # deviations of skin: of brightness, of two ratios of channels
 _SQUARE, _FEWEST, _AROUND = 0.35, 30, 60
 _SETTLING = 4

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.files import write_file
+from torchface.files import make_folder, write_file
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
@@ -81,7 +81,7 @@ def save_picture(image: Tensor, path: str | Path) -> None:
     kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
     if path.suffix.lower() not in kinds:
         raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected .png or .jpg")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     content = BytesIO()
     to_pillow(image).save(content, kinds[path.suffix.lower()])
     write_file(path, content.getvalue())

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
-from torchface.geometry.operators import components, corners, vertex_normals
+from torchface.geometry.operators import components, corners
 from torchface.geometry.proximity import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
@@ -114,6 +114,7 @@ _MIDLINE: dict[str, dict[str, _Site]] = {
 }
 # Directions from which a marker has to be seen by one camera at least, degrees of yaw.
 _VIEWS = (0.0, -55.0, 55.0)
+_FORWARD, _TOWARD = -0.2, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +201,14 @@ def _outer_skin(mesh: Mesh) -> Tensor:
         touching = torch.zeros(len(vertices), dtype=torch.bool)
         touching[mesh.annotations.contacts.flatten().cpu()] = True
         skin &= ~touching[faces].any(1)
-    middle = torch.stack(corners(vertices, faces)).mean(0)
-    normals = torch.nn.functional.normalize(vertex_normals(vertices, faces)[faces].sum(1), dim=-1)
+    a, b, c = corners(vertices, faces)
+    middle = (a + b + c) / 3
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    skin &= normals[:, 2] > _FORWARD  # the inside of a lid looks back
     caster = RayCaster(vertices, faces[part[faces[:, 0]] == part[faces.flatten()].mode().values])
     seen = torch.zeros(len(faces), dtype=torch.bool)
     for yaw in torch.deg2rad(torch.tensor(_VIEWS, dtype=torch.float64)):
         toward = torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
         free = ~caster.occluded(middle + 0.1 * normals, toward.expand_as(middle))
-        seen |= free & (normals @ toward > 0.2)
+        seen |= free & (normals @ toward > _TOWARD)
     return (skin & seen).nonzero()[:, 0]

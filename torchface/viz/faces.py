@@ -14,6 +14,7 @@ from torchface.geometry.camera import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
 from torchface.rendering.shading import CLAY, DEFAULT_LIGHTING, Lighting, render
+from torchface.viz.region_colors import as_seen
 
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 
@@ -53,7 +54,8 @@ def face_views(
 ) -> Tensor:
     """The mesh from several sides in one row, (3,H,W); ``framed_by`` keeps the framing of another pose."""
     cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
-    row = sheet([render(mesh, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
+    seen = as_seen(mesh)
+    row = sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
     return row if title is None else caption(row, title)
 
 

@@ -18,6 +18,7 @@ from torchface.rendering.compositing import from_figure, heat_colors, sheet
 from torchface.rendering.shading import DEFAULT_LIGHTING, render
 from torchface.viz.faces import FRONT, clay_colors, frame_face
 from torchface.viz.marker_sites import facing
+from torchface.viz.region_colors import as_seen
 
 SIDE = 55.0
 _WIDTH, _HEIGHT = 520, 650
@@ -57,13 +58,18 @@ def marker_regions(mesh: Mesh, points: Tensor, regions: Sequence[str]) -> Tensor
     return sheet([*views, from_figure(figure)], len(views) + 1)
 
 
+def _paint(mesh: Mesh) -> Tensor | None:
+    """Clay where a texture or colours would hide the markers; regions of a bare mesh keep theirs."""
+    return None if mesh.texture is None and mesh.colors is None else clay_colors(mesh)
+
+
 def _views(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str]) -> list[Tensor]:
     return [_view(mesh, points, colors, labels, yaw) for yaw in (FRONT, SIDE)]
 
 
 def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str], yaw: float) -> Tensor:
     camera = frame_face(mesh, yaw, width=_WIDTH, height=_HEIGHT)
-    image = render(mesh, camera, clay_colors(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=4), samples=1)
+    image = render(as_seen(mesh), camera, _paint(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=4), samples=1)
     figure = Figure(figsize=(_WIDTH / 100, _HEIGHT / 100), dpi=100)
     axes: Axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(image.permute(1, 2, 0).numpy())

@@ -10,13 +10,15 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.operators import corners
+from torchface.geometry.proximity import SurfaceIndex
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import from_figure, sheet
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import render
 from torchface.viz.curves import SOLVED, TRUE
 from torchface.viz.faces import FRONT, THREE_QUARTER, clay_colors, frame_face
+from torchface.viz.region_colors import drawn_triangles
 
 _LIFT = 0.5
 
@@ -45,14 +47,14 @@ def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] 
 
 def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
     """Which points on a mesh, (M,3), a viewer sees who looks from ``yaw`` degrees, (M,) bool."""
-    normals = vertex_normals(mesh.vertices.double(), mesh.faces)
-    normals = normals[torch.cdist(points.double(), mesh.vertices.double()).argmin(1)]
+    faces, vertices = mesh.faces[drawn_triangles(mesh)], mesh.vertices.double()
+    a, b, c = corners(vertices, faces[SurfaceIndex(vertices, faces).nearest(points).triangle])
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     turn = math.radians(yaw)
     toward = torch.tensor([math.sin(turn), 0.0, math.cos(turn)], dtype=torch.float64)
     lifted = points.double() + _LIFT * normals
-    return (normals @ toward > 0) & ~RayCaster(mesh.vertices.double(), mesh.faces).occluded(
-        lifted, toward.expand_as(lifted)
-    )
+    hidden = RayCaster(vertices, faces).occluded(lifted, toward.expand_as(lifted))
+    return (normals @ toward > 0) & ~hidden
 
 
 def error_rounds(errors: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchface.files import write_file
+from torchface.files import make_folder, write_file
 from torchface.rendering.compositing import save_picture
 
 _STYLE = """
@@ -52,8 +52,7 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
     Returns:
         The page's path.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(folder)
     parts = [
         f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
         f"<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -29,6 +31,14 @@ def region_colors(mesh: Mesh) -> Tensor:
             colors[inside[ahead > _IRIS_COSINE]] = torch.tensor(IRIS.color)
             colors[inside[ahead > _PUPIL_COSINE]] = torch.tensor(_PUPIL)
     return colors
+
+
+def as_seen(mesh: Mesh) -> Mesh:
+    """A mesh without texture and colours with those of its regions, and without what hides its eyes; others as are."""
+    if mesh.texture is not None or mesh.colors is not None or not _regions(mesh):
+        return mesh
+    faces = mesh.faces[drawn_triangles(mesh).to(mesh.faces.device)]
+    return replace(mesh, faces=faces, polygons=None, uvs=None, uv_faces=None, colors=region_colors(mesh))
 
 
 def drawn_triangles(mesh: Mesh) -> Tensor:

@@ -13,6 +13,7 @@ from torchface.attachment import Attachment
 from torchface.capture import fit_attachment
 from torchface.capture.markers import AttachmentFit, sites_by_shape
 from torchface.errors import FileFormatError
+from torchface.files import check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.picks import load_landmarks
 from torchface.mesh import Mesh
@@ -88,6 +89,7 @@ def attach(
         TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
     """
     say = progress or (lambda line: None)
+    check_writable(out, picture)
     say("reading the rig")
     loaded = load_rig(rig, part=part)
     say("reading the range of motion")
@@ -101,7 +103,7 @@ def attach(
     faces, vertices = loaded.neutral.faces, loaded.vertices
     before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
     say("writing")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent)
     fit.attachment.save(out)
     if picture is not None:
         save_picture(sheet([site_views(loaded.neutral, before, after), error_rounds(fit.errors)], 1), picture)

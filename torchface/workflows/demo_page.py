@@ -116,7 +116,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], Non
         Section("The performance", _story(result), markup=markup),
         Section(
             "One frame",
-            "The true and the solved face, and the distance between them.",
+            "The true and the solved face, and the distance between them. No marker tells where eyes look.",
             pictures=[("frame_1.png", frame_picture)],
         ),
         Section(

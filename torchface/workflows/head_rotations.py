@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.io.live_link import ROTATIONS
+from torchface.io.weights import ROTATIONS
 
 
 def head_angles(rotation: Tensor) -> Tensor:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from torchface.capture.retarget import ShapeMap, load_shape_rules, retarget_take, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files import check_writable, make_folder
 from torchface.io import load_rig, load_take, save_animation
-from torchface.io.weights import save_weights_csv
 from torchface.take import Take, Track
+from torchface.workflows.weight_files import check_live_link, write_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,10 +21,12 @@ class Retargeted:
     Args:
         take: weights by the target's names.
         shapes: what drove what.
+        warnings: what a file leaves out.
     """
 
     take: Take
     shapes: ShapeMap
+    warnings: tuple[str, ...]
 
 
 def retarget_weights(
@@ -34,6 +37,7 @@ def retarget_weights(
     out: Path,
     animation: Path | None = None,
     part: str | None = None,
+    live_link: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Retargeted:
     """Reads, maps, writes; see ``torchface retarget --help`` for the arguments.
@@ -44,11 +48,13 @@ def retarget_weights(
         TorchfaceError: any file is broken.
     """
     say = progress or (lambda line: None)
+    check_writable(out, live_link, animation)
     say("reading")
     played = load_take(weights)
     if played.weights is None:
         raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
     target = load_rig(to, part=part)
+    check_live_link(target.names, live_link)
     if source is not None:
         rig = load_rig(source)
         # By the rig's own spelling, which is what a table names.
@@ -61,10 +67,8 @@ def retarget_weights(
         raise NameMismatchError(f"{table or weights}: {error}") from error
     moved = retarget_take(played, shapes)
     say("writing")
-    for path in (out, animation):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-    save_weights_csv(moved, out)
+    written = write_weights(moved, out, live_link)
     if animation is not None:
+        make_folder(animation.parent)
         save_animation(target, moved, animation)
-    return Retargeted(moved, shapes)
+    return Retargeted(moved, shapes, tuple(written))

@@ -24,9 +24,9 @@ from torchface.capture.markers import Cleanup, HelmetMotion
 from torchface.capture.markers.solve import RIDGE, SPARSITY
 from torchface.errors import ValueRangeError
 from torchface.evaluation import marker_rmse
+from torchface.files import check_writable, make_folder
 from torchface.geometry.alignment import Similarity
 from torchface.io import load_rig, save_animation
-from torchface.io.live_link import save_live_link
 from torchface.io.live_link_stream import parse_address
 from torchface.onnx.live import LiveMarkerSolver
 from torchface.rig import BlendshapeRig
@@ -36,6 +36,7 @@ from torchface.workflows.head_camera import HeadCamera, Predicted, predicted_cur
 from torchface.workflows.marker_input import AS_THEY_ARE, MarkerOptions, frame_span, read_markers
 from torchface.workflows.stream import StreamReport, stream_markers, stream_weights
 from torchface.workflows.take_check import check_coverage, check_explained, fit_warnings
+from torchface.workflows.weight_files import check_live_link, write_weights
 
 _SHOWN_DEFECTS = 12
 _SHOWN_SPANS = 6
@@ -267,6 +268,7 @@ def solve_take(
     camera: HeadCamera | None = None,
     progress: Callable[[str], None] | None = None,
     options: MarkerOptions = AS_THEY_ARE,
+    live_link: Path | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
 
@@ -275,10 +277,14 @@ def solve_take(
         TorchfaceError: any file is broken or does not fit the others.
     """
     say = progress or (lambda line: None)
+    check_writable(out, live_link, animation, report)
     if stream is not None:
         parse_address(stream)
     say("reading the rig")
     loaded = load_rig(rig, part=part)
+    check_live_link(loaded.names, live_link)
+    if stream is not None:
+        check_live_link(loaded.names, stream)
     where = Attachment.load(attachment)
     where.check(loaded.neutral, attachment, rig)
     say("reading the take")
@@ -294,10 +300,9 @@ def solve_take(
     solved = solution.take
     assert solved.weights is not None
     say("writing")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_live_link(solved, out)
+    written = write_weights(solved, out, live_link)
     if animation is not None:
-        animation.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(animation.parent)
         save_animation(loaded, solved, animation)
     sites = solution.attachment
     offset = torch.zeros(len(sites.triangles), 3) if sites.residual is None else sites.residual
@@ -311,7 +316,7 @@ def solve_take(
         solution.motion,
         solution.cleanup,
         predicted,
-        warnings=(*notes, *solution.warnings),
+        warnings=(*notes, *solution.warnings, *written),
     )
     if report is not None:
         say("writing the report")

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers import Cleanup, Defect
-from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, sheet
 from torchface.rendering.shading import DEFAULT_LIGHTING, render
 from torchface.rig import BlendshapeRig
@@ -21,6 +20,7 @@ from torchface.viz.marker_maps import marker_map
 from torchface.viz.motion import motion_curves
 from torchface.viz.page import Section, Table, write_page
 from torchface.viz.player import Markers, Panel, Played, Player, write_player
+from torchface.viz.region_colors import as_seen
 from torchface.workflows.solve import Solution, SolveReport
 
 _CURVES_A_PICTURE = 13
@@ -54,7 +54,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
     weights, names = take.weights.values[..., 0].float(), take.weights.names
     offsets = _offsets(rig, solution, weights)
     errors = offsets.norm(dim=-1)
-    done = "; ".join(line for line in report.lines() if not line.startswith("  "))
+    done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
     sections = [
         Section(
             "The performance",
@@ -115,11 +115,11 @@ def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
     while len(chosen) < min(_SHOWN_FRAMES, len(weights)):  # each choice depends on the one before
         chosen.append(int(torch.cdist(weights, weights[chosen]).amin(1).argmax()))
     camera = frame_face(rig.neutral, width=150, height=188)
-    lighting = replace(DEFAULT_LIGHTING, occlusion_rays=4)
+    lighting, seen = replace(DEFAULT_LIGHTING, occlusion_rays=4), as_seen(rig.neutral)
 
     def picture(frame: int) -> Tensor:
-        mesh: Mesh = rig.neutral.with_vertices(rig(weights[frame : frame + 1].to(rig.deltas))[0])
-        return caption(render(mesh, camera, lighting=lighting), f"frame {frame}", 12)
+        moved = rig(weights[frame : frame + 1].to(rig.deltas))[0]
+        return caption(render(seen.with_vertices(moved), camera, lighting=lighting), f"frame {frame}", 12)
 
     return sheet([picture(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
 

@@ -53,9 +53,9 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
                 f"labels: found {_listed(absent)} in the map, expected labels of {side}: {_listed(there)}"
             )
     taken: dict[str, str] = {}  # channel by known label
-    for channel, label in renamed.items():
-        if label:
-            _take(taken, label, channel)
+    for channel, own in renamed.items():
+        if own:
+            _take(taken, own, channel)
     for fold in (False, True):
         folded = {_spelled(label, fold): label for label in known}
         bare = {_spelled(_bare(label), fold): label for label in known}

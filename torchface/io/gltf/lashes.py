@@ -13,7 +13,7 @@ from torchface.mesh import Mesh
 
 _SPACING = 1.1  # millimetres between the hairs of one card
 _ROOT, _SHORTEST, _LEAN = 0.34, 0.55, 0.9  # share of the spacing that a root takes; of the card's length; of a spacing
-_SIDE = 1024
+_SIDE, _DENSE = 1024, 0.6
 
 
 def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Paint:
@@ -43,7 +43,11 @@ def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Pai
     def hairs(at: Tensor) -> Tensor:
         return torch.cat([color.expand(len(at), 3), _opacity(at)[:, None]], dim=1)
 
-    return painted(mesh, triangles, values, hairs, _SIDE)
+    paint = painted(mesh, triangles, values, hairs, _SIDE)
+    if paint.colors is None:
+        return paint
+    faded = _DENSE * (1 - values[:, :1])  # vertices are too few for hairs
+    return Paint(None, torch.cat([color.expand(len(values), 3), faded], dim=1).float())
 
 
 def _along(points: Tensor, card: Tensor) -> Tensor:

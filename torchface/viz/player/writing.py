@@ -6,7 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -22,8 +22,8 @@ from torchface.mesh import Mesh
 from torchface.rendering.compositing import heat_colors, to_pillow
 from torchface.rendering.shading import vertex_openness
 from torchface.rig import BlendshapeRig
-from torchface.viz.faces import framing
-from torchface.viz.region_colors import drawn_triangles, region_colors
+from torchface.viz.faces import clay_colors, framing
+from torchface.viz.region_colors import as_seen
 
 _MOST_FRAMES, _FASTEST = 6000, 60.0
 # A hundredth of a millimetre: markers as 16-bit numbers, and the shortest move that is worth a number.
@@ -179,12 +179,11 @@ def _markers(markers: Markers, step: int) -> dict[str, Any]:
 
 def _looks(mesh: Mesh) -> dict[str, Any]:
     """The framing, and what covers the mesh: texture with a corner a pair of vertex and texture point, or colours."""
-    bare = mesh.texture is None and mesh.colors is None
-    shown = drawn_triangles(mesh) if bare else torch.ones(len(mesh.faces), dtype=torch.bool)
-    faces = mesh.faces.cpu()[shown]
+    mesh = as_seen(mesh)
+    faces = mesh.faces.cpu()
     vertex, corners, uvs, texture = torch.arange(len(mesh.vertices)), faces, None, None
     if mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None:
-        pairs, inverse = torch.stack([faces.flatten(), mesh.uv_faces.cpu()[shown].flatten()], 1).unique(
+        pairs, inverse = torch.stack([faces.flatten(), mesh.uv_faces.cpu().flatten()], 1).unique(
             dim=0, return_inverse=True
         )
         vertex, corners = pairs[:, 0], inverse.reshape(-1, 3)
@@ -192,8 +191,8 @@ def _looks(mesh: Mesh) -> dict[str, Any]:
         content = BytesIO()
         to_pillow(mesh.texture).save(content, "JPEG", quality=88)
         texture = "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
-    colors = region_colors(mesh) if mesh.colors is None else mesh.colors
-    openness = vertex_openness(replace(mesh, faces=faces, polygons=None, uvs=None, uv_faces=None, texture=None))
+    colors = clay_colors(mesh) if mesh.colors is None else mesh.colors
+    openness = vertex_openness(mesh)
     centre, span = framing(mesh)
     return {
         "faces": _packed(faces, np.uint32),

@@ -1,0 +1,109 @@
+"""Pictures of a ``.glb`` by three.js in a headless Chromium."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.io.images import decode_image
+
+WEB = Path(__file__).resolve().parent / "web"
+_SECONDS = 120
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is seen.
+
+    Args:
+        weights: of shapes by name; the others are 0.
+        yaw: degrees that the camera stands to the side of the front.
+        target: what it looks at, metres.
+        span: metres that the picture is wide.
+        turns: pitch and yaw of nodes by name, radians.
+    """
+
+    weights: dict[str, float] = field(default_factory=dict)
+    yaw: float = 0.0
+    target: tuple[float, float, float] = (0.0, -0.02, 0.05)
+    span: float = 0.32
+    turns: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def chromium() -> str | None:
+    """The path of a Chromium, or none."""
+    return next(
+        (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+    )
+
+
+def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, side: int = 512) -> list[Tensor]:
+    """What three.js draws of ``.glb`` files, a picture (3,side,side) a shot.
+
+    Args:
+        browser: see ``chromium``.
+        shots: the file, and what is seen of it.
+        folder: for the browser's profile.
+        side: pixels.
+    """
+    files = {f"/{i}.glb": file for i, file in enumerate(dict.fromkeys(file for file, _ in shots))}
+    names = {file: name for name, file in files.items()}
+    order = json.dumps(
+        {"side": side, "shots": [{"file": names[file], **asdict(shot)} for file, shot in shots]}
+    ).encode()
+    results: list[dict] = []
+    done = threading.Event()
+
+    class Handler(SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path not in ("/shots.json", *files):
+                return super().do_GET()
+            body = files[self.path].read_bytes() if self.path in files else order
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+            return None
+
+        def do_POST(self) -> None:
+            results.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+            done.set()
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(WEB)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags += ["--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder / 'profile'}"]
+    page = f"http://127.0.0.1:{server.server_port}/look.html"
+    process = subprocess.Popen([browser, *flags, page], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        assert done.wait(_SECONDS), "the page posted nothing"
+    finally:
+        process.terminate()
+        process.wait(30)
+        server.shutdown()
+        server.server_close()
+    assert "error" not in results[0], results[0]["error"]
+    rows = [base64.b64decode(url.partition(",")[2]) for url in results[0]["pictures"]]
+    return [decode_image(row, "the browser's picture") for row in rows]
+
+
+def grid(rows: Sequence[Tensor], columns: int) -> Tensor:
+    """Pictures of one size beside and below each other."""
+    lines = [torch.cat(list(rows[i : i + columns]), dim=2) for i in range(0, len(rows), columns)]
+    return torch.cat(lines, dim=1)

@@ -1,0 +1,140 @@
+"""Weights on disk: any rig's names, Live Link Face where they allow, and what a take holds beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.capture import MarkerSolver
+from torchface.cli import main
+from torchface.io import load_take, save_rig, save_take
+from torchface.io.live_link import not_in_live_link
+from torchface.io.weights import ROTATIONS, load_weights_csv, save_weights_csv
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
+from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
+from torchface.take import Take, Track
+
+DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
+OWN = ("ctrl_a", "ctrl_b", "ctrl_c", "ctrl_d")
+HALVES = ("jawOpen", "browInnerUp_L", "mouthSmile_L", "mouthSmile_R")
+TIMECODE = tuple(f"10:00:00:{frame:02d}.000" for frame in range(30))
+
+
+@pytest.fixture(scope="module")
+def stage(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one rig by three sets of names, an attachment and a marker take."""
+    folder = tmp_path_factory.mktemp("stage")
+    sites = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(30)[:, None] * torch.tensor([0.05, 0.11, 0.17, 0.23]))
+    take = record(dome_rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.05)).take
+    for name, names in (("arkit", dome_rig.names), ("own", OWN), ("halves", HALVES)):
+        save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), folder / f"{name}.glb")
+    sites.save(folder / "attachment.json")
+    save_take(take, folder / "take.c3d")
+    return folder
+
+
+def solve(stage: Path, rig: str, *more: str | Path) -> Path:
+    out = stage / f"{rig}.csv"
+    words = ["solve", stage / f"{rig}.glb", stage / "take.c3d", "--attachment", stage / "attachment.json", "--quiet"]
+    main([str(word) for word in (*words, "--out", out, *more)])
+    return out
+
+
+def values(path: Path) -> torch.Tensor:
+    track = load_take(path).weights
+    assert track is not None
+    return track.values
+
+
+def phone_take() -> Take:
+    generator = torch.Generator().manual_seed(0)
+    columns = {name: torch.randn(30, generator=generator, dtype=torch.float64) for name in ROTATIONS}
+    track = Track(ARKIT, torch.rand(30, 52, 1, generator=generator))
+    return Take(60.0, weights=track, timecode=TIMECODE, extras={"columns": columns})
+
+
+def test_a_rig_with_names_of_its_own_is_solved_into_a_plain_table(stage: Path) -> None:
+    out = solve(stage, "own")
+    assert out.read_text().startswith("frame,time,ctrl_a,ctrl_b,ctrl_c,ctrl_d\n")
+    arkit = load_take(solve(stage, "arkit")).weights
+    assert arkit is not None
+    same = arkit.select([name[0].upper() + name[1:] for name in DOME])
+    torch.testing.assert_close(values(out), same.values)
+
+
+def test_names_decide_the_format_and_both_may_be_asked_for(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert solve(stage, "arkit").read_text().startswith("Timecode,BlendshapeCount,")
+    live = stage / "live.csv"
+    plain = solve(stage, "halves", "--live-link", live)
+    assert plain.read_text().startswith("frame,time,jawOpen,browInnerUp_L,")
+    assert live.read_text().startswith("Timecode,BlendshapeCount,")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "does not give back" in told
+    assert "browInnerUp_L" in told
+    torch.testing.assert_close(values(plain)[:, 0], values(live)[:, [n.lower() for n in ARKIT].index("jawopen")])
+
+
+def test_live_link_without_a_single_name_is_refused_before_the_solve(
+    stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (stage / "own.csv").unlink(missing_ok=True)
+    for more in (("--live-link", stage / "live.csv"), ("--stream", "udp://127.0.0.1:11111")):
+        with pytest.raises(SystemExit):
+            solve(stage, "own", *more)
+        assert "expected at least one of ARKit's shapes" in " ".join(capsys.readouterr().err.split())
+        assert not (stage / "own.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "lost"),
+    [
+        (ARKIT, ()),
+        (("eyeBlink_L", "JawOpen"), ()),
+        (("browInnerUp_L", "browInnerUp_R", "jawOpen"), ("browInnerUp_L", "browInnerUp_R")),
+        (OWN, OWN),
+    ],
+)
+def test_what_live_link_would_not_give_back(names: tuple[str, ...], lost: tuple[str, ...]) -> None:
+    assert not_in_live_link(names) == lost
+
+
+def test_a_plain_table_keeps_timecode_and_rotations_to_the_bit(tmp_path: Path) -> None:
+    take = replace(phone_take(), weights=Track(OWN, torch.rand(30, 4, 1)))
+    save_weights_csv(take, tmp_path / "take.csv")
+    back = load_take(tmp_path / "take.csv")
+    assert back.weights is not None
+    assert back.weights.names == OWN
+    assert torch.equal(back.weights.values, take.weights.values)  # type: ignore[union-attr]
+    assert back.timecode == TIMECODE
+    assert back.extras["columns"].keys() == set(ROTATIONS)
+    for name, column in take.extras["columns"].items():
+        assert torch.equal(back.extras["columns"][name], column)
+    bare = load_weights_csv(tmp_path / "take.csv")
+    save_weights_csv(replace(bare, timecode=None, extras={}), tmp_path / "bare.csv")
+    assert (tmp_path / "bare.csv").read_text().startswith("frame,time,ctrl_a,ctrl_b,ctrl_c,ctrl_d\n")
+
+
+@pytest.mark.parametrize("target", ["arkit", "halves"])
+def test_retarget_keeps_timecode_and_rotations(stage: Path, target: str) -> None:
+    take = phone_take()
+    save_take(take, stage / "phone.csv")
+    out, live = stage / "moved.csv", stage / "moved_live.csv"
+    words = ["retarget", stage / "phone.csv", "--to", stage / f"{target}.glb", "--out", out, "--live-link", live]
+    main([str(word) for word in (*words, "--quiet")])
+    for path in (out, live):
+        moved = load_take(path)
+        assert moved.timecode == TIMECODE
+        for name, column in take.extras["columns"].items():
+            torch.testing.assert_close(moved.extras["columns"][name], column, atol=1e-9, rtol=0)
+
+
+def test_a_solved_take_is_saved_as_its_weights(stage: Path, dome_rig: BlendshapeRig) -> None:
+    rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, OWN)
+    solved = MarkerSolver(rig, place_markers(dome_rig, 30)).solve_take(load_take(stage / "take.c3d"))
+    save_take(solved, stage / "solved.csv")
+    assert torch.equal(values(stage / "solved.csv"), solved.weights.values)  # type: ignore[union-attr]

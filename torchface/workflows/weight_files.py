@@ -1,0 +1,52 @@
+"""Weights on disk as the commands write them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchface.errors import NameMismatchError
+from torchface.files import make_folder
+from torchface.io.live_link import not_in_live_link, save_live_link
+from torchface.io.weights import save_weights_csv
+from torchface.shape_names import ARKIT, mapping
+from torchface.take import Take
+
+_SHOWN = 8
+
+
+def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
+    """Raises ``NameMismatchError`` where Live Link Face's file or packets are asked for and could hold no shape."""
+    if target is not None and not mapping(names, ARKIT).any():
+        raise NameMismatchError(
+            f"{target}: found a rig with {', '.join(names[:4])}, ..., expected at least one of ARKit's shapes for Live "
+            "Link Face; --out writes the rig's own names, and torchface retarget gives them ARKit's"
+        )
+
+
+def write_weights(take: Take, out: Path, live_link: Path | None = None) -> list[str]:
+    """Writes a take's weights, and says what a file leaves out.
+
+    Args:
+        take: weights by a rig's names.
+        out: Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
+            ``frame,time,<shape>,...`` with every shape by its own name.
+        live_link: Live Link Face's CSV whatever the names are, by :func:`torchface.shape_names.mapping`.
+
+    Returns:
+        Lines for people to read.
+    """
+    assert take.weights is not None
+    lost = not_in_live_link(take.weights.names)
+    make_folder(out.parent)
+    (save_weights_csv if lost else save_live_link)(take, out)
+    if live_link is None:
+        return []
+    make_folder(live_link.parent)
+    save_live_link(take, live_link)
+    more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
+    return (
+        [f"{live_link} does not give back (halves are merged, others left out): {', '.join(lost[:_SHOWN])}{more}"]
+        if lost
+        else []
+    )
