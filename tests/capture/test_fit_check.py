@@ -70,6 +70,18 @@ def test_a_slipping_helmet_is_named_and_passes_once_its_motion_is_taken_out(perf
     assert check_fit(sites(rig, attachment), markers, slip=True).distance == pytest.approx(found.mended, abs=0.1)
 
 
+def test_few_markers_close_together_may_stand_off_the_skin(performance: Performance) -> None:
+    rig, attachment, takes = performance
+    points = attachment.on(rig.neutral.faces, rig.vertices)
+    near = (points - points[points[:, 1].argmax()]).norm(dim=1).argsort()[:8]
+    brow = attachment.select([(attachment.labels or ())[i] for i in near.tolist()])
+    take = record(rig, brow, takes[0][::24], torch.Generator().manual_seed(0), StageFlaws(standoff=3)).take
+    assert take.markers is not None
+    found = check_fit(sites(rig, brow), take.markers.values)
+    assert found.spread < 30
+    assert not found.refused
+
+
 @pytest.mark.parametrize("slip", [False, True])
 def test_a_take_in_another_space_is_refused_for_its_alignment(
     performance: Performance, stage_space: Similarity, slip: bool

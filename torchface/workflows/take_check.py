@@ -9,7 +9,6 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
-from torchface.capture.markers.fit_check import REFUSED_SHARE
 from torchface.errors import AlignmentError, NameMismatchError
 from torchface.take import Take
 
@@ -103,7 +102,7 @@ def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool =
     if fit.refused and not insist:
         raise AlignmentError(
             f"{_source(take)}: the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm "
-            f"(median), expected at most {REFUSED_SHARE * fit.spread:.2g} mm; {_cause(fit, aligned)}; {_INSIST}"
+            f"(median), expected at most {fit.limit:.2g} mm; {_cause(fit, aligned)}; {_INSIST}"
         )
     return fit
 

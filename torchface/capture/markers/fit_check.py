@@ -18,6 +18,8 @@ from torchface.geometry.alignment import Similarity, similarity_transform
 # sites of the marker next to each 0.2, another head's attachment 0.8 to 1.3, centimetres or metres read as millimetres
 # 1.4 to 1.6.
 TRIED_SHARE, DOUBTFUL_SHARE, REFUSED_SHARE = 0.015, 0.035, 0.1
+# Markers on the brows alone lie close together; they stand as far off the skin as those of a whole face.
+_LEAST_SPREAD = 40.0
 # What is tried counts as the cause if it leaves this part of the distance.
 _MENDED = 0.5
 _UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0}
@@ -48,9 +50,28 @@ class FitCheck:
     similarity: Similarity | None = None
 
     @property
+    def limit(self) -> float:
+        """The largest ``distance`` that is not refused, millimetres."""
+        return REFUSED_SHARE * self._size
+
+    @property
     def refused(self) -> bool:
         """The rig does not explain the markers; what would be solved is no performance."""
-        return not self.distance <= REFUSED_SHARE * self.spread
+        return not self.distance <= self.limit
+
+    @property
+    def noisy(self) -> bool:
+        """The distance is more than a stage's noise makes: worth looking for a cause."""
+        return not self.distance <= TRIED_SHARE * self._size
+
+    @property
+    def doubtful(self) -> bool:
+        """The distance is more than noise, another head's rig or markers that stand off the skin make."""
+        return not self.distance <= DOUBTFUL_SHARE * self._size
+
+    @property
+    def _size(self) -> float:
+        return max(self.spread, _LEAST_SPREAD)
 
     @property
     def unit(self) -> str:
@@ -87,7 +108,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     found = FitCheck(apart, spread)
     if slip and not found.refused:
         return _with_slip(affine, few, found)
-    if apart <= TRIED_SHARE * spread:
+    if not found.noisy:
         return found
     if int((~torch.isnan(few).any(-1).all(0)).sum()) < 3:
         return _otherwise(found)
@@ -97,7 +118,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         return _with_slip(affine, few, found)
     found = replace(found, similarity=pose)
     mended = _distance(affine, laid)
-    if mended > TRIED_SHARE * spread and not _is_elsewhere(pose, few, spread):
+    if replace(found, distance=mended).noisy and not _is_elsewhere(pose, few, spread):
         steady = _distance(affine, _without_motion(affine, laid))
         if steady < _MENDED * mended:
             return replace(found, cause="slip", mended=steady)
@@ -109,7 +130,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
 
 def _otherwise(found: FitCheck) -> FitCheck:
     """Where nothing that was tried helps, it is the sites or the rig; or only noise, if the distance is small."""
-    return replace(found, cause="attachment") if found.distance > DOUBTFUL_SHARE * found.spread else found
+    return replace(found, cause="attachment") if found.doubtful else found
 
 
 def _with_slip(affine: Tensor, markers: Tensor, found: FitCheck) -> FitCheck:
