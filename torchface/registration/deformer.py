@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -15,6 +15,7 @@ from torchface.geometry.operators import triangle_cross
 from torchface.geometry.proximity import SurfaceIndex
 from torchface.registration.contact import ContactPull
 from torchface.registration.correspondence import Correspondences, correspondences, evenly_spread, exposed_vertices
+from torchface.registration.landmark_pull import LandmarkPull
 from torchface.registration.linear_step import Contacts, Data, LinearStep
 from torchface.registration.record import StageRecord
 from torchface.registration.schedule import Level, Schedule, Stage
@@ -26,14 +27,6 @@ from torchface.rendering.raycast import RayCaster
 _AREA_OF_ONE = 10.0
 _MOST_ATTEMPTS = 8
 _SLIVER = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class LandmarkPull:
-    """Template vertices (L,) int64 and where they belong, (L,3) float64."""
-
-    vertices: Tensor
-    points: Tensor
 
 
 class Deformer:
@@ -117,7 +110,7 @@ class Deformer:
 
     def _attempt(self, stage: Stage, number: int, space: Subspace, vertices: Tensor) -> StageRecord:
         held = ~self._folded[self._landmarks.vertices]
-        pull = LandmarkPull(self._landmarks.vertices[held], self._landmarks.points[held])
+        pull = self._landmarks.subset(held)
         step = LinearStep(
             space,
             vertices.numpy(),
@@ -126,6 +119,7 @@ class Deformer:
             stage.landmark_weight,
             self._schedule.sliding,
             self._held_together(stage),
+            pull.weights(self.current).numpy(),
         )
         energies, moved, made = [], float("inf"), 0
         while made < stage.iterations and moved >= stage.tolerance:

@@ -55,9 +55,10 @@ class LinearStep:
     r"""Minimises cost function 7 over the affine maps of a subspace.
 
     .. math:: E(X) = \lVert \alpha (M \otimes G) X \rVert^2 + \lVert W (D X - U) \rVert^2
-        + \lVert \beta (D_L X - U_L) \rVert^2 + \sum_{(i,j)} c_{ij} \lVert p_j - p_i - o_{ij} \rVert^2
+        + \sum_l \beta^2 b_l \lVert (D_L X - U_L)_l \rVert^2 + \sum_{(i,j)} c_{ij} \lVert p_j - p_i - o_{ij} \rVert^2
 
-    The last sum, over vertices in contact, is not in the paper; p are the positions ``D X``.
+    The last sum, over vertices in contact, and the landmarks' own weights b are not in the paper; p are the
+    positions ``D X``.
 
     A vertex's block of :math:`W` is :math:`\sqrt w\,(n n^\top + \sqrt\rho\,(I - n n^\top))`: across the surface a
     correspondence counts in full, along it, where the nearest point says nothing, only a share :math:`\rho`. With
@@ -72,6 +73,7 @@ class LinearStep:
         landmark_weight: :math:`\beta`.
         sliding: :math:`\rho`.
         contacts: what is to keep together; nothing if absent.
+        landmark_weights: :math:`b`, (L,); 1 if absent.
 
     Source: Amberg, Romdhani, Vetter 2007, equation 12; thesis 3.2.3, equation 7.
     """
@@ -85,15 +87,17 @@ class LinearStep:
         landmark_weight: float,
         sliding: float,
         contacts: Contacts | None = None,
+        landmark_weights: Array | None = None,
     ) -> None:
         self._space, self._vertices, self._landmarks = subspace, vertices, landmarks
-        self._alpha2, self._beta2, self._rho = stiffness**2, landmark_weight**2, sliding
+        self._alpha2, self._rho = stiffness**2, sliding
+        own = np.ones(len(landmarks)) if landmark_weights is None else landmark_weights
+        self._beta2 = (landmark_weight**2 * own)[:, None]
         self._rows = subspace.positions[vertices]
         self._rows_t = self._rows.T.tocsr()
         self._landmark_rows_t = subspace.positions[landmarks].T.tocsr()
-        fixed = self._alpha2 * subspace.stiffness_matrix + self._beta2 * (
-            self._landmark_rows_t @ self._landmark_rows_t.T
-        )
+        pull = self._landmark_rows_t @ sparse.diags_array(self._beta2[:, 0]) @ self._landmark_rows_t.T
+        fixed = self._alpha2 * subspace.stiffness_matrix + pull
         self._contacts = contacts
         if contacts is not None:
             apart = subspace.positions[contacts.pairs[:, 1]] - subspace.positions[contacts.pairs[:, 0]]
@@ -112,7 +116,7 @@ class LinearStep:
         pull = (1 - self._rho) * across**2 + self._rho * (left**2).sum(1)
         landmarks = place[self._landmarks] - data.landmarks
         stiff = self._space.stiffness @ maps
-        energy = self._alpha2 * (stiff**2).sum() + (data.weights * pull).sum() + self._beta2 * (landmarks**2).sum()
+        energy = self._alpha2 * (stiff**2).sum() + (data.weights * pull).sum() + (self._beta2 * landmarks**2).sum()
         if self._contacts is not None:
             energy += (self._contacts.weights * (self._parted(self._contacts, place) ** 2).sum(1)).sum()
         return float(energy)
@@ -143,7 +147,7 @@ class LinearStep:
 
         place = maps[3::4]
         downhill = self._rows_t @ blocks(data.targets - place[self._vertices])
-        downhill += self._beta2 * (self._landmark_rows_t @ (data.landmarks - place[self._landmarks]))
+        downhill += self._landmark_rows_t @ (self._beta2 * (data.landmarks - place[self._landmarks]))
         if self._contacts is not None:
             downhill -= self._contact_rows_t @ self._parted(self._contacts, place)
         downhill -= self._alpha2 * self._space.stiffness_gradient(maps)

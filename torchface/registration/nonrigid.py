@@ -16,7 +16,8 @@ from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
 from torchface.registration.contact import contact_pull
 from torchface.registration.correspondence import evenly_spread, exposed_vertices
-from torchface.registration.deformer import Deformer, LandmarkPull
+from torchface.registration.deformer import Deformer
+from torchface.registration.landmark_pull import LandmarkPull
 from torchface.registration.model_start import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
 from torchface.registration.preparation import (
     Landmarks,
@@ -87,7 +88,8 @@ def register(
         template: a face, millimetres. Only what faces outward looks for the scan; parts that share no vertex with it
             (eyeballs, teeth) follow the rest.
         scan: millimetres; any topology and pose, with holes, hair, collar, crumbs, either side out.
-        landmarks: template vertex ids (L,) int64 and scan points (L,3); at least three, NaN rows are skipped.
+        landmarks: template vertex ids (L,) int64 and scan points (L,3); at least three, NaN rows are skipped. Those of
+            the jaw's contour (of a template with 68) let go where surface and other landmarks contradict them.
         detector: asked for landmarks where none are given, once the template lies on the scan.
         model: of faces in the template's topology (a ``MorphableModel`` or ``HeadModel``). It is fitted to the scan
             first and the template bends from there: what the model knows no longer slides along the surface. The
@@ -143,7 +145,13 @@ def register(
         )
     vertices = deformer.current.to(template.vertices)
     mesh = replace(template, vertices=vertices, colors=None, texture=None)
-    notes = [*start.notes, *_model_notes(fit), *_final_notes(template, scan, deformer, texture_size)]
+    disagreement = start.pull.disagreement(deformer.current)
+    notes = [
+        *start.notes,
+        *([disagreement] if disagreement else []),
+        *_model_notes(fit),
+        *_final_notes(template, scan, deformer, texture_size),
+    ]
     if has_colors(scan):
         say("resampling the scan's colours")
         mesh = _colored(mesh, ScanColors(scan, *_surface_parts(start.prepared)), nearest, matched, texture_size)
@@ -192,8 +200,7 @@ def _start(
             landmarks = detector(laid, scan, pose)
             by = "detected landmarks" if landmarks is not None else by
     if landmarks is None:
-        pull = LandmarkPull(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3, dtype=torch.float64))
-        return _Start(by, pose, pull, prepared, surface, prepared.notes)
+        return _Start(by, pose, LandmarkPull.none(), prepared, surface, prepared.notes)
     (ids, points), pose, note = check_landmarks(landmarks, template, surface)
     notes += [note] if note else []
     if _faces_away(samples, surface, pose):
@@ -201,7 +208,7 @@ def _start(
         surface = SurfaceIndex(prepared.vertices, prepared.faces)
     targets = ScanPoints(prepared.vertices, prepared.faces)
     pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
-    return _Start(by, pose, LandmarkPull(ids, points), prepared, surface, (*prepared.notes, *notes))
+    return _Start(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
 
 
 def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> Similarity:
