@@ -30,7 +30,7 @@ _SLIVER = 0.1
 
 
 class Deformer:
-    """A template on its way to a scan.
+    """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others.
 
     Args:
         vertices: the template laid on the scan, (V,3) float64.
@@ -53,13 +53,15 @@ class Deformer:
         self.rest, self.faces, self._scan, self._landmarks = vertices, faces, scan, landmarks
         self._contacts, self._schedule = contacts, schedule
         self.maps = identity_maps(vertices)
-        self.exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
+        self.outward = exposed_vertices(vertices, faces, schedule.opening)
+        self.exposed = self.outward.nonzero()[:, 0]
         self._rest_cross = triangle_cross(vertices, faces)
         area = self._rest_cross.norm(dim=-1)
         self._sliver = area < _SLIVER * area.mean()
         # A correspondence stands for its share of the surface, so that the stiffness means the same at any resolution.
         self._area = float(self._rest_cross.norm(dim=-1).sum()) / 2
         self._folded = torch.zeros(len(vertices), dtype=torch.bool)
+        self.hidden = torch.zeros(len(vertices), dtype=torch.bool)
 
     @property
     def current(self) -> Tensor:
@@ -130,7 +132,7 @@ class Deformer:
             energies.append((before, step.energy(self.maps, data)))
             moved = float((self.current - place).norm(dim=-1).mean())
             made += 1
-        used = (found.weights > 0) & ~self._folded[vertices]
+        used = (found.weights > 0) & ~(self._folded | self.hidden)[vertices]
         return StageRecord(
             f"{number} {stage.level.value}",
             stage.stiffness,
@@ -139,7 +141,11 @@ class Deformer:
             float(found.distance[used].mean()),
             self._landmark_distance(),
             int(used.sum()),
-            {**found.dropped, "fold": int((self._folded[vertices] & (found.weights > 0)).sum())},
+            {
+                **found.dropped,
+                "fold": int((self._folded[vertices] & (found.weights > 0)).sum()),
+                "hidden": int(((self.hidden & ~self._folded)[vertices] & (found.weights > 0)).sum()),
+            },
             tuple(energies),
             0.0,
         )
@@ -150,8 +156,12 @@ class Deformer:
 
     def unfold(self) -> None:
         """Turns back what triangles are still turned over."""
+        self.lay(unfolded(self.rest, self.current, self.faces))
+
+    def lay(self, vertices: Tensor) -> None:
+        """Puts the vertices (V,3) where they are told to be."""
         maps = self.maps.copy()
-        maps[3::4] = unfolded(self.rest, self.current, self.faces).numpy()
+        maps[3::4] = vertices.numpy()
         self.maps = maps
 
     def _correspondences(self, vertices: Tensor, stage: Stage) -> Correspondences:
@@ -178,7 +188,8 @@ class Deformer:
 
     def _data(self, found: Correspondences, pull: LandmarkPull) -> Data:
         share = self._area / _AREA_OF_ONE / max(len(found.vertices), 1)
-        weights = (share * found.weights).masked_fill(self._folded[found.vertices], 0.0)
+        left_out = (self._folded | self.hidden)[found.vertices]
+        weights = (share * found.weights).masked_fill(left_out, 0.0)
         return Data(found.points.numpy(), found.normals.numpy(), weights.numpy(), pull.points.numpy())
 
     def _landmark_distance(self) -> float:

@@ -14,8 +14,10 @@ from torchface.geometry.alignment import Similarity
 from torchface.geometry.operators import vertex_normals
 from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
+from torchface.registration.completion import completed_colors, completed_form
 from torchface.registration.contact import contact_pull
 from torchface.registration.correspondence import evenly_spread, exposed_vertices
+from torchface.registration.cover import Cover
 from torchface.registration.deformer import Deformer
 from torchface.registration.landmark_pull import LandmarkPull
 from torchface.registration.model_start import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
@@ -29,12 +31,21 @@ from torchface.registration.preparation import (
 from torchface.registration.record import RegistrationRecord
 from torchface.registration.rigid import Samples, ScanPoints, find_pose, rigid_icp
 from torchface.registration.schedule import DEFAULT_SCHEDULE, Schedule
-from torchface.registration.texture import ScanColors, has_colors, resampled_texture, vertex_colors
+from torchface.registration.texture import (
+    ScanColors,
+    has_colors,
+    resampled_texture,
+    shown_share,
+    skin_base,
+    vertex_colors,
+)
 
 _RIGID_SAMPLES = 1500
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _NEAR = 3.0
 _FAR = 10.0
+_SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lies close to the scan
+_MOST_COMPLETIONS = 6
 _FEWEST_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
 Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
@@ -128,33 +139,35 @@ def register(
         fit = _model_fit(shape, template, laid, start, schedule)
         laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
     deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
+    cover = Cover(template, deformer.exposed, start.surface, _scan_colors(scan, start.prepared))
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
     for number, stage in enumerate(stages_left, 1):
         say(f"bending, stage {number} of {len(stages_left)}")
+        deformer.hidden = cover.hidden(deformer.current, settled=stage.reach <= _SETTLED)
         stages.append(deformer.run(stage, number))
     deformer.unfold()
     say("measuring")
     nearest = _nearest(start.surface, deformer.current)
-    matched = _matched(deformer, start.surface, nearest, schedule)
+    matched = cover.without_islands(_matched(deformer, start.surface, nearest, schedule))
     met = float(matched[deformer.exposed].double().mean())
     if met < _FEWEST_MET:
         raise AlignmentError(
             f"scan: found only {met:.0%} of the bent template's surface on the scan, expected at least "
             f"{_FEWEST_MET:.0%}; do the landmarks belong to this scan, and does it show what the template shows?"
         )
-    vertices = deformer.current.to(template.vertices)
-    mesh = replace(template, vertices=vertices, colors=None, texture=None)
-    disagreement = start.pull.disagreement(deformer.current)
-    notes = [
-        *start.notes,
-        *([disagreement] if disagreement else []),
-        *_model_notes(fit),
-        *_final_notes(template, scan, deformer, texture_size),
-    ]
-    if has_colors(scan):
+    unseen = ~cover.features & ~matched
+    if unseen.any():
+        say("completing what the scan does not show")
+        nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
+        matched &= ~unseen
+    mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
+    notes = [*start.notes, *start.pull.disagreement(deformer.current), *_model_notes(fit)]
+    notes += _final_notes(template, scan, deformer, texture_size)
+    colors = _scan_colors(scan, start.prepared)
+    if colors is not None:
         say("resampling the scan's colours")
-        mesh = _colored(mesh, ScanColors(scan, *_surface_parts(start.prepared)), nearest, matched, texture_size)
+        mesh = _colored(mesh, template, colors, nearest, matched, unseen, texture_size)
     record = RegistrationRecord(
         start.by,
         start_distance,
@@ -260,12 +273,10 @@ def _nearest(surface: SurfaceIndex, points: Tensor) -> SurfacePoints:
 
 
 def _matched(deformer: Deformer, surface: SurfaceIndex, nearest: SurfacePoints, schedule: Schedule) -> Tensor:
-    exposed = torch.zeros(len(deformer.rest), dtype=torch.bool)
-    exposed[deformer.exposed] = True
     own = vertex_normals(deformer.current, deformer.faces)
     cosine = torch.cos(torch.deg2rad(torch.tensor(schedule.largest_angle, dtype=torch.float64)))
     alike = (own * surface.normals_at(nearest)).sum(-1) >= cosine
-    return exposed & alike & ~surface.on_border(nearest) & (nearest.distance <= _NEAR)
+    return deformer.outward & ~deformer.hidden & alike & ~surface.on_border(nearest) & (nearest.distance <= _NEAR)
 
 
 def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: int) -> list[str]:
@@ -283,12 +294,54 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
     return notes
 
 
-def _surface_parts(prepared: PreparedScan) -> tuple[Tensor, Tensor, Tensor]:
-    return prepared.vertices, prepared.faces, prepared.face_ids
+def _completed(
+    deformer: Deformer, template: Mesh, surface: SurfaceIndex, nearest: SurfacePoints, unseen: Tensor, cover: Cover
+) -> tuple[SurfacePoints, Tensor]:
+    """Lays the unseen vertices where the template has them; the places on the scan and what is unseen then.
+
+    Where that turns triangles over, as between skin and an ear under hair, what lies around them is unseen too, and
+    of an ear all.
+    """
+    before, rest, faces = deformer.current, template.vertices.detach().cpu().double(), deformer.faces
+    for _ in range(_MOST_COMPLETIONS):
+        shown = deformer.outward & ~unseen
+        deformer.lay(completed_form(rest, before, faces, unseen, shown))
+        folded = faces[deformer.folded_triangles()].flatten()
+        around = torch.zeros_like(unseen)
+        around[folded[~cover.features[folded]]] = True
+        around[faces[around[faces].any(-1)].flatten()] = True
+        around &= ~cover.features
+        if not around.any():
+            break
+        unseen = torch.stack([unseen, around, *(ear for ear in cover.ears if (ear & around).any())]).any(0)
+    deformer.unfold()
+    moved = ((deformer.current - before).square().sum(-1) > 0).nonzero()[:, 0]
+    newer = _nearest(surface, deformer.current[moved])
+    found = SurfacePoints(*(part.clone() for part in vars(nearest).values()))
+    found.points[moved], found.triangle[moved] = newer.points, newer.triangle
+    found.barycentric[moved], found.distance[moved] = newer.barycentric, newer.distance
+    return found, unseen
 
 
-def _colored(mesh: Mesh, source: ScanColors, nearest: SurfacePoints, matched: Tensor, size: int) -> Mesh:
+def _scan_colors(scan: Mesh, prepared: PreparedScan) -> ScanColors | None:
+    return ScanColors(scan, prepared.vertices, prepared.faces, prepared.face_ids) if has_colors(scan) else None
+
+
+def _colored(
+    mesh: Mesh,
+    template: Mesh,
+    source: ScanColors,
+    nearest: SurfacePoints,
+    matched: Tensor,
+    unseen: Tensor,
+    size: int,
+) -> Mesh:
     colors = vertex_colors(source, nearest, matched)
-    texture = resampled_texture(mesh, colors, source, size) if size and mesh.uvs is not None else None
+    place, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    shown = shown_share(place, unseen)
+    # The last skin before hair is in its shadow: the fill starts where the scan's colours count in full.
+    filled = completed_colors(colors, skin_base(colors, template, matched), place, faces, shown < 1)
+    colors = torch.lerp(filled, colors, shown[:, None])
+    texture = resampled_texture(mesh, filled, shown, source, size) if size and mesh.uvs is not None else None
     device = mesh.vertices.device
     return replace(mesh, colors=colors.to(device), texture=None if texture is None else texture.to(device))

@@ -17,8 +17,8 @@ class StageRecord:
         distance: mean distance of the correspondences that were used, millimetres.
         landmark_distance: root mean square, millimetres; NaN without landmarks.
         used: correspondences that were used.
-        dropped: correspondences refused, by reason: ``distance``, ``border``, ``normal``, and ``fold`` where a
-            triangle would have turned over.
+        dropped: correspondences refused, by reason: ``distance``, ``border``, ``normal``, ``fold`` where a triangle
+            would have turned over, and ``hidden`` under hair, cloth or where an ear came out in pieces.
         energies: cost before and after each linear step, its correspondences held.
         seconds: wall-clock.
     """

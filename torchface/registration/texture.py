@@ -19,6 +19,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rendering.shading import sample_texture
 
 _REACH = 5.0
+_BLEND = 10.0
 _LARGEST_ANGLE = 75.0
 
 
@@ -76,16 +77,47 @@ def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -
     return colors.clamp(0, 1)
 
 
-def resampled_texture(mesh: Mesh, colors: Tensor, source: ScanColors, size: int) -> Tensor:
+def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:
+    """What is painted where nothing is seen, (V,3): the template's colours in the person's tone, else one skin colour.
+
+    Args:
+        colors: of the registered mesh's vertices, (V,3).
+        template: with or without vertex colours.
+        seen: whose colours are the person's, (V,) bool.
+    """
+    skin = colors[seen].median(0).values if seen.any() else colors.mean(0)
+    if template.colors is None:
+        return skin.expand(len(colors), 3)
+    own = template.colors.detach().cpu().to(colors)
+    return (own * (skin / own[seen].median(0).values.clamp(min=1e-3))).clamp(0, 1) if seen.any() else own
+
+
+def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:
+    """How much of each vertex's colour is the scan's, (V,) in [0,1]: 0 where unseen, 1 from 10 mm away from there on.
+
+    Args:
+        vertices: (V,3) millimetres.
+        unseen: (V,) bool.
+    """
+    if not unseen.any():
+        return torch.ones(len(vertices))
+    gap, _ = cKDTree(vertices[unseen].numpy()).query(vertices.numpy())
+    ramp = (torch.from_numpy(gap).float() / _BLEND).clamp(0, 1)
+    return ramp.square() * (3 - 2 * ramp)
+
+
+def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanColors, size: int) -> Tensor:
     """A texture (3,size,size) in the mesh's own layout.
 
     From each texel's place on the registered mesh a ray goes out and one in along the normal; the nearer hit within
-    5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do. Charts are
-    widened by four texels, so that no background shows at their seams.
+    5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do, and they take
+    over where the scan does not show the skin. Charts are widened by four texels, so that no background shows at
+    their seams.
 
     Args:
         mesh: registered, with texture coordinates.
         colors: of its vertices, (V,3).
+        shown: how much of the colour is the scan's, (V,) in [0,1].
         source: the scan.
         size: texels a side.
     """
@@ -96,8 +128,11 @@ def resampled_texture(mesh: Mesh, colors: Tensor, source: ScanColors, size: int)
     points = texels.interpolate(vertices, faces)
     normals = torch.nn.functional.normalize(texels.interpolate(vertex_normals(vertices, faces), faces), dim=-1)
     values = texels.interpolate(colors.double(), faces).float()
-    triangle, barycentric, found = _along_normals(source, points, normals)
-    values[found] = source.at(triangle[found], barycentric[found])
+    share = texels.interpolate(shown[:, None].double(), faces).float()
+    wanted = (share[:, 0] > 0).nonzero()[:, 0]
+    triangle, barycentric, found = _along_normals(source, points[wanted], normals[wanted])
+    rows = wanted[found]
+    values[rows] = torch.lerp(values[rows], source.at(triangle[found], barycentric[found]), share[rows])
     return laid_out(values.clamp(0, 1), texels)
 
 

@@ -1,0 +1,82 @@
+"""What a scan does not show, taken from the template: form and colours that go over into what it does show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.operators import edges, triangle_areas
+from torchface.optim.sparse import SparseCholesky
+
+_LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles
+_FORM_FADES, _COLORS_FADE = 80.0, 40.0
+_LEAST_AREA = 1e-3
+_FEWEST = 4
+
+
+def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor) -> Tensor:
+    r"""Vertices (V,3), the unseen ones where the template has them, bent to go on smoothly from those around.
+
+    The template is laid on what the scan shows by a similarity. The offset y from there to the registered vertices
+    goes on over the unseen ones as a thin plate does, and fades with the distance, :math:`\ell` = 80 mm:
+
+    .. math:: \min_y \int \lVert \Delta y \rVert^2 + \ell^{-4} \lVert y \rVert^2
+
+    Args:
+        rest: the template, (V,3) float64.
+        current: registered, (V,3) float64.
+        faces: (F,3) int64.
+        unseen: whose places the scan does not tell, (V,) bool; the rest of the mesh stays.
+        shown: whose places it tells, (V,) bool: they lay the template.
+
+    Source: Botsch and Sorkine 2008 (thin plates over a mesh).
+    """
+    if not unseen.any() or int(shown.sum()) < _FEWEST:
+        return current
+    laid = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
+    stiffness, area = _membrane(laid, faces)
+    plate = stiffness @ sparse.diags_array(1 / area) @ stiffness + sparse.diags_array(area / _FORM_FADES**4)
+    return laid + _spread(plate, current - laid, unseen)
+
+
+def completed_colors(colors: Tensor, base: Tensor, vertices: Tensor, faces: Tensor, unseen: Tensor) -> Tensor:
+    """Colours (V,3), the unseen ones going over from those around to a base within some 40 mm, as a membrane does.
+
+    Args:
+        colors: (V,3).
+        base: what the skin looks like far from anything seen, (V,3).
+        vertices: (V,3) float64, millimetres.
+        faces: (F,3) int64.
+        unseen: (V,) bool.
+    """
+    if not unseen.any():
+        return colors
+    stiffness, area = _membrane(vertices, faces)
+    system = stiffness + sparse.diags_array(area / _COLORS_FADE**2)
+    return (base + _spread(system, (colors - base).double(), unseen).to(colors)).clamp(0, 1)
+
+
+def _membrane(vertices: Tensor, faces: Tensor) -> tuple[sparse.csr_array, np.ndarray]:
+    """The stiffness (V,V) of a membrane with equal weights on all edges, and each vertex's area (V,)."""
+    count = len(vertices)
+    first, second = edges(faces).numpy().T
+    half = sparse.coo_array((np.full(len(first), _LINK), (first, second)), shape=(count, count)).tocsr()
+    links = half + half.T
+    third = triangle_areas(vertices, faces).double() / 3
+    area = torch.zeros(count, dtype=torch.float64)
+    for corner in range(3):
+        area.index_add_(0, faces[:, corner], third)
+    return (sparse.diags_array(links.sum(1)) - links).tocsr(), area.clamp(min=_LEAST_AREA).numpy()
+
+
+def _spread(system: sparse.csr_array, values: Tensor, unknown: Tensor) -> Tensor:
+    """Values (V,K) with the unknown rows at the least of the quadratic form, the others held."""
+    held = values.masked_fill(unknown[:, None], 0.0).numpy()
+    rows = unknown.nonzero()[:, 0].numpy()
+    pull = system[rows] @ held
+    filled = values.clone()
+    filled[unknown] = torch.from_numpy(SparseCholesky(system[rows][:, rows]).solve(-pull))
+    return filled
