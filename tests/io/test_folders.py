@@ -10,7 +10,8 @@ from mutation import check_reader
 from rig_samples import quad_sheet, sheet_rig
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError
-from torchface.io import load_rig, save_mesh, save_rig
+from torchface.geometry.normal_maps import DetailMaps
+from torchface.io import load_normal_map, load_rig, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -109,6 +110,17 @@ def test_a_written_folder_is_the_same_rig(tmp_path: Path) -> None:
     assert torch.equal(found.neutral.annotations.mirror, rig.neutral.annotations.mirror)
     assert (found.neutral.texture - rig.neutral.texture).abs().max() <= 0.5 / 255 + 1e-6
     assert [path.name for path in tmp_path.iterdir()] == ["actor"]
+
+
+def test_wrinkle_maps_lie_beside_their_shapes(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    maps = torch.nn.functional.normalize(torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0)), dim=1)
+    save_rig(rig, tmp_path / "actor", DetailMaps(("jawOpen",), maps[:1], maps[1]))
+    for name, normals in (("jawOpen", maps[0]), ("neutral", maps[1])):
+        assert (load_normal_map(tmp_path / "actor" / f"{name}_normals.png") - normals).abs().max() < 1e-3
+    with pytest.raises(NameMismatchError, match="no shape 'frown'"):
+        save_rig(rig, tmp_path / "other", DetailMaps(("frown",), maps[:1]))
+    assert not (tmp_path / "other").exists()
 
 
 def test_shapes_that_a_rigger_adds_or_takes_away_are_heeded(tmp_path: Path) -> None:

@@ -74,11 +74,14 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
         detail: wrinkle maps of its shapes.
 
     Raises:
-        NameMismatchError: a shape's name is no file's name.
+        NameMismatchError: a shape's name is no file's name, or a wrinkle map belongs to no shape.
         FileFormatError: the folder holds another rig's OBJ files, or cannot be written to.
     """
     folder = Path(folder)
     _check_names(rig, folder)
+    missing = [] if detail is None else [name for name in detail.names if name not in rig.names]
+    if missing:
+        raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
