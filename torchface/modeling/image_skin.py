@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.geometry.camera import Camera
 from torchface.mesh import Mesh
+from torchface.modeling.eye_colors import iris_color, part_vertices, with_part_colors
 from torchface.modeling.landmark_view import LANDMARKS
 from torchface.modeling.morphable import MorphableModel
 from torchface.modeling.photo_texture import photo_texture
@@ -52,15 +53,24 @@ def photographed_skin(
 
     Returns:
         With texture coordinates: the photographs laid on the head, and where none shows it the colour model, else the
-        template's skin. Without: the colour model's colours.
+        template's skin; of a template without colours, parts such as teeth wear what they are made of, and the irises
+        their colour in the photographs. Without: the colour model's colours.
     """
     fit = None if color is None else fit_colors(color, posed, images, cameras)
     base = _own_colors(posed) if fit is None else fit.colors
     if posed.uvs is None or size == 0:
         return Skin(base, None, fit)
     trust = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
+    if base is not None:
+        laid = photo_texture(posed, images, cameras, size, base, trust)
+        return Skin(laid.colors, laid.image, fit)
+    parts = part_vertices(posed)
+    if parts.any() and not parts.all():
+        trust = torch.ones(len(images), len(parts)) if trust is None else trust
+        trust = torch.where(parts, 0.0, trust)
     laid = photo_texture(posed, images, cameras, size, base, trust)
-    return Skin(laid.colors, laid.image, fit)
+    worn = with_part_colors(replace(posed, colors=laid.colors), iris_color(posed, images, cameras))
+    return Skin(worn.colors, laid.image, fit)
 
 
 def _has_landmarks(mesh: Mesh) -> bool:

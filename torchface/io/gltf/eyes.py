@@ -20,6 +20,8 @@ _LARGEST_SHARE = 0.6  # of an eyeball's radius; one that is no person's has no l
 _FRONT, _DEPTH = 0.6, 1.5  # millimetres behind the inner shell's front: round the pupil; where the iris ends
 _RIM, _DARK, _VEINS = (0.07, 0.05, 0.04), (0.012, 0.010, 0.010), (0.80, 0.60, 0.56)
 _OUTLIER, _ROUNDS = 2.5, 6
+_INNER = (0.50, 0.36, 0.20)  # round the pupil of a brown iris
+_AS_MADE = 0.02
 
 
 def stands_alone(faces: Tensor, inside: Tensor) -> bool:
@@ -51,15 +53,16 @@ def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMateria
         ahead = points[inner.unique()]
         points = _looking_along(ahead[ahead[:, 2] > ahead[:, 2].max() - _FRONT].mean(0), points)
     iris = min(_IRIS, _LARGEST_SHARE * float(radius))
+    worn = _worn_iris(mesh, triangles, points, iris)
     is_outer = torch.isin(mesh.faces[triangles, 0], outer)
     if len(inner) == 0:
-        return [(triangles, EYEBALL, painted(mesh, triangles, points, lambda at: _one_shell(at, iris)))]
+        return [(triangles, EYEBALL, painted(mesh, triangles, points, lambda at: _one_shell(at, iris, worn)))]
     rows, behind = triangles[is_outer], triangles[~is_outer]
     inside = (_off_axis(points) < iris) & (points[:, 2] > 0)
     clear = inside[mesh.faces[rows]].all(1)
     shell = painted(mesh, rows[~clear], points, lambda at: _outer_shell(at, iris))
     depth = float(points[inner.unique(), 2].max()) - _DEPTH
-    seen = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth))
+    seen = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth, worn))
     return [(rows[~clear], SCLERA, shell), (behind, IRIS, seen), (rows[clear], CORNEA, None)]
 
 
@@ -99,8 +102,8 @@ def _looking_along(axis: Tensor, points: Tensor) -> Tensor:
     return points @ torch.stack([x, torch.linalg.cross(z, x), z]).T
 
 
-def _one_shell(at: Tensor, iris: float) -> Tensor:
-    sclera, colored = _sclera(at), _iris(at, iris)
+def _one_shell(at: Tensor, iris: float, worn: Tensor | None) -> Tensor:
+    sclera, colored = _sclera(at), _iris(at, iris, worn)
     inside = (1 - _ramp(_off_axis(at), iris - _LIMBUS, iris + _LIMBUS)) * (at[:, 2] > 0)
     color = torch.lerp(sclera, colored, inside[:, None])
     color = _mix(color, _DARK, (1 - _ramp(_off_axis(at), _PUPIL - 0.1, _PUPIL + 0.1)) * (at[:, 2] > 0))
@@ -114,9 +117,9 @@ def _outer_shell(at: Tensor, iris: float) -> Tensor:
     return torch.cat([color, torch.where(front, _ramp(off, iris - 0.1, iris + 0.1), 1.0)[:, None]], dim=1)
 
 
-def _inner_shell(at: Tensor, iris: float, depth: float) -> Tensor:
+def _inner_shell(at: Tensor, iris: float, depth: float, worn: Tensor | None) -> Tensor:
     seen = torch.where(at[:, 2] > depth, _ramp(_off_axis(at), _PUPIL - 0.1, _PUPIL + 0.1), 0.0)
-    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), seen) * _iris(at, iris)
+    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), seen) * _iris(at, iris, worn)
     return torch.cat([color, torch.ones(len(at), 1, dtype=at.dtype)], dim=1)
 
 
@@ -127,12 +130,27 @@ def _sclera(at: Tensor) -> Tensor:
     return _mix(white, _VEINS, 0.8 * _ramp(turned, 0.6, 1.4))
 
 
-def _iris(at: Tensor, iris: float) -> Tensor:
+def _worn_iris(mesh: Mesh, triangles: Tensor, points: Tensor, iris: float) -> Tensor | None:
+    """The colour (3,) that an eyeball's front wears where its back wears the white that nobody has painted."""
+    if mesh.colors is None:
+        return None
+    ids = mesh.faces[triangles].unique()
+    colors, at = mesh.colors[ids].detach().cpu().double(), points[ids]
+    front, back = (_off_axis(at) < 0.9 * iris) & (at[:, 2] > 0), at[:, 2] < 0
+    white = torch.tensor(EYEBALL.color, dtype=torch.float64)
+    if not front.any() or not back.any() or float((colors[back] - white).abs().max()) > _AS_MADE:
+        return None
+    return colors[front].median(0).values
+
+
+def _iris(at: Tensor, iris: float, worn: Tensor | None) -> Tensor:
     """Fibres that run out from the pupil, lighter inside, with a dark border."""
     off, turn = _off_axis(at), torch.atan2(at[:, 1], at[:, 0])
     fibres = sum(torch.cos(turn * waves + phase) for waves, phase in ((29, 0.3), (43, 1.9), (61, 4.0), (17, 2.2))) / 4
-    color = torch.tensor(IRIS.color, dtype=at.dtype) * (1 + 0.5 * torch.as_tensor(fibres))[:, None]
-    color = _mix(color, (0.50, 0.36, 0.20), 0.6 * (1 - _ramp(off, 0.3 * iris, 0.62 * iris)))
+    mean = torch.tensor(IRIS.color) if worn is None else worn
+    color = mean.to(at.dtype) * (1 + 0.5 * torch.as_tensor(fibres))[:, None]
+    inner = _INNER if worn is None else tuple((1.4 * worn).clamp(max=1).tolist())
+    color = _mix(color, inner, 0.6 * (1 - _ramp(off, 0.3 * iris, 0.62 * iris)))
     return _mix(color, _RIM, _ramp(off, 0.80 * iris, iris)).clamp(0, 1)
 
 
