@@ -136,6 +136,14 @@ def test_info_tells_of_the_animation_in_a_file(
     assert "animation" not in capsys.readouterr().err
 
 
+def test_every_command_that_shows_progress_can_be_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]:
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        told = capsys.readouterr().out
+        assert ("-q" in told) == ("--quiet" in told), words
+
+
 def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])

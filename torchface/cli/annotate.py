@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,7 +23,7 @@ def annotate(
     face: int = 0,
     browser: bool = True,
     port: int = 8080,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Correct the landmarks of a few frames of a video by hand, in the browser, for an appearance model to learn from.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import steps, told
+from torchface.cli.progress import Quiet, steps, told
 
 
 def attach(
@@ -21,7 +21,7 @@ def attach(
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Find where markers sit on a rig from a range-of-motion take, and write them as attachment JSON.
 

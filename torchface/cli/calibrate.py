@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 from torchface.errors import ValueRangeError
 
 
@@ -17,7 +17,7 @@ def calibrate(
     out: Path = Path("camera.toml"),
     corners: str = "9x6",
     square: float = 25.0,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Calibrate a camera from pictures of a checkerboard, or a video of one, and write it as .toml.
 

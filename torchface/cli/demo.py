@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def demo(
@@ -16,7 +16,7 @@ def demo(
     target: Path | None = None,
     out: Path = Path("out/demo"),
     seed: int = 1,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run the main job from end to end and open the result in a browser: OUT/index.html.
 

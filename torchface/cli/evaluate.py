@@ -8,7 +8,7 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def evaluate(
@@ -26,7 +26,7 @@ def evaluate(
     as_is: bool = False,
     scale: float | None = None,
     height: int = 290,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare a result with the truth: error of every vertex, by region, by shape, over time, as heat maps.
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport
 
 
-def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: bool = False) -> None:
+def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: Quiet = False) -> None:
     """Write the marker solve of one rig and one marker layout as an ONNX file, and check it.
 
     Inputs of the graph: `markers` (B,M,3), millimetres, NaN where not seen, and `previous` (B,N), the weights of the
@@ -34,7 +34,7 @@ def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quie
     _write_solver(export_solver, rig, attachment, out, part, quiet)
 
 
-def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: bool = False) -> None:
+def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quiet: Quiet = False) -> None:
     """Write the hybrid solve of one rig and one marker layout as an ONNX file, and check it.
 
     As `torchface export solver`, with two inputs more: `predicted` (B,N), weights in [0,1] that a classifier says, and
@@ -71,7 +71,7 @@ def _write_solver(
     print(out)
 
 
-def action_units(model: str, out: Path, quiet: bool = False) -> None:
+def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     """Write an action unit classifier as an ONNX file, and check it.
 
     Inputs of the graph: `regions` (B,R,h,w), painted patterns in [0,1], and `rest` (R,h,w), the same of the face at
@@ -110,7 +110,7 @@ def video_solver(
     prior: str | None = None,
     dynamics: str | None = None,
     part: str | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write the video solve of one rig and one camera as an ONNX file, and check it.
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
-def export_model(name: str, /, out: Path, quiet: bool = False) -> None:
+def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
     """Write a model of the zoo, or of a folder, as an ONNX file, and check it against PyTorch.
 
     A head model gives the decoder (coefficients to vertices and colours), an expression regression the offsets of a

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def fit(
@@ -25,7 +25,7 @@ def fit(
     names: Literal["arkit"] | None = None,
     everything: bool = False,
     insist: bool = False,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Make a person's rig from one or several photographs, and write it as .glb.
 

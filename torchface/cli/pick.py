@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def pick(
@@ -21,7 +21,7 @@ def pick(
     scan_unit: str | None = None,
     part: str | None = None,
     port: int = 8080,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Pick points on a head by clicking, in the browser: landmark vertices, marker sites, correspondences with a scan.
 

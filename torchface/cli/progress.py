@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Annotated
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from tyro.conf import arg
 
 console = Console(stderr=True)
+
+Quiet = Annotated[bool, arg(aliases=["-q"])]
+"""The option of every command that shows progress."""
 
 
 def told(lines: Iterable[str]) -> None:

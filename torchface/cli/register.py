@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from tyro.conf import Positional
 
-from torchface.cli.progress import console
+from torchface.cli.progress import Quiet, console
 
 _MOST_ROWS = 40
 
@@ -26,7 +26,7 @@ def register(
     detector: str | None = None,
     texture_size: int = 1024,
     model: str | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Bend a template onto raw scans: each scan's face in the template's topology, with the scan's colours.
 

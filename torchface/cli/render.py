@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import steps
+from torchface.cli.progress import Quiet, steps
 
 
 def render(
@@ -20,7 +20,7 @@ def render(
     height: int = 640,
     clay: bool = False,
     part: str | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render a mesh or rig from several sides into one picture, by ray casting; no graphics driver is needed.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps, told
+from torchface.cli.progress import Quiet, console, steps, told
 
 _MOST_NAMES = 12
 
@@ -21,7 +21,7 @@ def retarget(
     live_link: Path | None = None,
     animation: Path | None = None,
     part: str | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Carry weights over to another rig by what its shapes are called, or by a table.
 

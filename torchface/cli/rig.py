@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def rig(
@@ -25,7 +25,7 @@ def rig(
     texture_size: int = 2048,
     detail_size: int = 2048,
     names: Literal["arkit"] | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import steps, told
+from torchface.cli.progress import Quiet, steps, told
 
 
 def solve(
@@ -36,7 +36,7 @@ def solve(
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     insist: bool = False,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Solve a marker take for blendshape weights.
 

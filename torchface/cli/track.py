@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.progress import TimeRemainingColumn as Remaining
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console
+from torchface.cli.progress import Quiet, console
 
 
 def track(
@@ -30,7 +30,7 @@ def track(
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Track a face in a video and solve it for the weights of the actor's rig; no markers are needed.
 

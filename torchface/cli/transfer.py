@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def transfer(
@@ -17,7 +17,7 @@ def transfer(
     part: str | None = None,
     unit: str | None = None,
     names: Literal["arkit"] | None = None,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Give a neutral head the shapes of a template rig and write the rig as .glb.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import console, steps
+from torchface.cli.progress import Quiet, console, steps
 
 
 def view(
@@ -15,7 +15,7 @@ def view(
     out: Path | None = None,
     part: str | None = None,
     port: int = 8080,
-    quiet: bool = False,
+    quiet: Quiet = False,
 ) -> None:
     """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, wrinkle maps,
     saving edited weights.
