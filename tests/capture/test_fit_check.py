@@ -126,3 +126,24 @@ def test_sites_of_other_markers_are_refused_wherever_the_take_lies(performance: 
 def test_units_by_scale() -> None:
     found = [unit_of_scale(scale) for scale in (1.0, 1.1, 930.0, 9.6, 25.0, 0.1, 0.0011, 3.0, 0.0)]
     assert found == ["", "", "m", "cm", "in", "mm", "mm", "", ""]
+
+
+@pytest.mark.real
+def test_real_takes_pass_and_the_same_on_other_sites_do_not(
+    real_capture: tuple[BlendshapeRig, Attachment, list[Tensor]],
+) -> None:
+    rig, attachment, takes = real_capture
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(0))
+    others = replace(attachment, triangles=attachment.triangles[order], barycentric=attachment.barycentric[order])
+    for weights in takes[:3]:
+        take = record(rig, attachment, weights[::30], torch.Generator().manual_seed(0), GAPS, fps=2).take
+        assert take.markers is not None
+        found = check_fit(sites(rig, attachment), take.markers.values)
+        assert found.cause == ""
+        assert found.distance < 0.5
+    wrong = check_fit(sites(rig, others), take.markers.values)
+    assert wrong.refused
+    assert wrong.cause == "attachment"
+    in_metres = check_fit(sites(rig, attachment), take.markers.values / 1000)
+    assert in_metres.refused
+    assert (in_metres.cause, in_metres.unit) == ("unit", "m")

@@ -41,6 +41,12 @@ def test_a_map_goes_first_and_leaves_out() -> None:
     assert match.strangers == ("M001", "Actor:M002")
 
 
+def test_a_map_leaves_out_a_whole_subject() -> None:
+    found = ["Jane:M001", "Joe:M001", "Jane:M002", "Joe:M002"]
+    assert match_labels(found, KNOWN, {"Jane:*": ""}).channels == ("Joe:M001", "Joe:M002")
+    assert own_labels(found, {"Jane:*": ""}).labels == ("M001", "M002")
+
+
 @pytest.mark.parametrize(
     ("found", "renamed", "said"),
     [

@@ -35,8 +35,8 @@ def attach(
         picture: Also draw where each marker sat and sits, and its error after each round: .png or .jpg.
         part: Keep this region of the rig only, such as face.
         labels: What the take's labels are called in INITIAL, and from then on: CSV, a row LABEL OF THE TAKE,LABEL
-            each; an empty second cell leaves the marker out. Unlabelled points and subjects' prefixes (Actor:M001)
-            are left out without it.
+            each; an empty second cell leaves the marker out, with Jane:* all of a subject's. Unlabelled points and
+            subjects' prefixes (Actor:M001) are left out without it.
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         quiet: Show no progress.

@@ -69,17 +69,19 @@ def solve(
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         part: Keep this region of the rig only, such as face.
         labels: What the take's labels are called in the attachment: CSV, a row LABEL OF THE TAKE,LABEL OF THE
-            ATTACHMENT each; an empty second cell leaves the marker out.
+            ATTACHMENT each; an empty second cell leaves the marker out, with Jane:* all of a subject's.
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
         insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
-    from torchface.errors import ValueRangeError
+    from torchface.errors import FileFormatError, ValueRangeError
     from torchface.workflows.head_camera import HeadCamera
     from torchface.workflows.marker_input import MarkerOptions
     from torchface.workflows.solve import SolveSettings, solve_take
 
+    if labels is not None and labels.suffix.lower() == ".toml":
+        raise FileFormatError(f"{labels}: found TOML, expected a .csv; labels of a video go to --video-labels")
     if (video is None) != (action_units is None):
         raise ValueRangeError("solve: found one of --video and --action-units, expected both or neither")
     camera = None if video is None or action_units is None else HeadCamera(video, action_units, video_labels, table)

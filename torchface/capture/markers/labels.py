@@ -36,7 +36,8 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
     Args:
         found: the take's.
         known: the attachment's.
-        renamed: the attachment's label by the take's, which goes first; an empty one leaves the marker out.
+        renamed: the attachment's label by the take's, which goes first; an empty one leaves the marker out, and
+            ``Actor:*`` with an empty one a whole subject.
 
     Raises:
         NameMismatchError: two labels mean one marker, none means any, or ``renamed`` names a label that is not there.
@@ -45,7 +46,7 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
         >>> match_labels(["Actor:M001", "m002", "*12"], ["M001", "M002"]).labels
         ('M001', 'M002')
     """
-    renamed = dict(renamed or {})
+    renamed = _spelled_out(renamed or {}, found)
     for side, names, there in (("the take", renamed, found), ("the attachment", renamed.values(), known)):
         absent = [name for name in names if name and name not in there]
         if absent:
@@ -88,7 +89,7 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
 
     Args:
         found: the take's.
-        renamed: what to call a label; an empty one leaves the marker out.
+        renamed: what to call a label; an empty one leaves the marker out, ``Actor:*`` a whole subject.
 
     Raises:
         NameMismatchError: two labels become one, none is left, or ``renamed`` names a label that is not there.
@@ -97,7 +98,7 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
         >>> own_labels(["Actor:M001", "Actor:M002", "*12"]).labels
         ('M001', 'M002')
     """
-    renamed = dict(renamed or {})
+    renamed = _spelled_out(renamed or {}, found)
     absent = [name for name in renamed if name not in found]
     if absent:
         raise NameMismatchError(
@@ -112,6 +113,14 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
     for channel, label in zip(channels, labels, strict=True):
         _take(taken, label, channel)
     return LabelMatch(tuple(channels), tuple(labels), tuple(name for name in found if name not in channels))
+
+
+def _spelled_out(renamed: Mapping[str, str], found: Sequence[str]) -> dict[str, str]:
+    """A map with ``Actor:*`` as the labels of that subject, which it leaves out."""
+    plain = {name: label for name, label in renamed.items() if label or not name.endswith(":*")}
+    for pattern in renamed.keys() - plain.keys():
+        plain |= {name: "" for name in found if name.startswith(pattern[:-1]) and name not in plain}
+    return plain
 
 
 def _known_as(channel: str, known: Mapping[str, str], bare: Mapping[str, str], fold: bool, strip: bool) -> str | None:
@@ -143,8 +152,8 @@ def _spelled(name: str, fold: bool) -> str:
 def _take(taken: dict[str, str], label: str, channel: str) -> None:
     if label in taken:
         raise NameMismatchError(
-            f"labels: found {taken[label]!r} and {channel!r} for the marker {label!r}, expected one: leave the other "
-            "out by a table (--labels map.csv)"
+            f"labels: found {taken[label]!r} and {channel!r} for the marker {label!r}, expected one: leave the "
+            "other out by a row without a second cell in a table (--labels map.csv; 'Actor:*,' for a whole subject)"
         )
     taken[label] = channel
 
