@@ -1,6 +1,6 @@
 """Capture from 3D markers."""
 
-from torchface.capture.markers.attachment_fit import AttachmentFit, fit_attachment
+from torchface.capture.markers.attachment_fit import AttachmentFit, check_attachment, fit_attachment
 from torchface.capture.markers.cleanup import Cleanup, Defect, clean_take
 from torchface.capture.markers.fit_check import FitCheck, check_fit
 from torchface.capture.markers.helmet import HelmetMotion, HelmetSolver
@@ -8,6 +8,7 @@ from torchface.capture.markers.hybrid import HybridSolver, gamma_curves
 from torchface.capture.markers.initial_sites import sites_by_shape
 from torchface.capture.markers.labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.observability import Observability, observability
+from torchface.capture.markers.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
 from torchface.capture.markers.take_alignment import align_take, rest_residual
@@ -24,9 +25,11 @@ __all__ = [
     "LabelMatch",
     "MarkerSolver",
     "Observability",
+    "SiteUncertainty",
     "SparsityTrial",
     "WholeTakeSolver",
     "align_take",
+    "check_attachment",
     "check_fit",
     "clean_take",
     "fit_attachment",

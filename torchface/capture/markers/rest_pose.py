@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.capture.energy import marker_term, ridge_term
+from torchface.capture.energy import marker_term
 from torchface.capture.markers.surface_motion import with_one
 from torchface.errors import AlignmentError
 from torchface.geometry.alignment import Similarity, similarity_transform
@@ -14,11 +14,14 @@ from torchface.optim import BoxQP
 _ON_A_LINE = 1e-2
 _TOLERANCE = 3e-6
 _FILLS = 12
+_FREE_RIDGE = 1e-4
 _FIRST_RIDGE, _LAST_RIDGE, _FALLING_ROUNDS = 3.0, 0.01, 20
 _ROUNDS, _SETTLED = 80, 1e-3
 
 
-def solve_weights(affine: Tensor, moved: Tensor, ridge: float, start: Tensor | None = None) -> Tensor:
+def solve_weights(
+    affine: Tensor, moved: Tensor, ridge: float, start: Tensor | None = None, unbounded: int = 0
+) -> Tensor:
     r"""Weights for markers whose sites follow affine maps, as a step of an alternation.
 
     A marker that is not seen is put where the weights before had it, which keeps one H for all frames; the weights then
@@ -29,22 +32,27 @@ def solve_weights(affine: Tensor, moved: Tensor, ridge: float, start: Tensor | N
         moved: markers in rig space, (T,M,3), NaN for not seen.
         ridge: mm² a marker for a squared weight of 1.
         start: weights of the step before, (T,N).
+        unbounded: how many of the last columns are no shapes but may go any way, with hardly a ridge.
 
     Returns:
-        Weights in [0,1], (T,N), float64.
+        Weights in [0,1], (T,N), float64; the last ``unbounded`` of any size.
     """
     basis, rest = affine[..., 1:], affine[..., 0]
     gaps = torch.isnan(moved)
     passes = 1 if not bool(gaps.any()) else _FILLS if start is None else 2
     shapes = basis.shape[-1]
     weights = moved.new_zeros(len(moved), shapes) if start is None else start
+    lower, upper = affine.new_zeros(shapes), affine.new_ones(shapes)
+    ridges = affine.new_full((shapes,), ridge)
+    if unbounded:
+        lower[-unbounded:], upper[-unbounded:], ridges[-unbounded:] = -torch.inf, torch.inf, _FREE_RIDGE
     solve = None
     for _ in range(passes):
         filled = moved
         if passes > 1:
             filled = torch.where(gaps, rest + torch.einsum("mcn,tn->tmc", basis, weights), moved)
-        energy = marker_term(basis, rest, filled) + ridge_term(shapes, ridge, affine)
-        solve = solve or BoxQP(energy.H, 0.0, 1.0, _TOLERANCE)
+        energy = marker_term(basis, rest, filled)
+        solve = solve or BoxQP(energy.H + torch.diag(2 * ridges), lower, upper, _TOLERANCE)
         weights = solve(energy.f, weights)
     return weights
 
@@ -79,13 +87,16 @@ def pose_step(
     rows = torch.stack([*turns, *(axis.expand_as(y) for axis in axes), arm, -n], dim=1)
     matrix = torch.einsum("pic,pjc->ij", rows, rows)
     step = torch.linalg.solve(matrix, torch.einsum("pic,pc->i", rows, left))
-    skew = y.new_zeros(3, 3)
-    skew[0, 1], skew[0, 2], skew[1, 2] = -step[2], step[1], -step[0]
+    return nudged(pose, centre, step[:3], step[3:6], 1 + step[6]), float(step[7])
+
+
+def nudged(pose: Similarity, centre: Tensor, turns: Tensor, shift: Tensor, grow: Tensor) -> Similarity:
+    """One pose, then a turn (a rotation vector, (3,)) and a growth about a point (3,), then a shift (3,)."""
+    skew = turns.new_zeros(3, 3)
+    skew[0, 1], skew[0, 2], skew[1, 2] = -turns[2], turns[1], -turns[0]
     turn = torch.linalg.matrix_exp(skew - skew.T)
-    grow = 1 + step[6]
-    translation = centre + grow * (turn @ (pose.translation[0] - centre)) + step[3:6]
-    moved_pose = Similarity(pose.scale * grow, turn @ pose.rotation, translation[None])
-    return moved_pose, float(step[7])
+    translation = centre + grow * (turn @ (pose.translation[0] - centre)) + shift
+    return Similarity(pose.scale * grow, turn @ pose.rotation, translation[None])
 
 
 def pose_of_take(affine: Tensor, paths: Tensor) -> Similarity:

@@ -41,8 +41,16 @@ class PathMoments:
     frames: Tensor
 
     @staticmethod
-    def of(paths: Tensor, weights: Tensor, on_rig: Tensor | None = None) -> PathMoments:
+    def of(
+        paths: Tensor,
+        weights: Tensor,
+        on_rig: Tensor | None = None,
+        start: Tensor | None = None,
+        trust: float = 0.0,
+    ) -> PathMoments:
         """Of markers (T,M,3), NaN where not seen, and extended weights (T,N+1), float64.
+
+        Where the sites are believed to be at rest, ``start`` (M,3), counts as a ``trust``-th part of a frame at rest.
 
         A marker that is not seen is put where its present site is (``on_rig``, (T,M,3)). That keeps one C for all
         markers and moves no site that is the best already; others take a few more rounds to come to theirs.
@@ -50,6 +58,11 @@ class PathMoments:
         seen = ~torch.isnan(paths[..., 0])
         if on_rig is not None:
             paths = torch.where(seen[..., None], paths, on_rig)
+        if start is not None:
+            paths = torch.cat([paths, trust**0.5 * start[None]])
+            rest = torch.zeros_like(weights[:1])
+            rest[:, 0] = trust**0.5
+            weights = torch.cat([weights, rest])
         moments = weights.T @ weights
         moments.diagonal().add_(_LEAST_MOMENT * len(paths))
         factor = torch.linalg.cholesky(moments)
