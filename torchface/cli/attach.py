@@ -21,9 +21,13 @@ def attach(
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
+    insist: bool = False,
     quiet: Quiet = False,
 ) -> None:
     """Find where markers sit on a rig from a range-of-motion take, and write them as attachment JSON.
+
+    Swapped labels, spikes and the motion of a slipping helmet are taken out; sites and shapes that the take leaves
+    uncertain are named, and what the rig does not explain ends in an error.
 
     Args:
         rig: The performer's rig: a .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
@@ -39,12 +43,15 @@ def attach(
             subjects' prefixes (Actor:M001) are left out without it.
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        insist: Write the sites although the rig does not explain the markers, or the take leaves most of them
+            uncertain.
         quiet: Show no progress.
     """
     from torchface.workflows.attach import attach as find_sites
     from torchface.workflows.marker_input import MarkerOptions
 
     with steps(quiet) as step:
-        report = find_sites(rig, rom, out, initial, standoff, picture, part, step, MarkerOptions(unit, labels, frames))
+        options = MarkerOptions(unit, labels, frames)
+        report = find_sites(rig, rom, out, initial, standoff, picture, part, step, options, insist)
     told(report.lines())
     print(out)

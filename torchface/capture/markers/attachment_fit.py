@@ -205,7 +205,8 @@ def _result(
     )
     helmet = None
     if slips:
-        steady = similarity_transform(paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3))
+        # The scale is known; a fit of it would shrink what turns to and fro.
+        steady = frame_poses(paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3), pose.scale[0])
         helmet, pose = _helmet_motion(steady, pose, shown, here[..., 0].mean(0)), steady
     off_skin = left.norm(dim=1)
     return AttachmentFit(sites, pose, torch.stack(errors), weights, state.height, off_skin, uncertainty, helmet)
