@@ -77,6 +77,8 @@ def test_frames_cut_the_take(stage: Path, capsys: pytest.CaptureFixture[str]) ->
     whole = values(solved(stage, "take.c3d"))
     for text, rows in (("40:70", slice(40, 70)), (":25", slice(25)), ("130:999", slice(130, 150))):
         assert torch.equal(values(solved(stage, "take.c3d", "--frames", text)), whole[rows])
+    # Both formats say when in the file a frame was.
+    assert solved(stage, "take.c3d", "--frames", "70:75").timecode == solved(stage, "take.c3d").timecode[70:75]  # type: ignore[index]
     for text in ("40-70", "70:40", "200:"):
         with pytest.raises(SystemExit):
             solved(stage, "take.c3d", "--frames", text)

@@ -11,7 +11,7 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.csv_table import TableReader, parse_number, quoted, write_table
-from torchface.io.frame_rates import check_rate
+from torchface.io.frame_rates import check_rate, frame_numbers
 from torchface.io.numbered_csv import is_numbered
 from torchface.io.timecode import read_timecodes, write_timecodes
 from torchface.io.weights import ROTATIONS, weights_to_write
@@ -122,8 +122,8 @@ def save_live_link(take: Take, path: str | Path) -> None:
     A take that ``load_live_link`` read gives the same file again, byte by byte where it came from the app. Weights by
     other names go to ARKit's by :func:`torchface.shape_names.mapping`: halves of a split shape give their mean, a
     shape that the take lacks is 0, one that ARKit lacks is left out. Without timecodes of its own a take starts at
-    00:00:00:00.000; those it has are written as they are. Without rotations they are 0. ARKit's own spelling
-    (``eyeBlinkLeft``) becomes the app's (``EyeBlinkLeft``).
+    00:00:00:00.000, or later by the number of its first frame; those it has are written as they are. Without rotations
+    they are 0. ARKit's own spelling (``eyeBlinkLeft``) becomes the app's (``EyeBlinkLeft``).
 
     Args:
         take: weights (T,N,1); NaN becomes an empty cell.
@@ -139,7 +139,7 @@ def save_live_link(take: Take, path: str | Path) -> None:
     path = Path(path)
     names, values = _as_arkit(*weights_to_write(take, path), path)
     check_rate(take.fps, f"{path}: the take", ValueRangeError)
-    timecodes = take.timecode or write_timecodes(len(take), take.fps)
+    timecodes = take.timecode or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
     try:
         read_timecodes(timecodes, path)
     except FileFormatError as error:

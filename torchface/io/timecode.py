@@ -95,10 +95,10 @@ def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
     return next((base for base in (first, *_BASES) if base > frames.max()), 1000)
 
 
-def write_timecodes(count: int, fps: float) -> tuple[str, ...]:
-    """Timecodes from midnight on for frames 0 to ``count`` - 1, in thousandths of the base's frames."""
+def write_timecodes(count: int, fps: float, first: int = 0) -> tuple[str, ...]:
+    """Timecodes of ``count`` frames from number ``first`` on, 0 at midnight, in thousandths of the base's frames."""
     base = max(1, round(fps))
-    ticks = np.rint(np.arange(count) * (1000 * base / fps)).astype(np.int64)
+    ticks = np.rint(np.arange(first, first + count) * (1000 * base / fps)).astype(np.int64)
     seconds, parts = ticks // (1000 * base) % _DAY, ticks % (1000 * base)
     return tuple(
         f"{second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}:{part // 1000:02d}.{part % 1000:03d}"
