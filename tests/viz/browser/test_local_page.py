@@ -41,7 +41,7 @@ def listening_addresses(port: int) -> set[str]:
 def test_without_viser_the_extra_is_named_before_anything_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     for command in (view, pick):
-        with pytest.raises(MissingExtraError, match=r"pip install torchface\[viewer\]"):
+        with pytest.raises(MissingExtraError, match=r"-m pip install 'viser<2,>=1.1'"):
             command(Path("no_such_rig.glb"))
 
 
