@@ -14,6 +14,7 @@ from torch import nn
 from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.solve import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
+from torchface.capture.video.solve import VideoSolver
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.landmarks.appearance import AppearanceModel
 from torchface.landmarks.trees import LandmarkTrees
@@ -35,6 +36,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "reciprocal_prior": ReciprocalPrior,
     "shape_prior": ShapePrior,
     "uv_landmarks": UVLandmarkDetector,
+    "video_solver": VideoSolver,
 }
 """What a file may ask for: a kind is looked up here and nowhere else."""
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig
-from torchface.capture import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior, windows_of
+from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.shape_names import mapping
 
 _FOCAL, _DISTANCE = 900.0, 600.0  # pixels, millimetres
@@ -124,7 +124,8 @@ def filmed(
 def solve_error(film: Filmed, prior: ShapePrior | None, pixel_noise: float) -> float:
     """Root mean square error of weights solved from the landmarks of each frame, the head's pose with them."""
     # The landmarks were filmed as vertices, so they do not slide.
-    solver = VideoSolver(film.rig, None, film.intrinsics, prior, pixel_noise=pixel_noise, contour_slide=1.0)
+    settings = VideoSettings(pixel_noise=pixel_noise, contour_slide=1.0)
+    solver = VideoSolver(film.rig, None, film.intrinsics, prior, settings=settings)
     return _rms(solver(film.landmarks).weights - film.truth)
 
 

@@ -25,7 +25,7 @@ from torchface.capture.priors import (
     ShapePrior,
 )
 from torchface.capture.retarget import retarget_take, shape_map
-from torchface.capture.video import VideoSolver, solve_whole_take
+from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.video import solve as frame_solve
 from torchface.capture.video.belief import Belief, Expectation
 from torchface.capture.video.face_points import FacePoints
@@ -205,12 +205,14 @@ def measured(filmed: list[Shot], solve: Solve) -> Row:
 
 
 def by(prior: ShapePrior | None, dynamics: DynamicsPrior | None = None, **settings: float) -> Solve:
-    return lambda shot: VideoSolver(shot.rig, None, K, prior, dynamics, **settings)(shot.landmarks).weights
+    weighed = VideoSettings(**settings)
+    return lambda shot: VideoSolver(shot.rig, None, K, prior, dynamics, weighed)(shot.landmarks).weights
 
 
 def whole(prior: ShapePrior, dynamics: DynamicsPrior, **settings: float) -> Solve:
+    weighed = VideoSettings(**settings)
     return lambda shot: (
-        solve_whole_take(VideoSolver(shot.rig, None, K, prior, dynamics, **settings), shot.landmarks).weights
+        solve_whole_take(VideoSolver(shot.rig, None, K, prior, dynamics, weighed), shot.landmarks).weights
     )
 
 
@@ -370,7 +372,8 @@ def test_pose_from_stable_landmarks(faces: Faces, learned: Learned) -> None:
     for trust in (0.0, 0.1, 1.0, 10.0):
 
         def solve(shot: Shot, trust: float = trust) -> Tensor:
-            solver = VideoSolver(shot.rig, None, K, learned.priors["default"], pose_trust=trust)
+            settings = VideoSettings(pose_trust=trust)
+            solver = VideoSolver(shot.rig, None, K, learned.priors["default"], settings=settings)
             points = shot.rig.vertices[shot.rig.neutral.landmarks][STABLE].double()
             pose = solve_pnp(points, shot.landmarks[:, STABLE], K)
             return solver(shot.landmarks, pose.rotation, pose.translation).weights

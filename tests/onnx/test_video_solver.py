@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface import __version__
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
-from torchface.capture.video import VideoSolver
+from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.cli import main
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.calibration import CameraCalibration
@@ -79,7 +79,8 @@ def test_planted_weights_are_recovered_frame_after_frame(
 ) -> None:
     """From no more than landmarks: the first frame's pose is found too, and missing landmarks are skipped."""
     memory = dynamics if remembers else None
-    solver = VideoSolver(rig, None, K, dynamics=memory, sparsity=0.0, ridge=1e-9, pixel_noise=0.01)
+    settings = VideoSettings(sparsity=0.0, ridge=1e-9, pixel_noise=0.01, steps=6)
+    solver = VideoSolver(rig, None, K, None, memory, settings)
     weights, landmarks = filmed(solver, 30)
     assert bool(torch.isnan(landmarks).any())
     found = torch.stack([frame["weights"] for frame in played(VideoGraph(solver), landmarks)])
@@ -89,11 +90,11 @@ def test_planted_weights_are_recovered_frame_after_frame(
 
 def test_it_is_the_exact_solve_and_its_memory(rig: BlendshapeRig, takes: list[Tensor], dynamics: DynamicsPrior) -> None:
     """With steps enough, weights, pose and covariance are those of ``VideoSolver`` after many frames."""
-    solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), dynamics, tolerance=1e-8)
+    solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), dynamics, VideoSettings(tolerance=1e-8))
     _, landmarks = filmed(solver, 12)
     landmarks[5] = torch.nan
     states, _ = solver.states(landmarks)
-    for frame, state in zip(played(VideoGraph(solver, 30), landmarks), states, strict=True):
+    for frame, state in zip(played(VideoGraph(solver), landmarks), states, strict=True):
         torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
         torch.testing.assert_close(frame["rotation"].double(), state.rotation, atol=1e-4, rtol=0)
         torch.testing.assert_close(frame["translation"].double(), state.translation, atol=2e-2, rtol=0)
@@ -164,7 +165,7 @@ def test_a_graph_that_differs_is_not_written(
     monkeypatch.setattr(video_export, "_PARITY", -1.0)
     monkeypatch.setattr(video_export, "FRAMES", 3)
     with pytest.raises(ValueRangeError, match="differ from PyTorch's"):
-        export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", steps=1)
+        export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", settings=VideoSettings(steps=1))
     assert not list(tmp_path.iterdir())
 
 
@@ -173,7 +174,7 @@ def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
     with pytest.raises(ValueRangeError, match="expected one of Student's distributions"):
         VideoGraph(VideoSolver(rig, None, K, bells))
     with pytest.raises(ValueRangeError, match="pose_trust"):
-        VideoGraph(VideoSolver(rig, None, K, pose_trust=1.0))
+        VideoGraph(VideoSolver(rig, None, K, settings=VideoSettings(pose_trust=1.0)))
     with pytest.raises(ShapeError, match=r"expected \(68,2\)"):
         VideoGraph(VideoSolver(rig, None, K))(torch.zeros(67, 2), torch.ones(68))
 
@@ -186,11 +187,11 @@ def test_the_command_writes_a_solver_of_rig_and_camera(
     save_calibration(CAMERA, tmp_path / "camera.toml")
     given = ["--rig", f"{tmp_path}/rig.glb", "--camera", f"{tmp_path}/camera.toml", "--out", f"{tmp_path}/out.onnx"]
     with pytest.raises(SystemExit) as refused:
-        main(["export", "video_solver", *given, "--prior", "head", "--quiet"])
+        main(["export", "video-solver", *given, "--prior", "head", "--quiet"])
     assert refused.value.code == 2
-    assert "expected a prior of shapes" in capsys.readouterr().err
+    assert "expected a ShapePrior" in capsys.readouterr().err
     assert not (tmp_path / "out.onnx").exists()
-    main(["export", "video_solver", *given, "--quiet"])
+    main(["export", "video-solver", *given, "--quiet"])
     assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path}/out.onnx"
     session = onnxruntime.InferenceSession(tmp_path / "out.onnx", providers=["CPUExecutionProvider"])
     assert [o.name for o in session.get_outputs()] == ["weights", "rotation", "translation"]

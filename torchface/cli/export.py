@@ -109,15 +109,18 @@ def video_solver(
     out: Path,
     prior: str | None = None,
     dynamics: str | None = None,
+    fps: float | None = None,
+    landmarks: Path | None = None,
     part: str | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write the video solve of one rig and one camera as an ONNX file, and check it.
+    """Write the video solve of one rig and one camera as an ONNX file, and check it: the one of `torchface track`.
 
     Inputs of the graph: `landmarks` (68,2), pixels, NaN where not seen, `confidence` (68,), and what the frame before
     gave, `previous_` and its name; all NaN for the first frame. Outputs: `weights` (N,), `rotation` (3,3),
     `translation` (3,), millimetres, and with a dynamics prior `window`, `mean` and `covariance`. Pixels are of pictures
-    without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a film.
+    without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a film. The
+    settings are those of `torchface track`, and in the file's metadata.
 
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
@@ -125,31 +128,33 @@ def video_solver(
         out: The .onnx file to write.
         prior: Which weights faces have: a model's name in the zoo, or a folder.
         dynamics: How weights go on: a model's name in the zoo, or a folder.
+        fps: Frames a second of the application's camera; those that the dynamics prior has learned if absent.
+        landmarks: The landmarks.csv that `torchface track` wrote of a video of this camera, to check the graph with; a
+            made-up film if absent.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface import zoo
-    from torchface.capture import DynamicsPrior, ShapePrior
     from torchface.errors import FileFormatError
-    from torchface.io import load_rig
+    from torchface.io import load_rig, load_take
     from torchface.io.cameras import load_calibration
     from torchface.onnx import export_video_solver
+    from torchface.workflows.track_models import load_priors
 
     with steps(quiet) as step:
         step("reading rig, camera and priors")
         loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
-        shapes = None if prior is None else zoo.get_model(prior)
-        if not isinstance(shapes, ShapePrior | None):
-            raise FileFormatError(f"{prior}: found a {type(shapes).__name__}, expected a prior of shapes")
-        motion = None if dynamics is None else zoo.get_model(dynamics)
-        if not isinstance(motion, DynamicsPrior | None):
-            raise FileFormatError(f"{dynamics}: found a {type(motion).__name__}, expected a prior of dynamics")
+        priors = load_priors(loaded, prior, dynamics, fps)
+        film = None if landmarks is None else load_take(landmarks).landmarks
+        if landmarks is not None and film is None:
+            raise FileFormatError(f"{landmarks}: found no landmarks, expected the landmarks.csv of torchface track")
         step("exporting and checking")
-        report = export_video_solver(loaded, calibration, out, shapes, motion)
+        report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=film)
     table = Table(show_header=False)
     for row in report.rows():
         table.add_row(*row)
     console.print(table)
+    if priors.unlearned:
+        console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", markup=False, soft_wrap=True)
     print(out)
 
 
@@ -157,5 +162,5 @@ EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
-    "video_solver": video_solver,
+    "video-solver": video_solver,
 }

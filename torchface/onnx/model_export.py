@@ -9,6 +9,7 @@ from torch import nn
 
 from torchface.capture import MarkerSolver
 from torchface.capture.priors import DynamicsPrior
+from torchface.capture.video import VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkTrees, UVLandmarkDetector
 from torchface.modeling import ExpressionRegression, HeadModel
@@ -19,16 +20,17 @@ from torchface.onnx.head_decoder import export_head_decoder
 from torchface.onnx.landmark_bank import export_landmark_bank
 from torchface.onnx.landmark_trees import export_landmark_trees
 from torchface.onnx.solver_export import SolverReport, export_marker_solver
+from torchface.onnx.video_export import VideoReport, write_video_solver
 
 
 def export_model(
     model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
-) -> ExportReport | SolverReport:
+) -> ExportReport | SolverReport | VideoReport:
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:
         model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkTrees``,
-            ``DynamicsPrior`` or ``MarkerSolver``.
+            ``DynamicsPrior``, ``MarkerSolver`` or ``VideoSolver``.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -47,7 +49,9 @@ def export_model(
         return export_dynamics_prior(model, path, facts)
     if isinstance(model, MarkerSolver):
         return export_marker_solver(model, path, facts=facts)
+    if isinstance(model, VideoSolver):
+        return write_video_solver(model, path, facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkTrees, DynamicsPrior or MarkerSolver"
+        "LandmarkTrees, DynamicsPrior, MarkerSolver or VideoSolver"
     )

@@ -11,20 +11,17 @@ from torch import Tensor, nn
 
 from torchface.capture.priors import ShapePrior, StudentDensity
 from torchface.capture.video.face_points import LANDMARKS
+from torchface.capture.video.parts import LOOSE_PLACE, LOOSE_STEP, LOOSE_TURN, LOOSE_WEIGHT, SHIFT, TURN
 from torchface.capture.video.reprojection import HeadState, linearise
-from torchface.capture.video.solve import SHIFT, TURN, VideoSolver
+from torchface.capture.video.solve import VideoSolver
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import cross_matrix
 from torchface.onnx.sweep import swept_inverse
 from torchface.optim.splitting import RELAXATION
 
-STEPS = 6
 _SLIDING_STEPS = 3
 _FEWEST = 6
-_LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
-_LOOSE_WEIGHT, _LOOSE_STEP = 1.0, 0.1
-# Steps of splitting in one of Gauss and Newton; those of Gauss and Newton that share one inverse.
-_SPLITTING_STEPS, _SHARED = 20, 3
+_SPLITTING_STEPS = 40  # in one of Gauss and Newton
 _RHO = 0.05
 _TERMS = 24  # of a series; exact to 1e-7 for turns of up to 90 degrees
 
@@ -43,10 +40,10 @@ class VideoGraph(nn.Module):
     r"""``VideoSolver.step`` as products, clamps and choices alone, one frame with what it hands on to the next.
 
     The energy is that of ``VideoSolver``, in float64 inside and float32 outside. A step is one of Gauss and Newton,
-    whose program in the box is solved by a fixed number of steps of splitting; their matrix is inverted by sweeps, once
-    for a few steps, as it hardly changes. Each frame begins where the one before ended, so that a few steps come near
-    the exact solve's many. Contour landmarks slide, chosen anew in the first steps. The first frame's pose is that of
-    an affine camera, so that nothing else need be known.
+    whose program in the box is solved by a fixed number of steps of splitting; their matrix is inverted by sweeps. Each
+    frame takes as many steps as the settings allow, and keeps what it had once none moved a weight further than their
+    tolerance: then it is where the solver stops. Contour landmarks slide, chosen anew in the first steps. The first
+    frame's pose is that of an affine camera, so that nothing else need be known.
 
     Without a dynamics prior the state is ``weights``, ``rotation`` and ``translation``. With one it is ``rotation``,
     ``translation``, and
@@ -60,8 +57,7 @@ class VideoGraph(nn.Module):
     frame is a first one. A first frame with fewer than six landmarks hands on no state either.
 
     Args:
-        solver: the exact solve; its tracked poses count for nothing.
-        steps: of a frame.
+        solver: the exact solve, with its settings; its tracked poses count for nothing.
 
     Raises:
         ValueRangeError: the solver leans on tracked poses, or its prior is none of Student's distributions.
@@ -69,26 +65,21 @@ class VideoGraph(nn.Module):
     Source: thesis 4.2.6, 4.2.9, 4.2.10; Boyd et al. 2011, 3.4.3 and 5.2, for the splitting.
     """
 
-    def __init__(self, solver: VideoSolver, steps: int = STEPS) -> None:
+    def __init__(self, solver: VideoSolver) -> None:
         super().__init__()
-        if solver.pose_trust > 0:
-            raise ValueRangeError(f"video graph: found a pose_trust of {solver.pose_trust}, expected 0")
-        if steps < 1:
-            raise ValueRangeError(f"video graph: found {steps} steps, expected one at least")
-        self.names, self.steps = solver.names, steps
-        self.points, self.contour_slide = solver.points, solver.contour_slide
-        self.pixel_noise, self.sparsity, self.ridge = solver.pixel_noise, solver.sparsity, solver.ridge
+        self.settings = solver.settings
+        if self.settings.pose_trust > 0:
+            raise ValueRangeError(f"video graph: found a pose_trust of {self.settings.pose_trust}, expected 0")
+        self.names, self.points = solver.names, solver.points
         self.dynamics = copy.deepcopy(solver.dynamics)
-        self.dynamics_strength = solver.dynamics_strength
         self.window = 1 if self.dynamics is None else self.dynamics.window
         count, like = len(solver.names), solver.points.rest
         self.bells = _bells(solver.prior, count, like)
-        self.intrinsics, self.landmark_weights = solver.intrinsics, solver.landmark_weights
-        self.to_rays = torch.linalg.inv(solver.intrinsics).T
-        weight = 0.0 if self.dynamics is None else _LOOSE_WEIGHT**-2
-        self.loose = like.new_tensor([weight] * count + [_LOOSE_TURN**-2] * 3 + [_LOOSE_PLACE**-2] * 3).diag()
+        self.intrinsics, self.landmark_weights = solver.intrinsics.double(), solver.landmark_weights.double()
+        self.to_rays = torch.linalg.inv(self.intrinsics).T
+        self.loose = solver.loose.double().diag()
         self.loose_spread = like.new_tensor(
-            [_LOOSE_WEIGHT**2] * count + [_LOOSE_TURN**2] * 3 + [_LOOSE_PLACE**2] * 3
+            [LOOSE_WEIGHT**2] * count + [LOOSE_TURN**2] * 3 + [LOOSE_PLACE**2] * 3
         ).diag()
         self.motion = like.new_tensor([TURN**2] * 3 + [SHIFT**2] * 3)
         self.identity = torch.eye(count + 6).to(like)
@@ -143,25 +134,23 @@ class VideoGraph(nn.Module):
         weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
         head = HeadState(weights[None], rotation[None], translation[None])
         mean, information = self._expected(head, window, first, state)
-        precision = torch.where(enough, trust.sqrt() / self.pixel_noise, 0.0)[None]
+        apart = self.points.eyes_distance(head.rotation, head.translation, self.intrinsics)
+        noise = (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
+        precision = torch.where(enough, trust.sqrt() / noise, 0.0)[None]
         rows = self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics)
-        dual = torch.zeros_like(self.lower)
-        for step in range(self.steps):  # each step begins where the one before ended
+        dual, done = torch.zeros_like(self.lower), torch.zeros_like(first)
+        for step in range(self.settings.steps):  # each step begins where the one before ended
             if 0 < step < _SLIDING_STEPS:
                 rows = self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics)
             H, gradient = self._told(head, rows, found[None], precision, mean, information)
             own, slope = self._liked(head.weights[0])
-            if step % _SHARED == 0:
-                factors = self._factors(H + torch.nn.functional.pad(own, (0, 6, 0, 6)))
+            factors = self._factors(H + torch.nn.functional.pad(own, (0, 6, 0, 6)))
             gradient = gradient + torch.nn.functional.pad(slope, (0, 6))
             by, dual = self._step(head.weights[0], gradient, factors, dual)
-            head = self._moved(head, by)
+            head = _chosen(done, head, self._moved(head, by))
+            done = done | (by[: len(self.names)].abs().max() < self.settings.tolerance)
         # A face that is not seen stays as it was.
-        head = HeadState(
-            torch.where(enough, head.weights, weights),
-            torch.where(enough, head.rotation, rotation),
-            torch.where(enough, head.translation, translation),
-        )
+        head = _chosen(enough, head, HeadState(weights[None], rotation[None], translation[None]))
         begun = ~first | enough
         out = [
             torch.where(begun, head.weights[0], 0.0),
@@ -203,7 +192,7 @@ class VideoGraph(nn.Module):
         known = torch.where(gaps, 0.0, window)
         ahead, variance = self.dynamics(known.to(self.dynamics.center.dtype)[None])
         steps = torch.where(full, ahead[0].double() - known[-1], 0.0)
-        variance = torch.where(full, variance[0].double() / self.dynamics_strength, _LOOSE_STEP**2)
+        variance = torch.where(full, variance[0].double() / self.settings.dynamics_strength, LOOSE_STEP**2)
         least = torch.where(first, 0.0, state["mean"] + torch.nn.functional.pad(steps, (0, 6)))
         noise = torch.cat([variance, self.motion])[:, None] * self.identity
         spread = torch.where(first, self.loose_spread, state["covariance"] + noise)
@@ -213,7 +202,7 @@ class VideoGraph(nn.Module):
         self, head: HeadState, rows: Tensor, found: Tensor, precision: Tensor, mean: HeadState, information: Tensor
     ) -> tuple[Tensor, Tensor]:
         """What landmarks and the frames before tell: H (N+6,N+6), and the gradient (N+6,) at a state."""
-        at = linearise(self.points, head, rows, self.intrinsics, found, precision, self.contour_slide)
+        at = linearise(self.points, head, rows, self.intrinsics, found, precision, self.settings.contour_slide)
         J, r = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
         away = torch.cat(
             [
@@ -226,11 +215,11 @@ class VideoGraph(nn.Module):
 
     def _liked(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """What prior and prices ask: H (N,N), and the gradient (N,) at weights (N,)."""
-        H = 2 * self.ridge * self.identity[:-6, :-6]
+        H = 2 * self.settings.ridge * self.identity[:-6, :-6]
         for bell in self.bells:
             distance = weights @ bell.matrix @ weights
             H = H + (bell.freedom + bell.size) / (bell.freedom + distance) * bell.strength * bell.matrix
-        return H, H @ weights + self.sparsity
+        return H, H @ weights + self.settings.sparsity
 
     def _factors(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """G, 2G + (2 - α) I and -α (H + ρD)^-1 of splitting, (N+6,N+6) each; see ``torchface.optim.splitting``."""
@@ -279,6 +268,14 @@ def _bells(prior: ShapePrior | None, shapes: int, like: Tensor) -> list[_Bell]:
         matrix[rows[:, None], rows] = factor @ factor.T
         parts.append(_Bell(len(group), float(density.freedom), prior.strength, matrix))
     return parts
+
+
+def _chosen(condition: Tensor, one: HeadState, other: HeadState) -> HeadState:
+    return HeadState(
+        torch.where(condition, one.weights, other.weights),
+        torch.where(condition, one.rotation, other.rotation),
+        torch.where(condition, one.translation, other.translation),
+    )
 
 
 def _turned(vector: Tensor) -> Tensor:

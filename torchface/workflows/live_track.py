@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.video import VideoSolver
+from torchface.capture.video import VideoState
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.capture.video.pose import PoseTracker
 from torchface.errors import ValueRangeError
@@ -90,9 +90,9 @@ class LiveSolver:
         self.names = rig.names
         self._tracker = LandmarkTracker(models.trees, models.appearance, face=face)
         self._calibration, self._filter = calibration, LandmarkFilter()
-        self._models, self._rig = models, rig
         self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
-        self._solver: VideoSolver | None = None
+        self._solver = solver_for(rig, models, calibration)
+        self._state: VideoState | None = None
 
     def step(self, frame: Tensor) -> LiveFrame:
         """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0."""
@@ -100,13 +100,11 @@ class LiveSolver:
         landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
         pose = self._poses.step(landmarks, seen.confidence)
         enough = int(torch.isfinite(landmarks).all(1).sum()) >= _FEWEST
-        if self._solver is None and not enough:
+        if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
-        if self._solver is None:  # the first face tells how large it is, and so how noisy its landmarks are
-            self._solver = solver_for(self._rig, self._models, self._calibration, landmarks[None])
-            self._state = self._solver.start()
+        before = self._state or self._solver.start()
         self._state = self._solver.step(
-            self._state, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
+            before, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
         )
         weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
         return LiveFrame(weights, rotation, seen.landmarks)

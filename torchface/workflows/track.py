@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import torchface
-from torchface.capture.video import VideoSolution, VideoSolver
+from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.pose import HeadPoses, measure_poses, smooth_poses, track_pose
 from torchface.capture.video.whole_take import interpolated, solve_whole_take
@@ -49,10 +49,6 @@ Progress = Callable[[str, int, int], None]
 """Told what is being done, how many frames of it are done, and of how many."""
 
 _VERSION = torchface.__version__  # another one may track and solve differently
-_NOISE, _NOISE_REFINED = 0.025, 0.015  # of the eyes' distance: what models of landmarks are measured to be off
-_LEAST_NOISE = 0.5
-# By the error of films of the embedded performer, of strengths 1, 0.1, 0.03 and noises 1, 3, 6, 12 times as large.
-_ALIKE, _DYNAMICS_STRENGTH = 3.0, 0.03
 
 
 @dataclass(frozen=True)
@@ -124,6 +120,7 @@ def track_video(
     pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
     poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, film.path)
     seconds["pose"] = time.perf_counter() - begin
+    solver = solver_for(actor, models, calibration)
     solve_key = digest(
         see_key,
         models.solving,
@@ -131,11 +128,11 @@ def track_video(
         str(calibration.intrinsics.tolist()),
         str(calibration.distortion.tolist()),
         str(settings.whole_take),
+        str(solver.settings),
     )
     solution = kept_solution(state, solve_key, len(frames), len(actor.names))
     if solution is None:
         begin = time.perf_counter()
-        solver = solver_for(actor, models, calibration, pinhole)
         solution = _solve(solver, pinhole, poses, frames.confidence, settings.whole_take, progress)
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
@@ -208,36 +205,10 @@ def check_texture(rig: BlendshapeRig, texture: Path) -> None:
         raise ValueRangeError(f"{texture}: found a rig without texture coordinates, expected some to put it on")
 
 
-def solver_for(
-    rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, landmarks: Tensor
-) -> VideoSolver:
-    """The solver of a rig, for landmarks (T,68,2) that are as noisy as these.
-
-    Models of landmarks err alike in frames that look alike. A dynamics prior takes each frame's errors for new ones:
-    it would soon be sure of what they have in common, so with one the noise is reckoned larger and the prior weaker.
-    """
-    noise = landmark_noise(landmarks, models)
-    if models.dynamics is None:
-        return VideoSolver(rig, None, calibration.intrinsics, models.prior, None, noise)
-    return VideoSolver(
-        rig,
-        None,
-        calibration.intrinsics,
-        models.prior,
-        models.dynamics,
-        _ALIKE * noise,
-        dynamics_strength=_DYNAMICS_STRENGTH,
-    )
-
-
-def landmark_noise(landmarks: Tensor, models: TrackModels) -> float:
-    """How far landmarks (T,68,2) are off, a coordinate's standard deviation, pixels.
-
-    It grows with the face: a share of the distance between the eyes' outer corners, in the median frame.
-    """
-    span = (landmarks[:, 36] - landmarks[:, 45]).norm(dim=1).nanmedian()
-    share = _NOISE if models.appearance is None else _NOISE_REFINED
-    return max(_LEAST_NOISE, share * float(span.nan_to_num()))
+def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration) -> VideoSolver:
+    """The solver of a rig, for landmarks that the models find."""
+    settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None)
+    return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
 
 
 def actor_digest(rig: BlendshapeRig) -> str:

@@ -72,17 +72,38 @@ def load_track_models(
     trees = _read("--landmarks", landmarks, LandmarkTrees)
     if len(trees.mean) != 68:
         raise ValueRangeError(f"{landmarks}: found a model of {len(trees.mean)} landmarks, expected the 68 of iBUG")
-    shapes = None if prior is None else _read("--prior", prior, ShapePrior)
-    motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
-    silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
+    priors = load_priors(rig, prior, dynamics, fps)
     return TrackModels(
         trees,
         None if appearance is None else _read("--appearance", appearance, AppearanceModel),
+        priors.shapes,
+        priors.dynamics,
+        priors.unlearned,
+        digest(*(_hash(name) for name in (landmarks, appearance))),
+        digest(*(_hash(name) for name in (prior, dynamics))),
+    )
+
+
+@dataclass(frozen=True)
+class FittedPriors:
+    """Priors for a rig's shapes and a video's frame rate, and the shapes that they say nothing of."""
+
+    shapes: ShapePrior | None
+    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None
+    unlearned: tuple[str, ...]
+
+
+def load_priors(
+    rig: BlendshapeRig, prior: str | Path | None, dynamics: str | Path | None, fps: float | None = None
+) -> FittedPriors:
+    """Reads priors and brings them to a rig and a frame rate; see :func:`load_track_models`."""
+    shapes = None if prior is None else _read("--prior", prior, ShapePrior)
+    motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
+    silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
+    return FittedPriors(
         None if shapes is None else _fitted(prior, lambda: shapes.renamed(rig.names)),
         None if motion is None else _fitted(dynamics, lambda: adapt_dynamics(motion, rig.names, fps)),
         tuple(name for name in rig.names if name in silent),
-        digest(*(_hash(name) for name in (landmarks, appearance))),
-        digest(*(_hash(name) for name in (prior, dynamics))),
     )
 
 

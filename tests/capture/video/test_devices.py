@@ -17,6 +17,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+from torchface.capture.priors import ShapePrior
+from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.video.landmark_smoothing import LandmarkFilter, filter_landmarks, smooth_landmarks
 from torchface.capture.video.pose import (
     PoseSettings,
@@ -32,6 +34,7 @@ from torchface.geometry.distortion import undistort
 from torchface.geometry.pnp import solve_pnp
 from torchface.geometry.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix
+from torchface.onnx.video_export import filmed
 from torchface.synthetic import performer
 from torchface.temporal import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.quaternions import filter_rotations, smooth_rotations
@@ -239,3 +242,44 @@ def test_running_filters_follow_what_they_are_given(seen: tuple[Tensor, Tensor],
 def test_landmarks_of_a_lens_that_bends(seen: tuple[Tensor, Tensor], device: str) -> None:
     bent = CameraCalibration(K, torch.tensor([0.1, -0.02, 0.001, 0.001, 0.0]).double(), 640, 480)
     check(lambda pixels: undistort(pixels, bent), device, seen[1])
+
+
+def test_the_solver_and_all_it_holds(device: str) -> None:
+    """Moved as a whole, also after it was used, with a prior and a memory; frame by frame and the whole take."""
+    names = ("jawOpen", "mouthSmileLeft", "browInnerUp")
+    takes = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    solver = VideoSolver(
+        performer(texture=False).select(names),
+        None,
+        K,
+        ShapePrior.fit([takes], names),
+        Walk(),  # type: ignore[arg-type]
+        VideoSettings(relative_noise=0.01),
+    )
+    landmarks = filmed(solver, 4)[1].double()
+    landmarks[2] = torch.nan
+    expected = [solver(landmarks), solve_whole_take(solver, landmarks)]
+    solver.to(device)
+    assert {tensor.device.type for tensor in (*solver.buffers(), *solver.parameters())} == {device}
+    away = landmarks.to(device)
+    with torch.no_grad():
+        for one, other in zip((solver(away), solve_whole_take(solver, away)), expected, strict=True):
+            for found, known in zip(vars(one).values(), vars(other).values(), strict=True):
+                assert found.device.type == device
+                torch.testing.assert_close(found.cpu(), known, equal_nan=True, rtol=1e-6, atol=1e-6)
+
+
+class Walk(torch.nn.Module):
+    """Weights stay where they are, give or take a little: a dynamics prior that needs no learning."""
+
+    window = 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("center", torch.zeros(3, dtype=torch.float64))
+
+    def require(self, names: tuple[str, ...]) -> None:
+        assert len(names) == 3
+
+    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+        return 0.999 * windows[:, -1], 1e-3 * torch.ones_like(windows[:, -1])

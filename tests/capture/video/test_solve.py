@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchface.capture.priors import DynamicsPrior, GaussianMixture, ShapePrior
-from torchface.capture.video import VideoSolver, solve_whole_take
+from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.video.face_points import FacePoints
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
@@ -77,7 +77,8 @@ def film(rig: BlendshapeRig, weights: Tensor, rotation: Tensor, translation: Ten
 
 
 def exact(rig: BlendshapeRig, **settings: float) -> VideoSolver:
-    return VideoSolver(rig, None, K, sparsity=0.0, ridge=1e-9, pixel_noise=0.01, tolerance=1e-9, **settings)
+    exactly = VideoSettings(sparsity=0.0, ridge=1e-9, pixel_noise=0.01, tolerance=1e-9, steps=500, **settings)
+    return VideoSolver(rig, None, K, settings=exactly)
 
 
 def test_exact_landmarks_give_exact_weights_and_poses(small: BlendshapeRig) -> None:
@@ -123,8 +124,8 @@ def test_turning_head_and_camera_alike_leaves_the_weights(pitch: float, yaw: flo
         rig.neutral.with_vertices(rig.vertices @ turn.T.float()), rig.deltas @ turn.T.float(), rig.names
     )
     found = film(rig, acted(1), *poses(1), noise=1.0)
-    settings = {"contour_slide": 1.0, "tolerance": 1e-7}
-    one, other = (VideoSolver(r, None, K, **settings)(found) for r in (rig, turned))
+    settings = VideoSettings(contour_slide=1.0, tolerance=1e-7, steps=500)
+    one, other = (VideoSolver(r, None, K, settings=settings)(found) for r in (rig, turned))
     torch.testing.assert_close(one.weights, other.weights, atol=1e-3, rtol=0)
     torch.testing.assert_close(one.rotation, other.rotation @ turn, atol=1e-3, rtol=0)
 
@@ -135,7 +136,8 @@ def test_derivatives_are_finite_differences(small: BlendshapeRig, remembers: boo
     rotation, translation = (pose[:2] for pose in poses(60))
     found = film(small, acted(60)[:2], rotation, translation, noise=1.0)
     prior = ShapePrior.fit([acted(40)], SEEN)
-    solver = VideoSolver(small, None, K, prior, Walk() if remembers else None, tolerance=1e-11)  # type: ignore[arg-type]
+    settings = VideoSettings(relative_noise=0.01, tolerance=1e-11, steps=500)
+    solver = VideoSolver(small, None, K, prior, Walk() if remembers else None, settings)  # type: ignore[arg-type]
     factor = torch.randn(2, len(SEEN), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def value(landmarks: Tensor) -> Tensor:
@@ -167,8 +169,8 @@ def test_frame_by_frame_is_the_batch(small: BlendshapeRig) -> None:
 def test_memory_beats_single_frames_and_all_frames_beat_memory(small: BlendshapeRig) -> None:
     weights = acted(60)
     found = film(small, weights, *poses(60), noise=2.0)
-    alone = VideoSolver(small, None, K, pixel_noise=2.0)
-    solver = VideoSolver(small, None, K, dynamics=Walk(), pixel_noise=2.0)  # type: ignore[arg-type]
+    alone = VideoSolver(small, None, K, settings=VideoSettings(pixel_noise=2.0))
+    solver = VideoSolver(small, None, K, None, Walk(), VideoSettings(pixel_noise=2.0))  # type: ignore[arg-type]
     errors = [float((w - weights)[10:].square().mean().sqrt()) for w in (alone(found).weights, solver(found).weights)]
     errors.append(float((solve_whole_take(solver, found).weights - weights)[10:].square().mean().sqrt()))
     assert errors[1] < 0.7 * errors[0]
@@ -267,7 +269,7 @@ def test_bad_input(small: BlendshapeRig) -> None:
     with pytest.raises(ValueRangeError, match="ids below"):
         VideoSolver(small, torch.arange(68) + 10**6, K)
     with pytest.raises(ValueRangeError, match="pixel_noise"):
-        VideoSolver(small, None, K, pixel_noise=0.0)
+        VideoSettings(pixel_noise=0.0)
     with pytest.raises(ValueRangeError, match="without a dynamics prior"):
         solve_whole_take(solver, found)
     with pytest.raises(ValueRangeError, match="no frame yet"):

@@ -14,6 +14,8 @@ from torchface.rig import BlendshapeRig
 LANDMARKS = 68
 JAW = 17
 """How many of the 68 landmarks trace the face's contour; they come first."""
+EYE_CORNERS = (36, 45)
+"""The eyes' outer corners among the 68."""
 
 _SPACING = 3.0  # millimetres
 
@@ -115,6 +117,19 @@ class FacePoints:
         best = outermost(pixels, self.valid, across[:, None] * self.side[:, None])
         slid = self.rows.expand(len(weights), -1, -1).gather(2, best[..., None])[..., 0]
         return torch.cat([torch.where(best > 0, slid, rows[:, :JAW]), rows[:, JAW:]], dim=1)
+
+    def eyes_distance(self, rotation: Tensor, translation: Tensor, intrinsics: Tensor) -> Tensor:
+        """How far apart a camera straight ahead of them would see the eyes' outer corners, (B,), pixels.
+
+        Args:
+            rotation, translation: rig to camera, (B,3,3) and (B,3).
+            intrinsics: (3,3).
+        """
+        right, left = (self.rest[i] for i in EYE_CORNERS)
+        apart = (right - left).norm()
+        depth = rotation[:, 2] @ (0.5 * (right + left)) + translation[:, 2]
+        # A pose gone astray puts the eyes at no distance at all.
+        return 0.5 * (intrinsics[0, 0] + intrinsics[1, 1]) * apart / torch.maximum(depth, apart)
 
 
 def _thinned(curves: LevelCurves, vertices: Tensor) -> LevelCurves:

@@ -5,44 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
-from torchface.capture.priors.adapted_dynamics import AdaptedDynamicsPrior
-from torchface.capture.priors.dynamics import DynamicsPrior
-from torchface.capture.priors.shape_prior import ShapePrior
+from torchface.capture.energy import Quadratic
 from torchface.capture.video.belief import Belief, Expectation
-from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.face_points import LANDMARKS
 from torchface.capture.video.fixed_point import attach_gradients
 from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSolution, VideoState
+from torchface.capture.video.parts import LOOSE_STEP, VideoSolverParts, check_not_negative
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.warm_active_set import solve_from_active_set
-from torchface.rig import BlendshapeRig
-
-SPARSITY = 1.0
-RIDGE = 1e-2
-CONTOUR_WEIGHT = 0.5
-CONTOUR_SLIDE = 0.3
-TURN, SHIFT = 0.02, 4.0
-"""How far a head moves from frame to frame: standard deviations in radians and millimetres."""
 
 _FEWEST = 6
-_ROUNDS, _SLIDING_ROUNDS = 30, 3
-# Where the prior outweighs the landmarks its bound creeps; who asks for exact answers, for derivatives, gets them.
-_EXACT, _EXACT_ROUNDS = 1e-6, 500
-# What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre.
-_LOOSE_TURN, _LOOSE_PLACE = 0.5, 500.0
-# Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full.
-_LOOSE_WEIGHT, _LOOSE_STEP = 1.0, 0.1
+_SLIDING_STEPS = 3
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
 _NEWTON_STEPS = 50
 
 
-class VideoSolver(nn.Module):
+class VideoSolver(VideoSolverParts):
     r"""Solves 68 landmarks in one camera's frames for blendshape weights, and the head's pose with them.
 
     .. math::
@@ -70,15 +54,8 @@ class VideoSolver(nn.Module):
         intrinsics: K, (3,3), pixels; of pictures without distortion.
         prior: which weights faces have; its ``strength`` is :math:`\lambda`.
         dynamics: how weights go on.
-        pixel_noise: :math:`\sigma` of an inner landmark, pixels.
-        sparsity: :math:`\beta`, for a weight of 1.
-        ridge: :math:`\varepsilon`, for a squared weight of 1.
+        settings: what the terms weigh, and when steps end; :math:`\sigma` grows with the face where they say so.
         landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
-        dynamics_strength: by what the dynamics prior's variance is divided.
-        pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks.
-        contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
-            are the vertices themselves.
-        tolerance: steps end when no weight moves further than this.
 
     Raises:
         NameMismatchError: a prior was learned for other shapes than the rig has.
@@ -86,64 +63,6 @@ class VideoSolver(nn.Module):
 
     Source: thesis 4.2.6, 4.2.9, 4.2.10; equations 40, 44, 65.
     """
-
-    intrinsics: Tensor
-    landmark_weights: Tensor
-
-    def __init__(
-        self,
-        rig: BlendshapeRig,
-        landmark_vertices: Tensor | None,
-        intrinsics: Tensor,
-        prior: ShapePrior | None = None,
-        dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None,
-        pixel_noise: float = 1.0,
-        sparsity: float = SPARSITY,
-        ridge: float = RIDGE,
-        landmark_weights: Tensor | None = None,
-        dynamics_strength: float = 1.0,
-        pose_trust: float = 0.0,
-        contour_slide: float = CONTOUR_SLIDE,
-        tolerance: float = 3e-3,
-    ) -> None:
-        super().__init__()
-        self.names = rig.names
-        marks = rig.neutral.landmarks if landmark_vertices is None else landmark_vertices
-        if intrinsics.shape != (3, 3):
-            raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
-        weights = _default_weights() if landmark_weights is None else landmark_weights.detach()
-        if weights.shape != (LANDMARKS,):
-            raise ShapeError(f"landmark_weights: found {tuple(weights.shape)}, expected ({LANDMARKS},)")
-        _check_not_negative("landmark_weights", weights)
-        for name, value in (("sparsity", sparsity), ("ridge", ridge), ("pose_trust", pose_trust)):
-            _check_not_negative(name, torch.tensor(value))
-        positive = {"pixel_noise": pixel_noise, "dynamics_strength": dynamics_strength, "tolerance": tolerance}
-        for name, value in positive.items():
-            if not 0 < value < float("inf"):
-                raise ValueRangeError(f"{name}: found {value}, expected a positive number")
-        if not 0 <= contour_slide <= 1:
-            raise ValueRangeError(f"contour_slide: found {contour_slide}, expected a share from 0 to 1")
-        for learned in (prior, dynamics):
-            if learned is not None:
-                learned.require(rig.names)
-        self.points = FacePoints.of(rig, marks, slides=contour_slide < 1)
-        self.prior, self.dynamics = prior, dynamics
-        self.pixel_noise, self.sparsity, self.ridge = float(pixel_noise), float(sparsity), float(ridge)
-        self.dynamics_strength, self.pose_trust = float(dynamics_strength), float(pose_trust)
-        self.contour_slide, self.tolerance = float(contour_slide), float(tolerance)
-        self.register_buffer("intrinsics", intrinsics.detach().double())
-        self.register_buffer("landmark_weights", weights.double())
-        shapes, like = len(rig.names), self.points.rest
-        price = sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
-        self._price = _beside_motion(price)
-        free = like.new_full((6,), torch.inf)
-        self._lower = torch.cat([like.new_zeros(shapes), -free])
-        self._upper = torch.cat([like.new_ones(shapes), free])
-        self._motion = like.new_tensor([TURN**2] * 3 + [SHIFT**2] * 3)
-        # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
-        weight = 0.0 if dynamics is None else _LOOSE_WEIGHT**-2
-        loose = [weight] * shapes + [_LOOSE_TURN**-2] * 3 + [_LOOSE_PLACE**-2] * 3
-        self._loose = like.new_tensor(loose).diag()
 
     def forward(
         self,
@@ -203,7 +122,7 @@ class VideoSolver(nn.Module):
 
     def start(self) -> VideoState:
         """The state before the first frame."""
-        return VideoState(None, None, self.points.rest.new_zeros(1, 0, len(self.names)))
+        return VideoState(None, None, self.lower.new_zeros(1, 0, len(self.names), dtype=torch.float64))
 
     def step(
         self,
@@ -241,7 +160,9 @@ class VideoSolver(nn.Module):
         if rotation is None or translation is None or not _finite(rotation, translation):
             rotation, translation = self._pose_of(state, found)
         expected = self._expected(state, rotation, translation)
-        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence)
+        at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
+        noise = self.noise(at.rotation, at.translation)
+        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, noise)
         terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
         if state.head is not None and not enough:
             held = HeadState(state.head.weights, rotation, translation)
@@ -271,30 +192,30 @@ class VideoSolver(nn.Module):
         belief = state.belief
         if belief is None or self.dynamics is None:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
-            return Expectation(mean, self._loose[None])
+            return Expectation(mean, self.loose.double().diag()[None])
         return self.predicted(state, belief).expectation()
 
     def predicted(self, state: VideoState, belief: Belief) -> Belief:
         """What a frame's belief leads to in the next."""
         if self.dynamics is None or state.window.shape[1] < self.dynamics.window:
             steps = torch.zeros_like(belief.mean.weights)
-            variance = torch.full_like(steps, _LOOSE_STEP**2)
+            variance = torch.full_like(steps, LOOSE_STEP**2)
         else:
             mean, variance = self.dynamics(state.window.to(self.dynamics.center.dtype))
-            steps, variance = mean.double() - state.window[:, -1], variance.double() / self.dynamics_strength
-        return belief.predicted(steps, variance, self._motion)
+            steps, variance = mean.double() - state.window[:, -1], variance.double() / self.settings.dynamics_strength
+        return belief.predicted(steps, variance, self.motion_variance.double())
 
     def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
         # Steps are many and small; what tensors keep for derivatives is a fifth of their price.
         with torch.inference_mode():
             head, rows = start, self._chosen(start)
-            for turn in range(_ROUNDS if self.tolerance >= _EXACT else _EXACT_ROUNDS):
+            for turn in range(self.settings.steps):
                 # Which points the contour's landmarks are is settled first; later it could go back and forth.
-                if 0 < turn < _SLIDING_ROUNDS:
+                if 0 < turn < _SLIDING_STEPS:
                     rows = self._chosen(head)
                 before, head = head, self._advanced(terms, head, rows)
-                if float((head.weights - before.weights).abs().max()) < self.tolerance:
+                if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
                     break
         # Copies, as autograd refuses tensors that were made without it.
         head, rows = HeadState(head.weights.clone(), head.rotation.clone(), head.translation.clone()), rows.clone()
@@ -303,37 +224,39 @@ class VideoSolver(nn.Module):
         return Solved(head, rows)
 
     def _chosen(self, head: HeadState) -> Tensor:
-        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics)
+        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
 
     def _advanced(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """One Gauss-Newton step: a quadratic program, warm-started."""
-        shapes = len(self.names)
+        shapes, lower, upper = len(self.names), self.lower.double(), self.upper.double()
         energy = self.energy(terms, head, rows)
         begin = torch.nn.functional.pad(head.weights, (0, 6))
-        exactness = min(max(0.1 * self.tolerance, _FINEST), _COARSEST)
+        exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
         if len(begin) == 1:
             H, f = energy.H[0], energy.f[0]
-            found = solve_from_active_set(H, f, self._lower, self._upper, begin[0], exactness, _NEWTON_STEPS)[None]
+            found = solve_from_active_set(H, f, lower, upper, begin[0], exactness, _NEWTON_STEPS)[None]
         else:
             H = 0.5 * (energy.H + energy.H.transpose(1, 2))
-            problem = BoxProblem.of(H, energy.f, self._lower, self._upper)
+            problem = BoxProblem.of(H, energy.f, lower, upper)
             found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
         return head.moved(found[:, :shapes], found[:, shapes:])
 
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
-        known = self.seen(terms, head, rows) + terms.expected.quadratic(head) + self._price
+        price = Quadratic(self.ridge.double().diag(), self.price.double()[None])
+        known = self.seen(terms, head, rows) + terms.expected.quadratic(head) + price
         return known if self.prior is None else known + _beside_motion(self.prior.energy(head.weights))
 
     def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """What landmarks and tracked poses tell, linearised at a state, over weights and motion from there, (B,N+6)."""
-        at = linearise(self.points, head, rows, self.intrinsics, terms.landmarks, terms.precision, self.contour_slide)
+        K, slide = self.intrinsics.double(), self.settings.contour_slide
+        at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
         told = at.quadratic(head.weights)
-        if self.pose_trust == 0:
+        if self.settings.pose_trust == 0:
             return told
         shapes = len(self.names)
         by_motion = at.jacobian[..., shapes:].flatten(1, 2)
-        precision = self.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
+        precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
         away = head.motion_from(terms.rotation, terms.translation)
         H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
         return told + Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
@@ -349,31 +272,37 @@ class VideoSolver(nn.Module):
             return (energy.H @ here[..., None])[..., 0] + energy.f
 
         x = torch.nn.functional.pad(head.weights, (0, 6))
-        free = (x > self._lower) & (x < self._upper)
+        free = (x > self.lower) & (x < self.upper)
         x = attach_gradients(gradient, x, free)
         return head.moved(x[:, :shapes], x[:, shapes:])
 
     def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
         """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
         weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
-        rows = self.points.chosen(weights, rotation, translation, self.intrinsics)
-        placed = self.points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
-        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ self.intrinsics.T
+        points, K = self.points, self.intrinsics.double()
+        rows = points.chosen(weights, rotation, translation, K)
+        placed = points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
+        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
         squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
         return squared.nanmean(1).sqrt().to(landmarks.dtype)
 
-    def _precision(self, seen: Tensor, confidence: Tensor | None) -> Tensor:
-        weights = self.landmark_weights * seen
+    def noise(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels."""
+        apart = self.points.eyes_distance(rotation, translation, self.intrinsics.double())
+        return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
+
+    def _precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
+        weights = self.landmark_weights.double() * seen
         if confidence is not None:
             weights = weights * confidence
         # The root's slope is infinite at 0.
-        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / self.pixel_noise
+        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise[:, None]
 
     def _pose_of(self, state: VideoState, landmarks: Tensor) -> tuple[Tensor, Tensor]:
         """Of the frame before, or by all landmarks."""
         if state.head is not None:
             return state.head.rotation, state.head.translation
-        pose = solve_pnp(self.points.rest[:LANDMARKS], landmarks, self.intrinsics, self.landmark_weights)
+        pose = solve_pnp(self.rest[:LANDMARKS], landmarks, self.intrinsics, self.landmark_weights)
         return pose.rotation, pose.translation
 
     def _check(
@@ -389,11 +318,8 @@ class VideoSolver(nn.Module):
         if torch.isinf(landmarks).any():
             raise ValueRangeError("landmarks: found infinite ones, expected pixels, or NaN for not seen")
         if confidence is not None:
-            _check_not_negative("confidence", confidence)
+            check_not_negative("confidence", confidence)
         return count
-
-    def extra_repr(self) -> str:
-        return f"{len(self.names)} shapes, pixel_noise={self.pixel_noise}, sparsity={self.sparsity}"
 
 
 def _beside_motion(weights: Quadratic) -> Quadratic:
@@ -407,14 +333,3 @@ def _beside_motion(weights: Quadratic) -> Quadratic:
 
 def _finite(*tensors: Tensor) -> bool:
     return all(bool(torch.isfinite(x).all()) for x in tensors)
-
-
-def _default_weights() -> Tensor:
-    weights = torch.ones(LANDMARKS)
-    weights[:JAW] = CONTOUR_WEIGHT
-    return weights
-
-
-def _check_not_negative(name: str, value: Tensor) -> None:
-    if not bool((torch.isfinite(value) & (value >= 0)).all()):
-        raise ValueRangeError(f"{name}: found {value.flatten()[:5].tolist()}, expected finite ones of at least 0")

@@ -1,0 +1,84 @@
+"""What the terms of the video solve weigh, and when its steps end: alike for files, cameras and exported graphs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from torchface.errors import ValueRangeError
+
+# Of the eyes' distance: what models of landmarks are measured to be off, any face's and the actor's own.
+_FOUND, _REFINED = 0.025, 0.015
+_LEAST_FOUND = 0.5
+# By the error of films of the embedded performer, of strengths 1, 0.1, 0.03 and noises 1, 3, 6, 12 times as large.
+_ALIKE, _FOUND_DYNAMICS = 3.0, 0.03
+# With a prior the energy is flat along its valley, and a frame's last steps creep there. The next frame begins where
+# they end, so a few do, and a graph that takes as many gives the same weights.
+_FOUND_STEPS = 5
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    r"""What the terms of ``VideoSolver``'s energy weigh, and when its steps end.
+
+    Args:
+        pixel_noise: :math:`\sigma_0`, the least standard deviation of an inner landmark's coordinate, pixels.
+        relative_noise: of a landmark, as a share of the distance of the eyes' outer corners as a camera straight ahead
+            would see them: models of landmarks are off by more pixels in a larger face. 0 leaves ``pixel_noise``.
+        sparsity: :math:`\beta`, for a weight of 1.
+        ridge: :math:`\varepsilon`, for a squared weight of 1.
+        dynamics_strength: by what the dynamics prior's variance is divided.
+        pose_trust: :math:`\kappa`, what the tracked pose is worth beside the frame's own landmarks.
+        contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
+            are the vertices themselves.
+        tolerance: a frame's steps end when no weight moves further than this.
+        steps: of Gauss and Newton that a frame takes at most.
+
+    Raises:
+        ValueRangeError: an argument is not as above.
+    """
+
+    pixel_noise: float = 1.0
+    relative_noise: float = 0.0
+    sparsity: float = 1.0
+    ridge: float = 1e-2
+    dynamics_strength: float = 1.0
+    pose_trust: float = 0.0
+    contour_slide: float = 0.3
+    tolerance: float = 3e-3
+    steps: int = 30
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value) or value < 0:
+                raise ValueRangeError(f"{field.name}: found {value!r}, expected a finite number of at least 0")
+        for name in ("pixel_noise", "dynamics_strength", "tolerance", "steps"):
+            if not getattr(self, name) > 0:
+                raise ValueRangeError(f"{name}: found {getattr(self, name)}, expected a positive number")
+        if self.contour_slide > 1:
+            raise ValueRangeError(f"contour_slide: found {self.contour_slide}, expected a share from 0 to 1")
+        if not isinstance(self.steps, int):
+            raise ValueRangeError(f"steps: found {self.steps}, expected a whole number")
+
+    @classmethod
+    def of_found_landmarks(cls, remembers: bool = False, refined: bool = False) -> VideoSettings:
+        """For landmarks that a model has found in pictures, as ``torchface track`` solves them.
+
+        Models of landmarks err alike in frames that look alike. A dynamics prior takes each frame's errors for new
+        ones: it would soon be sure of what they have in common, so with one the noise is reckoned larger and the prior
+        weaker.
+
+        Args:
+            remembers: the solver has a dynamics prior.
+            refined: the landmarks come from a model of the actor's own looks.
+        """
+        share = _REFINED if refined else _FOUND
+        if not remembers:
+            return cls(pixel_noise=_LEAST_FOUND, relative_noise=share, steps=_FOUND_STEPS)
+        return cls(
+            pixel_noise=_ALIKE * _LEAST_FOUND,
+            relative_noise=_ALIKE * share,
+            dynamics_strength=_FOUND_DYNAMICS,
+            steps=_FOUND_STEPS,
+        )
