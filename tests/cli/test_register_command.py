@@ -50,6 +50,7 @@ def test_results_table_and_contact_sheet_are_written(
     assert float((found.vertices - true.vertices).norm(dim=-1).median()) < 0.3
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
+    told_of = rows
     assert [(row["name"], row["status"], row["landmarks"]) for row in rows] == [
         ("anna", "registered", "14"),
         ("ben", "registered", "14"),
@@ -61,6 +62,14 @@ def test_results_table_and_contact_sheet_are_written(
     spread = [np.ptp(sheet[8:170, third * i + 8 : third * i + 120]) for i in range(3)]
     assert min(spread[:2]) > 60
     assert spread[2] == 0
+    # Below the face its lines, darker than it, and its distances, in colour.
+    colors = np.asarray(Image.open(out / "contact_sheet.png").convert("RGB")).astype(int)
+    pictures = [colors[184 * k + 8 : 184 * k + 170, 8:120] for k in range(3)]
+    assert pictures[1].mean() < pictures[0].mean()
+    warmth = [float((row[..., 0] - row[..., 2]).mean()) for row in pictures]
+    assert warmth[0] > 5
+    assert warmth[2] < warmth[0] - 10
+    assert float(told_of[0]["shown"]) > 0.8
     before = (out / "ben.glb").stat().st_mtime_ns
     main(words)
     assert "3 known from an earlier run" in capsys.readouterr().err.replace("\n", " ")
@@ -90,7 +99,7 @@ def test_mistakes_end_with_a_message_and_status_2(brought: Path, capsys: pytest.
 
 
 def test_a_model_by_folder_holds_the_registration(
-    brought: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+    brought: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heads = dome_rig.vertices * torch.tensor([[1, 1, 1], [1.05, 1, 1], [1, 0.95, 1.1], [1, 1, 1.1]])[:, None]
     model = MorphableModel.fit(heads)
@@ -99,11 +108,16 @@ def test_a_model_by_folder_holds_the_registration(
     words = ["register", template, scans, "--out", str(brought / "out"), "--landmarks", scans, "--model"]
     main([*words, str(brought / "domes")])
     assert "the model comes to" in " ".join(capsys.readouterr().err.split())
+    monkeypatch.chdir(brought)
+    main([*words, "domes"])  # the folder beside the user, by its bare name
+    told = " ".join(capsys.readouterr().err.split())
+    assert "3 known from an earlier run" in told
+    assert told.count("neither a texture with coordinates nor vertex colours") == 1
     true = load_mesh(brought / "scans" / "ben.obj")
     assert float((load_mesh(brought / "out" / "ben.glb").vertices - true.vertices).norm(dim=-1).median()) < 0.3
     with pytest.raises(SystemExit):
-        main([*words, "domes"])
-    assert "found no 'domes'" in capsys.readouterr().err
+        main([*words, "dunes"])
+    assert "found no 'dunes'" in capsys.readouterr().err
     small = MorphableModel.fit(heads[:, :50])
     zoo.save_model(small, brought / "half", licence="MIT", data="domes", metrics={}, recipe="this test")
     with pytest.raises(SystemExit):

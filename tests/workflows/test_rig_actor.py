@@ -91,8 +91,16 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     words += ["--examples", folder / "examples", "--detail", folder / "detail", "--detail-size", "64"]
     main(["rig", *map(str, words), "--out", str(folder / "actor.glb"), "--quiet"])
     told = " ".join(capsys.readouterr().err.split())
-    for fact in ("laid on the scan by landmarks", "4 shapes transferred", "examples: 1", "normal maps: 2"):
+    for fact in (
+        "laid on the scan by landmarks",
+        "of what faces outward",
+        "_registration.png",
+        "4 shapes transferred",
+        "examples: 1",
+        "normal maps: 2",
+    ):
         assert fact in told
+    assert (folder / "actor_registration.png").is_file()
     plain, learned = load_rig(folder / "new" / "plain.glb"), load_rig(folder / "actor.glb")
     assert learned.names == actor.true.names
     assert torch.equal(learned.neutral.faces, actor.true.neutral.faces)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from pathlib import Path
 
 from rich.markup import escape
@@ -12,6 +13,7 @@ from tyro.conf import Positional
 from torchface.cli.progress import Quiet, console
 
 _MOST_ROWS = 40
+_NAMED = 3
 
 
 def register(
@@ -30,9 +32,10 @@ def register(
 ) -> None:
     """Bend a template onto raw scans: each scan's face in the template's topology, with the scan's colours.
 
-    Writes OUT/NAME.glb and a record OUT/NAME.json for each scan, OUT/summary.csv and OUT/contact_sheet.png. A scan
-    that cannot be registered is reported and skipped. Killed and started again, the command goes on where it was;
-    a scan whose files have changed is registered anew.
+    Writes OUT/NAME.glb and a record OUT/NAME.json for each scan, OUT/summary.csv and OUT/contact_sheet.png, which shows
+    each face, its mesh's lines and its distances to the scan (blue 0 to red 1 mm, grey where the scan shows no skin).
+    A scan that cannot be registered is reported and skipped. Killed and started again, the command goes on where it
+    was; a scan whose files have changed is registered anew.
 
     Args:
         template: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
@@ -90,15 +93,34 @@ def register(
     reused = sum(entry.reused for entry in entries)
     title = f"{len(done.report.registered)} of {len(entries)} scans registered"
     table = Table(title=title + (f", {reused} known from an earlier run" if reused else ""))
-    for head in ("scan", "median", "on the scan", "start by", "seconds", "remarks"):
+    for head in ("scan", "median", "95 %", "on the scan", "slid", "start by", "seconds"):
         table.add_column(head)
     # The worst first: those are the ones to look at.
     ranked = sorted(entries, key=lambda entry: (entry.registered, -entry.median_distance if entry.registered else 0.0))
     for entry in ranked[:_MOST_ROWS]:
-        numbers = (f"{entry.median_distance:.3f} mm", f"{entry.matched:.0%}") if entry.registered else ("skipped", "")
-        remarks = "; ".join(entry.notes) or entry.error
-        table.add_row(escape(entry.name), *numbers, entry.start, f"{entry.seconds:.1f}", escape(remarks))
+        numbers = (
+            f"{entry.median_distance:.3f} mm",
+            f"{entry.far_distance:.2f} mm",
+            f"{entry.shown:.0%}",
+            "?" if isnan(entry.slid) else f"{entry.slid:.1f} mm",
+        )
+        if not entry.registered:
+            numbers = ("skipped", "", "", "")
+        table.add_row(escape(entry.name), *numbers, entry.start, f"{entry.seconds:.1f}")
     console.print(table)
+    console.print(
+        "95 %: distance of the 95th percentile; on the scan: of what faces outward, the rest is the template's; slid: "
+        "how far landmarks inside the face end from their vertices, unknown without: what slides along the skin "
+        "is as near to it as what does not",
+        highlight=False,
+    )
+    remarks: dict[str, list[str]] = {}
+    for entry in ranked:
+        for remark in entry.notes or ([entry.error] if entry.error else []):
+            remarks.setdefault(remark, []).append(entry.name)
+    for remark, names in list(remarks.items())[:_MOST_ROWS]:
+        who = ", ".join(names) if len(names) <= _NAMED else f"{len(names)} of {len(entries)} scans"
+        console.print(f"{escape(who)}: {escape(remark)}", highlight=False)
     if len(entries) > _MOST_ROWS:
         console.print(f"the {_MOST_ROWS} worst; all are in {done.report.summary}")
     print(done.report.summary)

@@ -59,6 +59,11 @@ class CorpusJob:
                 start_distance=found.start_distance,
                 median_distance=found.median_distance,
                 matched=found.matched,
+                far_distance=found.far_distance,
+                shown=found.shown,
+                covered=found.covered,
+                stretch=found.stretch,
+                slid=found.slid,
                 landmarks=landmarks,
                 notes=found.notes,
             )
@@ -71,7 +76,8 @@ class CorpusJob:
         try:
             if entry.result is not None:
                 save_mesh(registration.mesh, entry.result)
-                write_record(entry, task, found, self.out)
+                seen = registration.distance.masked_fill(~registration.matched, torch.nan)
+                write_record(entry, task, found, self.out, seen)
             elif entry.lasting:
                 write_record(entry, task, None, self.out)
         except (TorchfaceError, OSError) as error:

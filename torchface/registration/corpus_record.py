@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import json
@@ -11,14 +12,20 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from torchface.errors import FileFormatError
 from torchface.files import read_file, write_file
 from torchface.registration.record import RegistrationRecord
 
 _FORMAT = "torchface.registered-scan/1"
-_LARGEST_RECORD = 4 * 2**20
+_LARGEST_RECORD = 16 * 2**20
+_STEP, _NOT_SHOWN = 0.01, 65535
 _COLUMNS = (
-    "name", "status", "median_mm", "matched", "start", "start_mm", "landmarks", "seconds", "scan", "result", "remarks"
+    "name", "status", "median_mm", "matched", "start", "start_mm", "landmarks", "seconds", "scan", "result", "remarks",
+    "p95_mm", "shown", "covered", "stretch", "slid_mm",
 )  # fmt: skip
 
 
@@ -52,6 +59,7 @@ class CorpusEntry:
         start: how the template came to lie on the scan, see ``RegistrationRecord``.
         start_distance, median_distance: millimetres; NaN where it was skipped.
         matched: share of the vertices whose place the scan tells.
+        far_distance, shown, covered, stretch, slid: see ``RegistrationRecord``.
         landmarks: how many were given.
         notes: what was found in the scan, for people to read.
         seconds: wall-clock.
@@ -67,6 +75,11 @@ class CorpusEntry:
     start_distance: float = math.nan
     median_distance: float = math.nan
     matched: float = 0.0
+    far_distance: float = math.nan
+    shown: float = 0.0
+    covered: float = 0.0
+    stretch: float = math.nan
+    slid: float = math.nan
     landmarks: int = 0
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
@@ -83,8 +96,21 @@ def record_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.json"
 
 
-def write_record(entry: CorpusEntry, task: CorpusTask, record: RegistrationRecord | None, folder: Path) -> None:
-    """Writes the record, which declares the scan finished; the result must be there before."""
+def write_record(
+    entry: CorpusEntry,
+    task: CorpusTask,
+    record: RegistrationRecord | None,
+    folder: Path,
+    distances: Tensor | None = None,
+) -> None:
+    """Writes the record, which declares the scan finished; the result must be there before.
+
+    Args:
+        entry, task: of the scan.
+        record: of its registration; None where it was skipped.
+        folder: of the results.
+        distances: of each vertex to the scan, (V,) millimetres, NaN where the scan does not show it.
+    """
     stages = [] if record is None else [asdict(stage) for stage in record.stages]
     for stage in stages:
         del stage["energies"]
@@ -101,6 +127,12 @@ def write_record(entry: CorpusEntry, task: CorpusTask, record: RegistrationRecor
         "start_mm": entry.start_distance,
         "median_mm": entry.median_distance,
         "matched": entry.matched,
+        "p95_mm": entry.far_distance,
+        "shown": entry.shown,
+        "covered": entry.covered,
+        "stretch": entry.stretch,
+        "slid_mm": entry.slid,
+        "distances": "" if distances is None else _packed(distances),
         "landmarks": entry.landmarks,
         "notes": list(entry.notes),
         "seconds": entry.seconds,
@@ -143,9 +175,36 @@ def write_summary(entries: Sequence[CorpusEntry], path: Path) -> None:
                 entry.scan,
                 "" if entry.result is None else entry.result.name,
                 remarks,
+                *_figures(entry),
             )
         )
     write_file(path, text.getvalue().encode())
+
+
+def read_distances(folder: Path, name: str) -> Tensor | None:
+    """The distance of each vertex of a result to its scan, (V,) millimetres, NaN where the scan does not show it; None
+    where the record tells none."""
+    try:
+        packed = json.loads(read_file(record_path(folder, name), _LARGEST_RECORD))["distances"]
+        steps = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<u2")
+    except (FileFormatError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+    if not len(steps):
+        return None
+    found = torch.from_numpy(steps.astype(np.float32)) * _STEP
+    found[torch.from_numpy(steps == _NOT_SHOWN)] = math.nan
+    return found
+
+
+def _packed(distances: Tensor) -> str:
+    """Distances (V,), NaN where not shown, in steps of 0.01 mm."""
+    steps = (distances.cpu().double() / _STEP).round().clamp(0, _NOT_SHOWN - 1).nan_to_num(_NOT_SHOWN)
+    return base64.b64encode(steps.numpy().astype("<u2").tobytes()).decode()
+
+
+def _figures(entry: CorpusEntry) -> tuple[str, ...]:
+    figures = (entry.far_distance, entry.shown, entry.covered, entry.stretch, entry.slid)
+    return tuple("" if math.isnan(x) or not entry.registered else f"{x:.4f}" for x in figures)
 
 
 def _entry(document: dict[str, Any], task: CorpusTask, folder: Path) -> CorpusEntry | None:
@@ -163,6 +222,11 @@ def _entry(document: dict[str, Any], task: CorpusTask, folder: Path) -> CorpusEn
         start_distance=_number(document["start_mm"]),
         median_distance=_number(document["median_mm"]),
         matched=_number(document["matched"]),
+        far_distance=_number(document["p95_mm"]),
+        shown=_number(document["shown"]),
+        covered=_number(document["covered"]),
+        stretch=_number(document["stretch"]),
+        slid=_number(document["slid_mm"]),
         notes=tuple(map(str, document["notes"])),
     )
 

@@ -52,6 +52,11 @@ class LandmarkPull:
         """How far each landmark's vertex is from its point, (L,) millimetres, with the vertices (V,3)."""
         return (current[self.vertices] - self.points).norm(dim=-1)
 
+    def slid(self, current: Tensor) -> float:
+        """How far the landmarks inside the face lie from their vertices (V,3), median, millimetres; NaN without any."""
+        inside = self.distance(current)[~self.contour]
+        return float(inside.median()) if len(inside) else float("nan")
+
     def weights(self, current: Tensor) -> Tensor:
         r"""How much each counts, (L,) in [0,1], with the vertices (V,3) where they are.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.alignment import Similarity
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.operators import edges, vertex_normals
 from torchface.geometry.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
 from torchface.registration.completion import completed_colors, completed_form
@@ -176,6 +176,11 @@ def register(
         float(nearest.distance[matched].median()) if matched.any() else float("nan"),
         float(matched.double().mean()),
         time.perf_counter() - begin,
+        float(nearest.distance[matched].quantile(0.95)) if matched.any() else float("nan"),
+        float(matched[deformer.outward].double().mean()),
+        float((deformer.hidden & ~matched)[deformer.outward].double().mean()),
+        _stretch(template, deformer.current, matched),
+        start.pull.slid(deformer.current),
     )
     device = template.vertices.device
     coefficients = None if fit is None else fit.coefficients.to(template.vertices)
@@ -321,6 +326,17 @@ def _completed(
     found.points[moved], found.triangle[moved] = newer.points, newer.triangle
     found.barycentric[moved], found.distance[moved] = newer.barycentric, newer.distance
     return found, unseen
+
+
+def _stretch(template: Mesh, current: Tensor, matched: Tensor) -> float:
+    """The 95th percentile of how much an edge between matched vertices has grown or shrunk beyond the whole."""
+    first, second = edges(template.faces.cpu()).T
+    seen = matched[first] & matched[second]
+    if not seen.any():
+        return float("nan")
+    before, after = (x[first[seen]] - x[second[seen]] for x in (template.vertices.detach().cpu().double(), current))
+    ratio = (after.norm(dim=-1) / before.norm(dim=-1).clamp(min=1e-9)).clamp(min=1e-9).log()
+    return float((ratio - ratio.median()).abs().quantile(0.95).expm1())
 
 
 def _scan_colors(scan: Mesh, prepared: PreparedScan) -> ScanColors | None:

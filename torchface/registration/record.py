@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 
@@ -47,6 +48,13 @@ class RegistrationRecord:
         median_distance: of the exposed vertices that found the scan, to it, millimetres.
         matched: share of the template's vertices whose place the scan tells; the others follow their neighbours.
         seconds: wall-clock.
+        far_distance: as the median, but the 95th percentile.
+        shown: share of what faces outward, whose place the scan tells.
+        covered: share of what faces outward that lies under hair, cloth or on an ear in pieces: the template's.
+        stretch: by which share of its length the 95th percentile of the edges that the scan shows has grown or shrunk
+            beyond the whole.
+        slid: how far the landmarks inside the face end from their vertices, median, millimetres; NaN without any. What
+            slides along the surface is as near to it as what does not: no distance to the scan shows this.
     """
 
     start: str
@@ -56,14 +64,28 @@ class RegistrationRecord:
     median_distance: float
     matched: float
     seconds: float = field(compare=False)
+    far_distance: float = math.nan
+    shown: float = math.nan
+    covered: float = 0.0
+    stretch: float = math.nan
+    slid: float = math.nan
+
+    def figures(self) -> str:
+        """How near it has come, how much of it the scan shows, and how far it has slid, in one line."""
+        covered = f", {self.covered:.0%} lies under hair, cloth or a broken ear" if self.covered >= 0.005 else ""
+        slid = f"landmarks inside the face end {self.slid:.1f} mm from their vertices"
+        if math.isnan(self.slid):
+            slid = "sliding along the skin does not show in these figures without landmarks (a model holds it)"
+        return (
+            f"median {self.median_distance:.3f} mm, 95th percentile {self.far_distance:.3f} mm from the scan, which "
+            f"shows {self.shown:.0%} of what faces outward{covered}; edges stretched by up to {self.stretch:.0%}; "
+            f"{slid}"
+        )
 
     def __str__(self) -> str:
         lines = [f"start by {self.start}: median {self.start_distance:.2f} mm from the scan"]
         lines += [_line(stage) for stage in self.stages]
-        lines.append(
-            f"median {self.median_distance:.3f} mm from the scan where {self.matched:.0%} of the vertices lie on it, "
-            f"{self.seconds:.1f} s"
-        )
+        lines.append(f"{self.figures()}, {self.seconds:.1f} s")
         return "\n".join(lines + [f"note: {note}" for note in self.notes])
 
 

@@ -16,6 +16,7 @@ from torchface.registration.nonrigid import Registration
 from torchface.rendering.compositing import from_figure, headed, heat_colors, sheet
 from torchface.rendering.shading import render
 from torchface.viz.faces import FRONT, PROFILE, THREE_QUARTER, frame_face
+from torchface.viz.wireframe import lines_on_clay
 
 _NOT_MATCHED = (0.75, 0.75, 0.75)
 
@@ -29,9 +30,9 @@ def registration_sheet(
     clay: bool = False,
     yaws: tuple[float, ...] = (FRONT, THREE_QUARTER, PROFILE),
 ) -> Tensor:
-    """A row a view: the scan, the registered mesh in the scan's colours, its distance to the scan; (3,H,W).
+    """A row a view: the scan, the registered mesh in the scan's colours, its distance to the scan, its lines; (3,H,W).
 
-    All of it is turned upright as the template stands. Grey in the heat map is what follows its neighbours only.
+    All of it is turned upright as the template stands. Grey in the heat map is what the scan does not show.
 
     Args:
         scan: as it was registered.
@@ -47,18 +48,25 @@ def registration_sheet(
     there = _moved(scan, upright)
     if clay:
         own, there = (replace(mesh, colors=None, texture=None) for mesh in (own, there))
-    heat = heat_colors(registration.distance.float().cpu(), maximum)
-    heat[~registration.matched.cpu()] = torch.tensor(_NOT_MATCHED)
+    heat = distance_colors(registration.distance.masked_fill(~registration.matched, torch.nan), maximum)
     for yaw in yaws:
         camera = frame_face(own, yaw, width=width, height=height)
-        pictures += [render(there, camera), render(own, camera), render(own, camera, heat)]
-    columns = [pictures[i::3] for i in range(3)]
-    titles = ("scan", "registered", "distance")
+        pictures += [render(there, camera), render(own, camera), render(own, camera, heat), lines_on_clay(own, camera)]
+    titles = ("scan", "registered", "distance", "mesh")
+    columns = [pictures[i :: len(titles)] for i in range(len(titles))]
     made = [headed(sheet(column, 1), title) for column, title in zip(columns, titles, strict=True)]
     figure = Figure(figsize=(0.9, made[0].shape[1] / 100), dpi=100)
     mappable = ScalarMappable(Normalize(0, maximum), "turbo")
     figure.colorbar(mappable, cax=figure.add_axes((0.12, 0.2, 0.2, 0.6)), label="mm")
-    return sheet([*made, from_figure(figure)], 4)
+    return sheet([*made, from_figure(figure)], len(made) + 1)
+
+
+def distance_colors(distances: Tensor, maximum: float) -> Tensor:
+    """Colours (V,3) of distances (V,), millimetres, 0 to ``maximum``; grey where they are NaN."""
+    distances = distances.float().cpu()
+    heat = heat_colors(distances.nan_to_num(0.0), maximum)
+    heat[distances.isnan()] = torch.tensor(_NOT_MATCHED)
+    return heat
 
 
 def _moved(mesh: Mesh, pose: Similarity) -> Mesh:

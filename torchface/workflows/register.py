@@ -17,14 +17,18 @@ from torchface.io.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.registration.corpus import CorpusReport, register_corpus
-from torchface.registration.corpus_record import CorpusEntry
+from torchface.registration.corpus_record import CorpusEntry, read_distances
 from torchface.rendering.compositing import caption, save_picture, sheet
-from torchface.viz.faces import face_views
+from torchface.rendering.shading import render
+from torchface.viz.faces import frame_face
+from torchface.viz.registration import distance_colors
+from torchface.viz.wireframe import lines_on_clay
 
 CONTACT_SHEET = "contact_sheet.png"
 _WIDTH, _HEIGHT = 144, 180
 _TEXT = 11
 _SKIPPED = 0.85
+_MOST = 1.0  # end of the distance maps' scale, millimetres
 _KINDS = "HeadModel or MorphableModel"
 
 
@@ -109,7 +113,7 @@ def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
 
 
 def contact_sheet(report: CorpusReport, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Tensor:
-    """All registered faces from the front as the template looks, with name and distance; (3,H,W).
+    """All registered faces from the front as the template looks, their lines and distances to the scan; (3,H,W).
 
     Args:
         report: of the corpus.
@@ -118,24 +122,29 @@ def contact_sheet(report: CorpusReport, template: Mesh, progress: Callable[[int,
     """
     cells = []
     for number, entry in enumerate(report.entries, 1):
-        cells.append(_cell(entry, template))
+        cells.append(_cell(entry, template, report.out))
         if progress is not None:
             progress(number, len(report.entries))
     columns = max(4, round((len(cells) * 1.8) ** 0.5))
     return sheet(cells, min(columns, len(cells)))
 
 
-def _cell(entry: CorpusEntry, template: Mesh) -> Tensor:
+def _cell(entry: CorpusEntry, template: Mesh, folder: Path) -> Tensor:
     name = entry.name if len(entry.name) <= 20 else f"{entry.name[:9]}..{entry.name[-9:]}"
     if entry.result is not None:
         try:
             mesh = load_mesh(entry.result)
             upright = in_place_of(mesh, template)
-            face = face_views(upright, (0.0,), width=_WIDTH, height=_HEIGHT, samples=1, framed_by=upright)
-            return caption(caption(face, name, _TEXT), f"{entry.median_distance:.2f} mm", _TEXT)
+            camera = frame_face(upright, width=_WIDTH, height=_HEIGHT)
+            pictures = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
+            distances = read_distances(folder, entry.name)
+            if distances is not None and len(distances) == len(upright.vertices):
+                pictures.append(render(upright, camera, distance_colors(distances, _MOST), samples=1))
+            told = f"{entry.median_distance:.2f} mm on {entry.shown:.0%}"
+            return caption(caption(sheet(pictures, 1), name, _TEXT), told, _TEXT)
         except FileFormatError:  # somebody has taken it away meanwhile
             pass
-    blank = torch.full((3, _HEIGHT, _WIDTH), _SKIPPED)
+    blank = torch.full((3, 3 * _HEIGHT, _WIDTH), _SKIPPED)
     return caption(caption(blank, name, _TEXT), "skipped", _TEXT)
 
 

@@ -34,13 +34,17 @@ from torchface.modeling.example_rigging import RiggingSchedule
 from torchface.modeling.scanned_examples import seen_example
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.rendering.compositing import save_picture
 from torchface.rig import BlendshapeRig
+from torchface.viz.registration import registration_sheet
 from torchface.workflows.expressions import LAYOUT, Expression, expressions_in, neutral_in, weights_row
 from torchface.workflows.penetration import Penetration, penetration
 from torchface.workflows.register import in_place_of, load_shape_model
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 from torchface.workflows.skin import dressed_as, hidden_parts
 
+PICTURE = "_registration.png"
+"""Ends the name of the picture that lies beside a rig."""
 _FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
 # Registered scans are noisier than shapes are a person's own, and what they show is known roughly.
 _SCANNED = RiggingSchedule(beta=(0.5, 0.1), gamma=(25.0, 25.0))
@@ -84,6 +88,7 @@ class ActorReport:
         example_names: the examples used, in the order of ``examples.errors``.
         maps: the baked normal maps by name, the neutral's first.
         skipped: lines on scans that could not be used.
+        picture: of the registration: scan, face, distances and lines.
         penetration: how far teeth, gums and eyes stand out of the skin.
     """
 
@@ -94,16 +99,15 @@ class ActorReport:
     example_names: tuple[str, ...]
     maps: dict[str, NormalMap]
     skipped: tuple[str, ...]
+    picture: Path
     penetration: Penetration | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
-        record, near = self.neutral.record, self.neutral.distance[self.neutral.matched]
-        lines = [
-            f"neutral: laid on the scan by {record.start}, then {_spread(near)} from it where "
-            f"{record.matched:.0%} of the vertices lie on it"
-        ]
+        record = self.neutral.record
+        lines = [f"neutral: laid on the scan by {record.start}; {record.figures()}"]
         lines += [f"  note: {note}" for note in record.notes]
+        lines.append(f"  picture: {self.picture}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
         lines += [] if self.penetration is None else [self.penetration.line()]
@@ -139,6 +143,9 @@ def rig_actor(
     progress: Callable[[str], None] | None = None,
 ) -> ActorReport:
     """Registers the neutral scan, transfers the shapes, learns from examples, bakes normal maps, writes the rig.
+
+    Beside the rig lies a picture of the registration, ``NAME_registration.png``: the scan, the face, its distances to
+    the scan, its mesh.
 
     Args:
         scan: the actor at rest, any topology and pose.
@@ -187,6 +194,9 @@ def rig_actor(
     maps = job.baked(actor, fine)
     say("writing the rig")
     save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
+    say("drawing the registration")
+    picture = out.with_name(f"{out.stem}{PICTURE}")
+    save_picture(registration_sheet(load_mesh(scan, options.unit), registration), picture)
     names = {label: baked for label, (_, baked) in maps.items()}
     return ActorReport(
         actor,
@@ -196,6 +206,7 @@ def rig_actor(
         used,
         names,
         tuple(job.skipped),
+        picture,
         penetration(actor, parts),
     )
 
@@ -315,12 +326,6 @@ def _detail(maps: dict[str, tuple[tuple[str, ...], NormalMap]]) -> DetailMaps | 
         assert neutral is not None
         return DetailMaps((), torch.zeros(0, *neutral.normals.shape), neutral.normals)
     return detail_maps([shape for shape, _ in named], [baked for _, baked in named], neutral)
-
-
-def _spread(distances: Tensor) -> str:
-    if len(distances) == 0:
-        return "nowhere near"
-    return f"median {float(distances.median()):.3f} mm, 95th percentile {float(distances.quantile(0.95)):.3f} mm"
 
 
 def check_out(out: Path) -> None:
