@@ -311,3 +311,38 @@ def test_attach_finds_the_sites_and_draws_them(
     with pytest.raises(SystemExit):
         run("attach", shoot / "rig.glb", shoot / "rom.c3d", "--initial", shoot / "rom.c3d")
     assert "rom.c3d: " in capsys.readouterr().err
+
+
+def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
+    shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    true = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(300)[:, None] * torch.tensor([0.05, 0.11, 0.17, 0.23]))
+    slip = StageFlaws(noise=0.05, slip_translation=8, slip_rotation=3)
+    markers = record(dome_rig, true, weights, torch.Generator().manual_seed(0), slip).take.markers
+    assert markers is not None
+    swapped = markers.values.clone()
+    swapped[100:130, [3, 20]] = markers.values[100:130, [20, 3]]
+    save_take(Take(60.0, markers=Track(markers.names, swapped)), shoot / "dirty.c3d")
+    guess, out = shoot / "guess.json", shoot / "sites.json"
+    misplaced(dome_rig, true, torch.Generator().manual_seed(1), 2.0, 5.0).save(guess)
+    common = ("--initial", guess, "--out", out, "--quiet")
+    run("attach", shoot / "rig.glb", shoot / "dirty.c3d", *common)
+    told = " ".join(capsys.readouterr().err.split())
+    assert "helmet: moved by up to" in told
+    assert "cleanup: swap: 1" in told
+    off = site_distances(dome_rig, Attachment.load(out), true)
+    assert off.median() < 0.5
+    out.unlink()
+    swapped[:, 5] = torch.tensor([0.0, 40.0, 120.0]) + 0.05 * torch.randn(300, 3)
+    save_take(Take(60.0, markers=Track(markers.names, swapped)), shoot / "helmet.c3d")
+    with pytest.raises(SystemExit):
+        run("attach", shoot / "rig.glb", shoot / "helmet.c3d", *common)
+    told = " ".join(capsys.readouterr().err.split())
+    assert "helmet.c3d: markers: M006" in told
+    assert "they sit on the helmet" in told
+    assert "--insist" in told
+    assert not out.exists()
+    run("attach", shoot / "rig.glb", shoot / "helmet.c3d", *common, "--insist")
+    assert "warning: markers: M006" in " ".join(capsys.readouterr().err.split())
+    assert site_distances(dome_rig, Attachment.load(out), true).median() < 0.5
