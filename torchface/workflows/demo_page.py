@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, headed, sheet
+from torchface.rendering.shading import DEFAULT_LIGHTING
 from torchface.shape_names import ARKIT, mapping
 from torchface.viz.curves import compared_curves, error_curve, named_bars
 from torchface.viz.faces import FRONT, THREE_QUARTER, face_views, heat_map
@@ -29,6 +31,8 @@ _POSES: dict[str, dict[str, float]] = {
 _ACTIVE = 8
 _CURVE_SECONDS = 8.0
 _HEAT_MAXIMUM = 2.0
+# Ten heads in small: few rays show form as well.
+_FEW_RAYS = replace(DEFAULT_LIGHTING, occlusion_rays=3)
 
 
 def result_rows(result: DemoResult) -> list[tuple[str, str, str]]:
@@ -257,9 +261,18 @@ def _rig_picture(result: DemoResult) -> Tensor:
     for title, weights in _POSES.items():
         template, actor = _posed(result, weights)
         upper.append(
-            face_views(template, (THREE_QUARTER,), width=236, height=300, framed_by=result.scene.template.neutral)
+            face_views(
+                template,
+                (THREE_QUARTER,),
+                width=236,
+                height=300,
+                framed_by=result.scene.template.neutral,
+                lighting=_FEW_RAYS,
+            )
         )
-        actor_view = face_views(actor, (THREE_QUARTER,), width=236, height=300, framed_by=result.scene.head)
+        actor_view = face_views(
+            actor, (THREE_QUARTER,), width=236, height=300, framed_by=result.scene.head, lighting=_FEW_RAYS
+        )
         lower.append(caption(actor_view, title))
     return sheet([*upper, *lower], len(upper))
 
