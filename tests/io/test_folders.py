@@ -112,6 +112,13 @@ def test_a_written_folder_is_the_same_rig(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["actor"]
 
 
+def test_a_rig_is_written_into_the_folder_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    save_rig(sheet_rig(), ".")
+    assert load_rig(".").names == sheet_rig().names
+
+
 def test_wrinkle_maps_lie_beside_their_shapes(tmp_path: Path) -> None:
     rig = sheet_rig()
     maps = torch.nn.functional.normalize(torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0)), dim=1)

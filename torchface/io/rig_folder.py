@@ -82,7 +82,8 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
     missing = [] if detail is None else [name for name in detail.names if name not in rig.names]
     if missing:
         raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
-    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    place = folder.resolve()  # "." has no name of its own
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()

@@ -336,7 +336,7 @@ def check_out(out: Path) -> None:
         )
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        trial = out.with_name(f".{out.name}.writable")
+        trial = out.resolve().parent / f".{out.resolve().name}.writable"
         trial.touch()
         trial.unlink()
     except OSError as error:
