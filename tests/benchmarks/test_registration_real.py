@@ -24,6 +24,7 @@ def test_a_real_scan_with_landmarks_and_without(data: Path, ict_folder: Path) ->
     assert template.annotations is not None
     face = template.annotations.regions["narrow_face"]
     print(f"\n{'':>14}{'median mm':>11}{'mean':>8}{'95th':>8}{'on the scan':>13}{'s':>7}" + f"{'landmarks, mm:':>16}")
+    shares = []
     for name, given in (("landmarks", (template.landmarks, points)), ("none", None)):
         result = register(template, scan, given)
         distance = result.distance[face]
@@ -37,3 +38,7 @@ def test_a_real_scan_with_landmarks_and_without(data: Path, ict_folder: Path) ->
             picture = registration_sheet(scan, result, clay=kind, width=400, height=500)
             save_picture(picture, OUT / f"real_{name}{'_form' * kind}.png")
         assert float(distance.median()) <= 0.5
+        shares.append(result.record.shown)
+        print(f"{'':>14}{result.record.figures()}")
+    # Landmarks that disagree with the surface must not take the template off it.
+    assert shares[0] >= shares[1] - 0.01

@@ -100,7 +100,13 @@ def render(
 def _albedo(mesh: Mesh, colors: Tensor | None, triangle: Tensor, barycentric: Tensor) -> Tensor:
     if colors is None and mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None:
         uv = (mesh.uvs[mesh.uv_faces[triangle]].float() * barycentric[..., None]).sum(1)
-        return sample_texture(mesh.texture, uv)
+        sampled = sample_texture(mesh.texture, uv)
+        if mesh.colors is None:
+            return sampled
+        # Charts of further tiles (UDIM) have no place in the one picture that a mesh has.
+        beyond = ((uv < 0) | (uv > 1)).any(-1, keepdim=True)
+        own = (mesh.colors[mesh.faces[triangle]].float() * barycentric[..., None]).sum(1)
+        return torch.where(beyond, own.to(sampled), sampled)
     colors = mesh.colors if colors is None else colors
     if colors is None:
         return torch.tensor(CLAY).expand(len(triangle), 3)
