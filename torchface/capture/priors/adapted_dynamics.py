@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.dynamics import DynamicsPrior
 from torchface.capture.priors.learned_names import require_same_names, translation
-from torchface.capture.priors.motion import same_rate
-from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.capture.priors.motion import newest_frames, same_rate
+from torchface.errors import FileFormatError, ValueRangeError
 
 _LARGEST_RATIO = 8.0
 
@@ -86,11 +86,7 @@ class AdaptedDynamicsPrior(nn.Module):
         Raises:
             ShapeError: fewer frames than the window, or another number of shapes.
         """
-        if windows.ndim != 3 or windows.shape[1] < self.window or windows.shape[2] != len(self.names):
-            raise ShapeError(
-                f"windows: found {tuple(windows.shape)}, expected (B,{self.window},{len(self.names)}) or more frames"
-            )
-        windows = windows[:, -self.window :]
+        windows = newest_frames(windows, self.window, len(self.names))
         known = torch.einsum("kj,bjn,ln->bkl", self.interpolation, windows, self.to_learned)
         last = before = known[:, -1]
         variances: list[Tensor] = []

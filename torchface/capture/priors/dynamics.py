@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.gaussian_process import GaussianProcesses
 from torchface.capture.priors.learned_names import require_same_names
-from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts, same_rate
+from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts, newest_frames, same_rate
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
@@ -197,11 +197,7 @@ class DynamicsPrior(nn.Module):
         Raises:
             ShapeError: fewer frames than the window, or another number of shapes.
         """
-        if windows.ndim != 3 or windows.shape[1] < self.window or windows.shape[2] != len(self.names):
-            raise ShapeError(
-                f"windows: found {tuple(windows.shape)}, expected (B,{self.window},{len(self.names)}) or more frames"
-            )
-        windows = windows[:, -self.window :]
+        windows = newest_frames(windows, self.window, len(self.names))
         motion = torch.einsum("bjn,jo->bon", windows - self.center, self.basis)
         told, own = self.processes((motion / self.feature_scale).flatten(1))
         steps = (windows * self.coefficients).sum(1)

@@ -60,6 +60,17 @@ def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
     return torch.cat([motion[:, 1:], windows[:, -1:] - windows[:, -2:-1]], dim=1)
 
 
+def newest_frames(windows: Tensor, window: int, shapes: int) -> Tensor:
+    """The last ``window`` frames (B,J,N) of windows (B,J',N).
+
+    Raises:
+        ShapeError: fewer frames than the window, or another number of shapes.
+    """
+    if windows.ndim != 3 or windows.shape[1] < window or windows.shape[2] != shapes:
+        raise ShapeError(f"windows: found {tuple(windows.shape)}, expected (B,{window},{shapes}) or more frames")
+    return windows[:, -window:]
+
+
 def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Every window of a take, and the frame that follows it.
 
