@@ -10,7 +10,7 @@ from torchface.geometry.operators import triangle_normals
 from torchface.modeling.penetration import InnerParts
 from torchface.rig import BlendshapeRig
 
-_MARGIN = 0.15
+_BONE_MARGIN, _SHELL_MARGIN = 0.15, 0.5
 _ALLOWED = 0.1
 _ROUNDS = 6
 _LONGEST_STEP = 2.0
@@ -38,11 +38,22 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     poses = clearance_poses(rig, parts) if poses is None else poses
     rest, deltas = rig.vertices.detach().cpu().double(), rig.deltas.detach().cpu().double().clone()
     moving = deltas.norm(dim=-1) > _STILL
-    changed = torch.zeros(len(deltas), dtype=torch.bool)
     clearance = Clearance(rest, parts)
-    for weights in poses.double():  # what one pose changes, the next one starts from
+    changed = _cleared(deltas, moving, poses.double(), clearance)
+    # What mixtures ask of a shape may bring parts out again in its own pose.
+    again = torch.eye(len(deltas), dtype=torch.float64)[changed]
+    changed |= _cleared(deltas, moving, again, clearance)
+    whole = rig.deltas.detach().clone()
+    whole[changed.to(whole.device)] = deltas[changed].to(whole)
+    return BlendshapeRig(rig.neutral, whole, rig.names) if bool(changed.any()) else rig
+
+
+def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance) -> Tensor:
+    """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool."""
+    changed = torch.zeros(len(deltas), dtype=torch.bool)
+    for weights in poses:  # what one pose changes, the next one starts from
         active = weights.nonzero()[:, 0]
-        pose = rest + torch.tensordot(weights[active], deltas[active], dims=1)
+        pose = clearance.rest + torch.tensordot(weights[active], deltas[active], dims=1)
         step = clearance.step(pose, closing=len(active) == 1)
         ids = step.abs().amax(1).nonzero()[:, 0]
         if len(ids) == 0:
@@ -51,9 +62,7 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
         share = part / part.square().sum(0).clamp(min=1e-9)
         deltas[active[:, None], ids] += share[..., None] * step[ids]
         changed[active] |= part.any(1)
-    whole = rig.deltas.detach().clone()
-    whole[changed.to(whole.device)] = deltas[changed].to(whole)
-    return BlendshapeRig(rig.neutral, whole, rig.names) if bool(changed.any()) else rig
+    return changed
 
 
 def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
@@ -91,7 +100,7 @@ class Clearance:
     """What may give way in a head: the shells' vertices and the skin near the parts."""
 
     def __init__(self, rest: Tensor, parts: InnerParts) -> None:
-        self.parts, self.hard = parts, parts.hard
+        self.rest, self.parts, self.hard = rest, parts, parts.hard
         self.skin = parts.skin.unique()
         self.shells = parts.vertices[~parts.hard]
         self.height_at_rest = self._height(rest)
@@ -108,7 +117,8 @@ class Clearance:
                 break
             pose = pose.clone()
             normals = triangle_normals(pose, parts.skin)[standing.triangle]
-            back = normals * (standing.depth + _MARGIN).clamp(max=_LONGEST_STEP)[:, None]
+            margin = torch.where(self.hard, _BONE_MARGIN, _SHELL_MARGIN)
+            back = normals * (standing.depth + margin).clamp(max=_LONGEST_STEP)[:, None]
             shells, bones = through & ~self.hard, through & self.hard
             if bones.any():
                 met = pose[parts.vertices[bones]] - standing.way[bones, None] * standing.outward[bones]
