@@ -93,7 +93,7 @@ def test_on_a_real_rig(real_capture: Capture, standoff: float) -> None:
         assert ratio <= 0.6
 
 
-def doubts(name: str, capture: Capture, slips: bool, played: float) -> list[tuple[float, float]]:
+def doubts(name: str, capture: Capture, slips: bool, played: float) -> list[tuple[float, int]]:
     """A range of motion played weaker, or under a slipping helmet; whether what came out wrong was named."""
     rig, attachment, takes = capture
     calm = (rig, attachment, [played * weights[::3] for weights in takes])
@@ -111,7 +111,7 @@ def doubts(name: str, capture: Capture, slips: bool, played: float) -> list[tupl
         shapes = [name for name, wrong in zip(rig.names, error.mean(0).abs().tolist(), strict=True) if wrong > 0.1]
         sites = [label for label, wrong in zip(known.labels, off.tolist(), strict=True) if wrong > 1]
         share = float((off < 1).double().mean())
-        rows.append((share, sum(name in named for name in shapes) / len(shapes) if shapes else 1.0))
+        rows.append((share, sum(name not in named for name in shapes)))
         print(
             f"{rom + 1:3}  {100 * share:9.0f} %  {float(off.median()):4.2f} mm {float(off.max()):4.2f} mm "
             f"{float(error.abs().mean()):8.4f} {sum(name in named for name in shapes):9} of {len(shapes):<9} "
@@ -123,6 +123,6 @@ def doubts(name: str, capture: Capture, slips: bool, played: float) -> list[tupl
 @pytest.mark.real
 @pytest.mark.parametrize(("slips", "played"), [(False, 0.4), (True, 1.0)])
 def test_calm_takes_and_slipping_helmets(real_capture: Capture, slips: bool, played: float) -> None:
-    for share, named in doubts("a real rig, six real takes", real_capture, slips, played):
+    for share, unnamed in doubts("a real rig, six real takes", real_capture, slips, played):
         assert share >= 0.95
-        assert named >= 0.75
+        assert unnamed <= 1
