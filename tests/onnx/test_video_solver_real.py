@@ -18,7 +18,7 @@ from torchface.io.cameras import save_calibration
 from torchface.workflows.track import TrackSettings, track_video
 from torchface.workflows.track_result import Tracked
 
-pytestmark = pytest.mark.real
+pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 PRIOR = "shape_prior"
 
