@@ -43,6 +43,6 @@ class Prepared(Generic[Value]):
 
 
 def _same(before: Tensor | float, now: Tensor | float) -> bool:
-    if not isinstance(before, Tensor) or not isinstance(now, Tensor):
-        return type(before) is type(now) and before == now
-    return before.dtype == now.dtype and before.device == now.device and bool(torch.equal(before, now))
+    if isinstance(before, Tensor) and isinstance(now, Tensor):
+        return before.dtype == now.dtype and before.device == now.device and torch.equal(before, now)
+    return type(before) is type(now) and bool(before == now)
