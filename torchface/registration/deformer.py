@@ -11,7 +11,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.geometry.operators import triangle_cross
+from torchface.geometry.operators import triangle_areas
 from torchface.geometry.proximity import SurfaceIndex
 from torchface.registration.contact import ContactPull
 from torchface.registration.correspondence import Correspondences, correspondences, evenly_spread, exposed_vertices
@@ -21,7 +21,7 @@ from torchface.registration.record import StageRecord
 from torchface.registration.schedule import Level, Schedule, Stage
 from torchface.registration.stiffness import identity_maps, linked_edges, positions, stiffness_rows
 from torchface.registration.subspace import Subspace, all_maps, graph, translations
-from torchface.registration.unfolding import unfolded
+from torchface.registration.unfolding import turned_over, unfolded
 from torchface.rendering.raycast import RayCaster
 
 _AREA_OF_ONE = 10.0
@@ -55,11 +55,10 @@ class Deformer:
         self.maps = identity_maps(vertices)
         self.outward = exposed_vertices(vertices, faces, schedule.opening)
         self.exposed = self.outward.nonzero()[:, 0]
-        self._rest_cross = triangle_cross(vertices, faces)
-        area = self._rest_cross.norm(dim=-1)
+        area = triangle_areas(vertices, faces)
         self._sliver = area < _SLIVER * area.mean()
         # A correspondence stands for its share of the surface, so that the stiffness means the same at any resolution.
-        self._area = float(self._rest_cross.norm(dim=-1).sum()) / 2
+        self._area = float(area.sum())
         self._folded = torch.zeros(len(vertices), dtype=torch.bool)
         self.hidden = torch.zeros(len(vertices), dtype=torch.bool)
 
@@ -152,7 +151,7 @@ class Deformer:
 
     def folded_triangles(self) -> Tensor:
         """Mask (F,) of the triangles that have turned by more than 90° since the template was laid on the scan."""
-        return (triangle_cross(self.current, self.faces) * self._rest_cross).sum(-1) < 0
+        return turned_over(self.rest, self.current, self.faces)
 
     def unfold(self) -> None:
         """Turns back what triangles are still turned over."""

@@ -6,16 +6,24 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.deformation import degenerate_triangles
 from torchface.geometry.operators import components, triangle_cross
 
 _MOST_CIRCLES = 6
 _AROUND = 2
 _STIFF = 0.2
+_FLAT = 1e-9  # the area over the square of the longest edge that is rounding alone
 
 
 def turned_over(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
-    """Mask (F,) of the triangles whose normal has turned by more than 90° since rest."""
-    return (triangle_cross(current, faces) * triangle_cross(rest, faces)).sum(-1) < 0
+    """Mask (F,) of the triangles whose normal has turned by more than 90° since rest.
+
+    A triangle without area has no normal that could turn, only rounding that differs from processor to processor.
+    """
+    turned = (triangle_cross(current, faces) * triangle_cross(rest, faces)).sum(-1) < 0
+    rows = turned.nonzero()[:, 0]
+    flat = degenerate_triangles(rest, faces[rows], _FLAT) | degenerate_triangles(current, faces[rows], _FLAT)
+    return turned.index_fill(0, rows[flat], False)
 
 
 def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
