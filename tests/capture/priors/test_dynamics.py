@@ -281,5 +281,5 @@ def test_bad_input(prior: DynamicsPrior, monkeypatch: pytest.MonkeyPatch) -> Non
         return there(name, *rest, **more)
 
     monkeypatch.setattr("importlib.import_module", without)
-    with pytest.raises(MissingExtraError, match=r"pip install torchface\[train\]"):
+    with pytest.raises(MissingExtraError, match=r"-m pip install 'gpytorch"):
         import_gpytorch()
