@@ -228,8 +228,9 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         weight = graph.smoothed(typical[:, None], torch.ones_like(known), _BROAD)
         told = torch.lerp(mean, graph.smoothed(told, typical, _BROAD), weight / (weight + _SPARSE))
     under = torch.where(fixed, told, mean)
-    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known, and is lost on the way
-        under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, _LOST))
+    lost = _LOST if masked else 0.0
+    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known; behind a mask it is lost
+        under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
     return guess + (1 - known)[:, None] * under
 
 
