@@ -77,7 +77,7 @@ def encode_png(image: Tensor) -> bytes:
         ShapeError: the image is not (3,H,W) or (4,H,W) with at least one pixel.
     """
     if image.ndim != 3 or image.shape[0] not in (3, 4) or 0 in image.shape:
-        raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) with at least one pixel")
+        raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) or (4,H,W) with at least one pixel")
     array = image.detach().clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(array)).save(buffer, "PNG")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface.capture.priors import ShapePrior
-from torchface.capture.video import VideoSettings, VideoSolver
+from torchface.capture.video import VideoSolver
 from torchface.io import load_rig, load_take, save_animation
 from torchface.io.ict_facekit import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel, fit_images
@@ -34,9 +34,7 @@ def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performa
     fit = fit_images(model, rig, landmarks[:1], image_size, transfers=0, texture_size=0)
     actor = BlendshapeRig(fit.mesh, rig.deltas, rig.names)
     prior = ShapePrior.fit(takes, rig.names)
-    solver = VideoSolver(
-        actor, rig.neutral.landmarks, fit.cameras[0].intrinsics, prior, settings=VideoSettings(pixel_noise=fit.noise)
-    )
+    solver = VideoSolver(actor, rig.neutral.landmarks, fit.cameras[0].intrinsics, prior)
     solution = solver(landmarks[:40])
     eyes = float((landmarks[0, 36] - landmarks[0, 45]).norm())
     errors = solution.errors[solution.solved] / eyes
