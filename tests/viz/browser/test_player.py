@@ -35,6 +35,8 @@ def written(rig: BlendshapeRig, folder: Path) -> Path:
 
 
 def test_it_plays_from_disk_and_colours_the_distance(chromium: Any, ball_rig: BlendshapeRig, tmp_path: Path) -> None:
+    chromium.get("about:blank")
+    chromium.get_log("browser")  # what pages of other tests had to say until they were left
     chromium.get(written(ball_rig, tmp_path / "report").as_uri())
 
     def picture(frame: int) -> torch.Tensor:
