@@ -171,7 +171,7 @@ def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     for picture in ("frames.png", "error.png", "head.png", "weights1.png"):
         assert picture in page
         assert (tmp_path / picture).is_file()
-    assert "calibrated, 0.10 px" in page
+    assert "as given, 0.10 px from what it was fitted to" in page
     assert "frames with a face" in page
 
 

@@ -92,7 +92,7 @@ class Tracked:
                 "(torchface calibrate measures it)"
             )
         else:
-            lines.append(f"camera: calibrated, {self.calibration.error:.2f} px")
+            lines.append(f"camera: as given, {self.calibration.error:.2f} px from what it was fitted to")
         if self.faces > 1:
             lines.append(f"{self.faces} faces in the first frame; --face N picks another than the one followed")
         few = int((self.seen & (self.stable < FEWEST_STABLE)).sum())

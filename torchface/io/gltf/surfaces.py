@@ -75,6 +75,17 @@ def surfaces(mesh: Mesh, pictured: bool) -> list[Surface]:
     return found
 
 
+def parts_without_texels(mesh: Mesh) -> Tensor:
+    """Triangles (F,) of parts other than skin that a texture in the mesh's layout does not show; see `surfaces`."""
+    groups = _groups(mesh)
+    own = _own_texels(mesh, groups)
+    bare = torch.zeros(len(mesh.faces), dtype=torch.bool)
+    for material, _, triangles in groups:
+        if material is not SKIN and not bool(own[triangles].all()):
+            bare[triangles] = True
+    return bare
+
+
 def _worn(mesh: Mesh, textured: bool) -> Worn:
     if textured:
         return "texture"
