@@ -22,7 +22,8 @@ _SQUARELY = 0.2
 _TRUSTED = 0.5
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
-_TYPICAL, _SPARSE, _LOST = 0.15, 0.05, 0.01
+_TYPICAL, _SPARSE = 0.15, 0.05
+_LOST, _LOST_AT_MASK = 0.004, 0.01  # a ring of vertices, of what the edge knows
 _MOST_GAIN = 4.0
 _DARK, _MOST_TONE = 0.05, 0.5
 _NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
@@ -228,7 +229,7 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         weight = graph.smoothed(typical[:, None], torch.ones_like(known), _BROAD)
         told = torch.lerp(mean, graph.smoothed(told, typical, _BROAD), weight / (weight + _SPARSE))
     under = torch.where(fixed, told, mean)
-    lost = _LOST if masked else 0.0
+    lost = _LOST_AT_MASK if masked else _LOST
     for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known; behind a mask it is lost
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
     return guess + (1 - known)[:, None] * under
