@@ -17,14 +17,19 @@ from torchface.modeling import HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 
 
+def people(rig: BlendshapeRig, ict_folder: Path) -> HeadModel:
+    """Real people's shapes on the rig's neutral."""
+    modes = load_identity_modes(ict_folder, part="face").deltas
+    sizes = modes.flatten(1).norm(dim=1)
+    return HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
+
+
 @pytest.mark.real
 def test_a_real_portrait(
     data: Path, ict_folder: Path, real_capture: tuple[BlendshapeRig, Attachment, list[torch.Tensor]]
 ) -> None:
     rig = real_capture[0]
-    modes = load_identity_modes(ict_folder, part="face").deltas
-    sizes = modes.flatten(1).norm(dim=1)
-    model = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
+    model = people(rig, ict_folder)
     path = data / "images" / "ibug" / "image_0010.png"
     image = load_image(path)
     marks = load_landmark_points(path.with_suffix(".pts")).ibug()
@@ -45,9 +50,7 @@ def test_smiles_of_turned_heads_are_as_strong_on_both_sides(
 ) -> None:
     """Taken alone, 68 landmarks of a head turned by 36 degrees gave 0.63 and 0.24 to the halves of one smile."""
     rig = real_capture[0]
-    modes = load_identity_modes(ict_folder, part="face").deltas
-    sizes = modes.flatten(1).norm(dim=1)
-    model = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
+    model = people(rig, ict_folder)
     left, right = rig.index(["mouthSmile_L", "mouthSmile_R"])
     folder, apart = data / "images" / "dlib_faces", []
     for face in load_dlib_faces(folder / "training_with_face_landmarks.xml"):

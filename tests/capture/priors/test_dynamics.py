@@ -233,13 +233,6 @@ def test_resampling_keeps_lines() -> None:
         resampled(line, 60, 0)
 
 
-def test_another_frame_rate_is_told(prior: DynamicsPrior) -> None:
-    assert prior.rate_note(59.94) is None
-    note = prior.rate_note(25)
-    assert note is not None
-    assert "60 frames a second and the video has 25" in note
-
-
 def test_regions_hold_every_shape_once() -> None:
     names = performance(2, 0)[1]
     regions = face_regions(names)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.dynamics import DynamicsPrior
-from torchface.capture.priors.learned_names import require_same_names, translation
+from torchface.capture.priors.learned_names import name_matrices, require_same_names
 from torchface.capture.priors.motion import newest_frames, same_rate
 from torchface.errors import FileFormatError, ValueRangeError
 
@@ -57,7 +57,7 @@ class AdaptedDynamicsPrior(nn.Module):
             )
         if same_rate(learned.fps, fps):
             ratio = 1.0
-        there, back = translation(learned.names, names)
+        there, back = name_matrices(learned.names, names)
         self.learned, self.names, self.fps = learned, tuple(names), float(fps)
         self.steps = math.ceil(ratio - 1e-9)
         self.last_part = ratio - (self.steps - 1)
@@ -110,12 +110,6 @@ class AdaptedDynamicsPrior(nn.Module):
     def require(self, names: Sequence[str]) -> None:
         """Raises ``NameMismatchError`` where a rig's shapes are not ``names``."""
         require_same_names(self.names, names)
-
-    def rate_note(self, fps: float) -> str | None:
-        """What to tell a user whose frames come at another rate; None where they come at this one."""
-        if same_rate(self.fps, fps):
-            return None
-        return f"the dynamics prior expects {self.fps:g} frames a second and the video has {fps:g}"
 
     @property
     def config(self) -> dict[str, Any]:

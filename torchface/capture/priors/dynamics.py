@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchface.capture.energy import Quadratic, gaussian_term
 from torchface.capture.priors.gaussian_process import GaussianProcesses
 from torchface.capture.priors.learned_names import require_same_names
-from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts, newest_frames, same_rate
+from torchface.capture.priors.motion import face_regions, motion_basis, moving_parts, newest_frames
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
@@ -227,22 +227,6 @@ class DynamicsPrior(nn.Module):
             NameMismatchError: they are others, or in another order.
         """
         require_same_names(self.names, names)
-
-    def rate_note(self, fps: float) -> str | None:
-        """What to tell a user whose frames come at another rate than those that the prior has learned from.
-
-        Args:
-            fps: frames a second of a video or a take.
-
-        Returns:
-            A sentence, or None where the rates are within 2 % of each other.
-        """
-        if same_rate(self.fps, fps):
-            return None
-        return (
-            f"the dynamics prior has learned from {self.fps:g} frames a second and the video has {fps:g}: what it "
-            "expects of a frame is off by as much (adapt_dynamics makes one for this rate)"
-        )
 
     @property
     def config(self) -> dict[str, Any]:

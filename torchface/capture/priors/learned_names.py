@@ -12,7 +12,7 @@ from torchface.shape_names import mapping
 _LEAST_SHARE = 0.5
 
 
-def translation(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor, Tensor]:
+def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor, Tensor]:
     """The matrices (L,N) and (N,L) from a rig's N weights to L learned ones and back.
 
     See :func:`torchface.shape_names.mapping`; a shape of the rig that the prior has not learned has a row of zeros in

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
-from torchface.capture.priors.learned_names import require_same_names, translation
+from torchface.capture.priors.learned_names import name_matrices, require_same_names
 from torchface.capture.priors.parzen import ParzenDensity
 from torchface.capture.priors.student import PARTING_VARIANCE, StudentDensity
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
@@ -192,7 +192,7 @@ class ShapePrior(nn.Module):
         """
         if tuple(names) == self.names:
             return self
-        _, back = translation(self.names, names)
+        _, back = name_matrices(self.names, names)
         home = back.argmax(1)
         places = {row: place for place, group in enumerate(self.groups) for row in group}
         # A shape that nothing is known of goes with the first group.
