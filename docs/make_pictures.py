@@ -8,22 +8,22 @@ from pathlib import Path
 import torch
 
 from torchface.capture.video.lighting import estimate_light
-from torchface.geometry.camera import look_at
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_image, load_rig, save_image
 from torchface.io.video import open_video
 from torchface.registration import register
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, from_pillow, save_picture, sheet
-from torchface.rendering.overlay import FacePaint, overlay, relight
 from torchface.rendering.point_light import PointLight, vertex_albedo
-from torchface.rendering.shading import render
+from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.face_paint import face_paint
-from torchface.synthetic.light_stage import LightStageSettings, film_under_light
-from torchface.synthetic.scanner import eyes_closed, scan_head
-from torchface.viz.faces import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
-from torchface.viz.registration import registration_sheet
-from torchface.workflows.fit import fit_photographs
+from torchface.synthetic.stages.face_paint import face_paint
+from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.synthetic.stages.scanner import eyes_closed, scan_head
+from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
+from torchface.viz.figures.registration_views import registration_sheet
+from torchface.workflows.fit.photograph_rig import fit_photographs
 
 HERE = Path(__file__).resolve().parent
 SIZE = {"width": 232, "height": 290}

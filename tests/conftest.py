@@ -14,7 +14,7 @@ from torchface.io import load_rig, load_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.synthetic.marker_stage import place_markers
+from torchface.synthetic.stages.marker_stage import place_markers
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("TORCHFACE_DATA", REPOSITORY.parent / "shared" / "data"))

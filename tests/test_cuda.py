@@ -13,13 +13,13 @@ from torchface import zoo
 from torchface.capture import DynamicsPrior, HelmetSolver, HybridSolver, MarkerSolver, ShapePrior, VideoSolver
 from torchface.capture.priors import adapt_dynamics
 from torchface.capture.video import solve_whole_take
+from torchface.capture.video.head_pose import PoseTracker, track_pose
 from torchface.capture.video.landmark_smoothing import LandmarkFilter, smooth_landmarks
-from torchface.capture.video.pose import PoseTracker, track_pose
-from torchface.geometry.robust_pnp import robust_pnp
+from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.optim import BoxQP
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.synthetic.marker_stage import place_markers
+from torchface.synthetic.stages.marker_stage import place_markers
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that torch sees")
 

@@ -23,10 +23,10 @@ from torch import Tensor, nn
 from torchface import Attachment, BlendshapeRig, TorchfaceError, zoo
 from torchface.capture import MarkerSolver
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.geometry.alignment import Similarity
+from torchface.geometry.similarity import Similarity
 from torchface.landmarks import UVLandmarkDetector, load_detector, save_detector
-from torchface.modeling.head_model import HeadModel
-from torchface.modeling.morphable import MorphableModel
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.morphable.morphable_model import MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FACTS = {"licence": "MIT", "data": "nothing but noise", "metrics": {"error": 0.25}, "recipe": "python -m train.none"}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
-from torchface.files import read_file, write_file
+from torchface.files.whole_files import read_file, write_file
 from torchface.mesh import Mesh
 
 _FORMAT = "torchface.attachment/1"

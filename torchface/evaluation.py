@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 

@@ -12,17 +12,17 @@ from typing import Any
 from torch import nn
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
-from torchface.capture.video.solve import VideoSolver
+from torchface.capture.video.video_solver import VideoSolver
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.landmarks.appearance import AppearanceModel
-from torchface.landmarks.trees import LandmarkTrees
-from torchface.landmarks.uv import UVLandmarkDetector
-from torchface.model_files import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
-from torchface.modeling.head_model import HeadModel
-from torchface.modeling.morphable import MorphableModel
-from torchface.modeling.personalization import ExpressionRegression
+from torchface.files.models import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
+from torchface.landmarks.images.appearance_model import AppearanceModel
+from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.rigging.expression_regression import ExpressionRegression
 
 KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,

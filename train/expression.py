@@ -15,7 +15,7 @@ import tyro
 from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
-from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression
 from torchface.rendering.compositing import save_picture
 from torchface.synthetic import draw_identities, performer

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchface import BlendshapeRig, Mesh
 from torchface.modeling import ExpressionRegression, transfer_deformation
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
-from torchface.rendering.shading import render
-from torchface.viz.faces import clay_colors, frame_face
+from torchface.viz.figures.face_views import clay_colors, frame_face
 
 METHODS = ("deformation transfer", "mean offset", "regression")
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.geometry.samples import Samples, blocks
+from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import HeadModel
-from torchface.modeling.model_quality import ModelQuality
+from torchface.modeling.morphable.model_quality import ModelQuality
 from torchface.rendering.compositing import save_picture
-from torchface.viz.model_pictures import (
+from torchface.viz.figures.model_figures import (
     color_modes_picture,
     far_picture,
     modes_picture,

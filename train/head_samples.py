@@ -12,15 +12,15 @@ from torch import Tensor
 
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
-from torchface.geometry.alignment import Similarity, similarity_transform
-from torchface.geometry.procrustes import aligned, generalised_procrustes
-from torchface.geometry.samples import MovedSamples, SampleRange, Samples, blocks
-from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
+from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.modeling import color_casts, texture_areas, without_cast
 from torchface.registration import find_scans
-from torchface.rendering.shading import sample_texture
-from torchface.synthetic import draw_identities, head
-from torchface.synthetic.complexion import complexion_colors, draw_complexions
+from torchface.rendering.clay_shading import sample_texture
+from torchface.synthetic import draw_identities, neutral_head
+from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 
 _CAST_VERTICES = 4000
 _CAST_SAMPLES = 6_000_000
@@ -57,7 +57,7 @@ def performers(count: int, seed: int) -> Source:
     identities, complexions = draw_identities(count, generator), draw_complexions(count, generator)
 
     def read(number: int) -> Mesh:
-        mesh = head(identities[number], texture=False)
+        mesh = neutral_head(identities[number], texture=False)
         return replace(mesh, colors=complexion_colors(complexions[number : number + 1])[0])
 
     return Source([f"performer {i}" for i in range(count)], read, f"performers {count} {seed}")

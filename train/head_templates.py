@@ -7,7 +7,7 @@ from pathlib import Path
 from torchface import BlendshapeRig, Mesh, load_mesh, load_rig
 from torchface.errors import FileFormatError
 from torchface.io import load_ict_facekit, load_identity_modes
-from torchface.io.ict_facekit import region
+from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
 from train.head_samples import vertex_colored

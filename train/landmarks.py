@@ -20,12 +20,12 @@ from torch import Tensor
 
 from torchface import TorchfaceError, zoo
 from torchface.errors import FileFormatError
-from torchface.io.images import load_image
-from torchface.io.landmarks import load_landmark_points
-from torchface.io.landmarks_dlib import load_dlib_faces
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.ibug import box_around, relative_errors
-from torchface.synthetic.face_pictures import FacePicture, PictureSettings, face_pictures
+from torchface.landmarks.images.ibug import box_around, relative_errors
+from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, face_pictures
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _LUMA = torch.tensor([0.299, 0.587, 0.114])
@@ -265,7 +265,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
         recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
         card=(
             "iBUG's 68 landmarks of faces in grey pictures, from boxes as OpenCV's Haar cascade gives them or "
-            "`torchface.landmarks.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
+            "`torchface.landmarks.images.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
             f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
             + (
                 ""

@@ -15,11 +15,11 @@ import tyro
 
 from torchface import Attachment, BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.capture import MarkerSolver
-from torchface.capture.markers.solve import RIDGE, SPARSITY
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.synthetic.marker_stage import place_markers
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.synthetic.stages.weight_curves import perform
 
 
 @dataclass(frozen=True)

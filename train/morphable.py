@@ -18,10 +18,10 @@ import tyro
 
 from torchface import TorchfaceError, zoo
 from torchface.errors import ValueRangeError
-from torchface.geometry.samples import SampleRange, Samples, blocks
+from torchface.geometry.sample_batches import SampleRange, Samples, blocks
 from torchface.modeling import HeadModel, MorphableModel
-from torchface.modeling.model_quality import ModelQuality, model_quality
-from torchface.modeling.sequence_fit import fit_sequence
+from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
+from torchface.modeling.morphable.streamed_training import fit_sequence
 from train.head_pictures import draw
 from train.head_samples import Source, balanced_colors, gather, laid, performers, registered
 from train.head_templates import ict_head_model, load_template

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.capture.priors import DynamicsPrior, windows_of
-from torchface.files import write_file
+from torchface.files.whole_files import write_file
 from train.prior_trials import OneStep
 
 _SHOWN = 4

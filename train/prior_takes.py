@@ -13,8 +13,8 @@ from torchface import Attachment, BlendshapeRig, load_take
 from torchface.capture.priors import resampled
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mapping
-from torchface.synthetic.performance import perform
-from torchface.workflows.solve import SolveSettings, solve_markers
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
 
 _SUFFIXES = (".csv", ".c3d", ".trc")
 _SAME_RATE = 1e-3  # relative; 59.94 and 60 frames a second are not the same, rounding is

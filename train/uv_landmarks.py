@@ -28,10 +28,10 @@ from torchface.landmarks import (
     scan_landmarks,
     unwrap,
 )
-from torchface.landmarks.evaluation import ScanErrors, error_table, landmark_errors, picture
+from torchface.landmarks.scans.detector_evaluation import ScanErrors, error_table, landmark_errors, picture
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.scanner import ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
 
 _TESTED_PERFORMERS = 20
 _VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds

@@ -25,18 +25,18 @@ from torchface.capture.action_units import (
     load_shape_table,
     read_regions,
 )
-from torchface.capture.action_units.alignment import Method
 from torchface.capture.action_units.classifier import GroupClassifier, group_regions
-from torchface.capture.action_units.curves import action_unit_curves
-from torchface.capture.action_units.evaluation import cross_validation, level_agreement
-from torchface.capture.action_units.training import label_group
+from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
+from torchface.capture.action_units.classifier_training import label_group
+from torchface.capture.action_units.pattern_flow import Method
+from torchface.capture.action_units.weight_targets import action_unit_curves
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
-from torchface.landmarks.hog import HogLayout, cell_map
+from torchface.landmarks.scans.hog import HogLayout, cell_map
 from torchface.onnx import export_action_units
 from torchface.synthetic import draw_identities
-from torchface.synthetic.action_performance import ACTION_UNITS
-from torchface.synthetic.camera_stage import film_session
+from torchface.synthetic.stages.action_performance import ACTION_UNITS
+from torchface.synthetic.stages.camera_stage import film_session
 
 FILMS = Path(__file__).resolve().parents[2] / "out" / "action_unit_films"
 NAMES = group_regions(GROUPS)

@@ -25,10 +25,10 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
-from torchface.landmarks.ibug import box_around
-from torchface.landmarks.shape_modes import planar_pose
+from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.portrait_film import EXPRESSIONS, expression_weights, film_portrait, mixed_expressions
+from torchface.synthetic.stages.portrait_video import EXPRESSIONS, expression_weights, film_portrait, mixed_expressions
 
 LEARNED, TESTED, ACTORS = len(EXPRESSIONS), 45, (3, 4, 5)
 BOUND = 0.6

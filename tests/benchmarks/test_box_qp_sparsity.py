@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.markers import observability, sparsity_by_rule, sparsity_experiment
-from torchface.capture.markers.solve import SPARSITY
+from torchface.capture.markers.marker_solver import SPARSITY
 
 matplotlib.use("Agg")
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import HelmetSolver, MarkerSolver, WholeTakeSolver, clean_take
-from torchface.synthetic.marker_stage import LabelSwap, StageFlaws, record
+from torchface.synthetic.stages.marker_stage import LabelSwap, StageFlaws, record
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 EVERY = 6

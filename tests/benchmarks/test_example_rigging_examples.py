@@ -19,19 +19,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import load_take
-from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
-from torchface.modeling.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
+from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.optim import box_qp
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.performance import perform
-from torchface.viz.faces import THREE_QUARTER, frame_face
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.viz.figures.face_views import THREE_QUARTER, frame_face
 
 EXAMPLES = [
     "mouthSmileLeft mouthSmileRight browInnerUp eyeLookUpLeft eyeLookUpRight jawForward",
@@ -223,7 +223,7 @@ MEASURED = """
 import resource, sys, time
 from pathlib import Path
 import torch
-from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import rig_from_examples
 folder = Path(sys.argv[1])
 template = load_ict_facekit(folder, part="face")

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchface.modeling import ExpressionRegression
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.synthetic import draw_identities, performer
-from torchface.viz.faces import clay_colors, frame_face
+from torchface.viz.figures.face_views import clay_colors, frame_face
 from train.expression_table import METHODS, People, compare, picture
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "expression_regression"

@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.io.images import load_image
-from torchface.io.landmarks import load_landmark_points
-from torchface.io.landmarks_dlib import load_dlib_faces
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import LandmarkTracker, LandmarkTrees, find_faces, find_landmarks, landmark_jitter
-from torchface.landmarks.consensus import ConsensusSettings
-from torchface.landmarks.face_box import overlaps
-from torchface.landmarks.ibug import box_around
-from torchface.landmarks.tracking import track_landmarks
+from torchface.landmarks.images.consensus import ConsensusSettings
+from torchface.landmarks.images.face_box import overlaps
+from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.tracking import track_landmarks
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.capture.video.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
-from torchface.capture.video.pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
-from torchface.geometry.calibration import assumed_calibration
-from torchface.geometry.pnp import pixel_jacobian
-from torchface.geometry.robust_pnp import robust_pnp
+from torchface.geometry.cameras.calibration import assumed_calibration
+from torchface.geometry.cameras.pnp import pixel_jacobian
+from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
-from torchface.synthetic import head
+from torchface.synthetic import neutral_head
 
 K = assumed_calibration(640, 480).intrinsics
 UPRIGHT = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
@@ -33,7 +33,7 @@ def one_thread() -> Iterator[None]:
 
 def filmed(noise: float, size: float = 1.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Landmarks at rest, rotations, translations, pixels of a head that turns, nods and moves, 30 frames a second."""
-    mesh, moment = head(), torch.arange(FRAMES, dtype=torch.float64) / 30
+    mesh, moment = neutral_head(), torch.arange(FRAMES, dtype=torch.float64) / 30
 
     def swing(most: float, phase: float) -> Tensor:
         quick = 0.3 * (2 * math.pi * 0.9 * moment + 2 * phase).cos()

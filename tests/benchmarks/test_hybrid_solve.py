@@ -19,16 +19,16 @@ from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver, 
 from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
 from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.markers import gamma_curves, rest_residual
-from torchface.geometry.camera import look_at
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.action_performance import MOVES, PerformanceSettings
-from torchface.synthetic.camera_stage import SIDE_MARKERS, StageSettings, film_session, stage_markers
-from torchface.synthetic.filmed_head import MARKER_RADIUS
-from torchface.synthetic.marker_stage import StageFlaws
+from torchface.synthetic.stages.action_performance import MOVES, PerformanceSettings
+from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, StageSettings, film_session, stage_markers
+from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
+from torchface.synthetic.stages.marker_stage import StageFlaws
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "hybrid"
 LED = ("4", "9", "6+43", "18L")

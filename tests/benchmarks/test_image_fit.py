@@ -19,25 +19,25 @@ import torch
 from torch import Tensor
 
 from torchface import load_take, zoo
-from torchface.geometry.alignment import similarity_transform
-from torchface.geometry.camera import look_at
-from torchface.geometry.pnp import solve_pnp
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.geometry.rotations import rotation_matrix
-from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
-from torchface.io.images import load_image
-from torchface.io.landmarks import load_landmark_points
-from torchface.io.landmarks_dlib import load_dlib_faces
+from torchface.geometry.similarity import similarity_transform
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images, transfer_deformation
-from torchface.modeling.image_alternation import alternate
-from torchface.modeling.image_fit import contour_curves
-from torchface.modeling.image_solve import Problem, State, solve
-from torchface.modeling.landmark_view import JAW, LinearPoints, Views, chosen_points
+from torchface.modeling.photographs.image_alternation import alternate
+from torchface.modeling.photographs.image_fit import contour_curves
+from torchface.modeling.photographs.image_solve import Problem, State, solve
+from torchface.modeling.photographs.landmark_view import JAW, LinearPoints, Views, chosen_points
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.workflows.fit_overlay import overlay
+from torchface.workflows.fit.fit_overlay import overlay
 
 pytestmark = pytest.mark.real
 

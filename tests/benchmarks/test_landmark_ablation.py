@@ -19,12 +19,12 @@ from torchface import Mesh, zoo
 from torchface.errors import NameMismatchError
 from torchface.landmarks import TWELVE, AutomaticLandmarks, LandmarkPairs, UVLandmarkDetector, contour_correspondences
 from torchface.registration import register
-from torchface.registration.preparation import Landmarks
+from torchface.registration.scan_preparation import Landmarks
 from torchface.rendering.compositing import headed, save_picture, sheet
-from torchface.synthetic import draw_identities, head, performer
-from torchface.synthetic.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
-from torchface.synthetic.subdivision import finely_coloured
-from torchface.viz.faces import heat_map
+from torchface.synthetic import draw_identities, neutral_head, performer
+from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.stages.subdivision import finely_coloured
+from torchface.viz.figures.face_views import heat_map
 from train.uv_landmarks import fit, scanned_performers
 
 SCANS = int(os.environ.get("TORCHFACE_BENCH_HEADS", "6"))
@@ -61,7 +61,7 @@ def some(pairs: LandmarkPairs, names: tuple[str, ...]) -> Landmarks:
 
 
 def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
-    template = head(texture=False)
+    template = neutral_head(texture=False)
     finder = AutomaticLandmarks(detector, template)
     regions, contacts = template.annotations.regions, template.annotations.contacts.flatten()
     lids, lips = regions["lids_left"] | regions["lids_right"], regions["upper_lip"] | regions["lower_lip"]

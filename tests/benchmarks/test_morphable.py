@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 from sklearn.decomposition import PCA
 
 from torchface.io import load_identity_modes
-from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.modeling import MorphableModel
 
 SAMPLES = int(os.environ.get("TORCHFACE_BENCH_SAMPLES", "10000"))
@@ -28,8 +28,8 @@ VERTICES, COMPONENTS = 9409, 200
 
 FIT = """
 import json, resource, sys, time
-from torchface.io.mesh_sequence import MeshSequence
-from torchface.modeling.sequence_fit import fit_sequence
+from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.modeling.morphable.streamed_training import fit_sequence
 from safetensors.torch import save_file
 
 path, checkpoint, out = sys.argv[1:4]

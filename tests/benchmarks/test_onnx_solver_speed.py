@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.onnx import export_solver
-from torchface.onnx.solver_export import hide_markers
+from torchface.onnx.solver_graph_export import hide_markers
 
 
 def play(session: onnxruntime.InferenceSession, markers: Tensor, warm: bool) -> tuple[Tensor, float, float]:

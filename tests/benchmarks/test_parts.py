@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from torchface.io import load_mesh, load_take
-from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import InnerParts, inner_parts, place_parts, shape_depths, transfer_with_report
-from torchface.modeling.penetration import TOLERANCE
+from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.registration import register
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.synthetic.identity import IDENTITY
-from torchface.synthetic.performer import performer
-from torchface.workflows.register import in_place_of
+from torchface.synthetic.head.identity import IDENTITY
+from torchface.synthetic.head.performer import performer
+from torchface.workflows.register_scans import in_place_of
 
 HEADS, FRAMES = 20, 100
 SHELLS = 1.2

@@ -18,15 +18,15 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from torchface.capture.video.lighting import estimate_light
-from torchface.geometry.camera import Camera
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight, in_camera_frame, vertex_albedo
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.light_stage import LightStageSettings, lit_picture, turning_cameras
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, turning_cameras
+from torchface.synthetic.stages.weight_curves import perform
 
 LAMPS = 50
 STAGE = LightStageSettings(samples=1)

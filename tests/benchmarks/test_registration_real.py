@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from torchface.io import load_identity_modes, load_mesh
-from torchface.io.landmarks import load_landmark_points
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.registration import register
 from torchface.rendering.compositing import save_picture
-from torchface.viz.registration import registration_sheet
+from torchface.viz.figures.registration_views import registration_sheet
 
 OUT = Path(__file__).parents[2] / "out" / "registration"
 PARTS = {"brows": slice(17, 27), "nose": slice(27, 36), "eyes": slice(36, 48), "mouth": slice(48, 68)}

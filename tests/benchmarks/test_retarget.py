@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig, load_rig, load_take
-from torchface.capture.retarget import shape_map
+from torchface.capture.retargeting import shape_map
 from torchface.rendering.compositing import caption, save_picture, sheet
 from torchface.synthetic import performer
-from torchface.viz.faces import face_views
+from torchface.viz.figures.face_views import face_views
 
 PICTURES = Path("out/retarget")
 SIZE = {"width": 260, "height": 325}

@@ -8,15 +8,15 @@ import torch
 
 from torchface import Take, Track, save_rig
 from torchface.evaluation import weight_jitter
-from torchface.geometry.calibration import CameraCalibration
-from torchface.io.cameras import save_calibration
-from torchface.io.weights import save_weights_csv
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io.camera_files import save_calibration
+from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.rendering.point_light import PointLight
-from torchface.synthetic.light_stage import LightStageSettings, film_under_light
-from torchface.synthetic.performance import perform
-from torchface.synthetic.performer import performer
-from torchface.workflows.evaluate import EvaluationSettings, evaluate
-from torchface.workflows.track import TrackSettings, track_video
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.workflows.evaluate.evaluate_result import EvaluationSettings, evaluate
+from torchface.workflows.track.track_video import TrackSettings, track_video
 
 FRAMES, FPS = 150, 60.0
 WIDTH, HEIGHT = 320, 240

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from torchface import load_mesh
-from torchface.geometry.proximity import SurfaceIndex
-from torchface.io.landmarks import load_landmark_points
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import TWELVE, ScanAnnotation, UVLandmarkDetector, scan_landmarks, twelve_from_ibug
-from torchface.landmarks.evaluation import error_table, landmark_errors, picture
+from torchface.landmarks.scans.detector_evaluation import error_table, landmark_errors, picture
 from torchface.rendering.compositing import save_picture, sheet
 from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
 

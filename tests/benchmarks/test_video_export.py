@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchface.capture.video import VideoSettings
 from torchface.cli import main
-from torchface.io.cameras import save_calibration
-from torchface.workflows.track import TrackSettings, track_video
-from torchface.workflows.track_result import Tracked
+from torchface.io.camera_files import save_calibration
+from torchface.workflows.track.track_result import Tracked
+from torchface.workflows.track.track_video import TrackSettings, track_video
 
 pytestmark = pytest.mark.real
 

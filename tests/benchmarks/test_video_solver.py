@@ -24,19 +24,19 @@ from torchface.capture.priors import (
     ReciprocalPrior,
     ShapePrior,
 )
-from torchface.capture.retarget import retarget_take, shape_map
+from torchface.capture.retargeting import retarget_take, shape_map
 from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
-from torchface.capture.video import solve as frame_solve
-from torchface.capture.video.belief import Belief, Expectation
+from torchface.capture.video import video_solver as frame_solve
 from torchface.capture.video.face_points import FacePoints
-from torchface.geometry.camera import look_at
-from torchface.geometry.pnp import solve_pnp
+from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_take
-from torchface.io.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import transfer_deformation
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer

@@ -12,8 +12,8 @@ from typing import TypeVar
 import pytest
 import torch
 
-from torchface.modeling.detail import bake_normal_map
-from torchface.modeling.scan_alignment import align_scan
+from torchface.modeling.detail.normal_map_baking import bake_normal_map
+from torchface.modeling.detail.scan_alignment import align_scan
 
 T = TypeVar("T")
 

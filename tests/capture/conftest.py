@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from torchface import Attachment, BlendshapeRig, Mesh
-from torchface.geometry.alignment import Similarity
+from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.marker_stage import place_markers
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.synthetic.stages.weight_curves import perform
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchface import BlendshapeRig, load_rig, load_take
-from torchface.capture.retarget import ShapeRule, load_shape_rules, shape_map
+from torchface.capture.retargeting import ShapeRule, load_shape_rules, shape_map
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer

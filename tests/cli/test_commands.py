@@ -13,15 +13,15 @@ from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.cli import COMMANDS, main, progress
 from torchface.cli.export import EXPORTS
 from torchface.evaluation import weight_jitter
-from torchface.geometry.alignment import Similarity
+from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
-from torchface.io.picks import LandmarkVertices, save_landmarks
+from torchface.io.landmarks.picks import LandmarkVertices, save_landmarks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.marker_sites import misplaced, site_distances
-from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
+from torchface.synthetic.stages.displaced_sites import misplaced, site_distances
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
-from torchface.workflows.attach import load_sites
+from torchface.workflows.attach_markers import load_sites
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ import torch
 from torchface.cli import main
 from torchface.cli.ending import told_plainly
 from torchface.errors import FileFormatError
-from torchface.files import check_writable, make_folder
+from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import save_rig, save_take
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.marker_stage import place_markers, record
+from torchface.synthetic.stages.marker_stage import place_markers, record
 
 
 @pytest.fixture(scope="module")

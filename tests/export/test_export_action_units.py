@@ -16,7 +16,7 @@ from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.cli.export import action_units as command
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.modeling import MorphableModel
-from torchface.onnx import action_units as graph
+from torchface.onnx import action_unit_graph as graph
 from torchface.onnx import export_action_units
 
 

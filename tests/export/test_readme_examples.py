@@ -16,12 +16,12 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.video import VideoSolver
-from torchface.geometry.calibration import assumed_calibration
+from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
-from torchface.landmarks.hog import HogLayout
+from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model, export_video_solver
-from torchface.onnx.video_export import filmed
+from torchface.onnx.video_graph_export import filmed
 from torchface.synthetic import performer
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.io.images import decode_image
+from torchface.io.images.image_files import decode_image
 
 WEB = Path(__file__).resolve().parent / "web"
 _SECONDS = 120

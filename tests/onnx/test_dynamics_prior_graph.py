@@ -12,9 +12,9 @@ import torch
 
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.errors import ValueRangeError
-from torchface.onnx import dynamics_prior as exporting
+from torchface.onnx import dynamics_prior_graph as exporting
 from torchface.onnx import export_model
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.weight_curves import perform
 
 
 @pytest.fixture(scope="module", params=[1, 4])

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchface import BlendshapeRig
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.onnx import HybridGraph, SolverGraph, export_hybrid_solver
-from torchface.onnx.solver_export import hide_markers, random_frames
-from torchface.synthetic.marker_stage import place_markers
+from torchface.onnx.solver_graph_export import hide_markers, random_frames
+from torchface.synthetic.stages.marker_stage import place_markers
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import torch
 from torchface import BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.onnx.live import LiveMarkerSolver
-from torchface.onnx.solver_export import hide_markers, random_frames
-from torchface.synthetic.marker_stage import place_markers
+from torchface.onnx.live_solver import LiveMarkerSolver
+from torchface.onnx.solver_graph_export import hide_markers, random_frames
+from torchface.synthetic.stages.marker_stage import place_markers
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from torchface.capture import MarkerSolver
 from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.landmarks import DetectorSettings, UVLandmarkDetector
-from torchface.landmarks.hog import HogLayout
+from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model
-from torchface.onnx.landmark_bank import LandmarkBank, export_landmark_bank
+from torchface.onnx.uv_landmark_graph import LandmarkBank, export_landmark_bank
 
 FACTS = {"licence": "MIT", "data": "noise", "metrics": {"error": 1.5}, "recipe": "none"}
 SIZE = 160

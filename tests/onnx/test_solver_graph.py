@@ -15,9 +15,9 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, Mesh, __version__
 from torchface.capture import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.alignment import Similarity
+from torchface.geometry.similarity import Similarity
 from torchface.onnx import SolverGraph, export_solver
-from torchface.onnx.solver_export import hide_markers, random_frames
+from torchface.onnx.solver_graph_export import hide_markers, random_frames
 from torchface.onnx.solver_model import solver_model
 
 
@@ -123,7 +123,7 @@ def test_a_graph_that_disagrees_is_not_written(
     rig: BlendshapeRig, attachment: Attachment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = solver_model(SolverGraph(MarkerSolver(rig, attachment, sparsity=0.031)))
-    monkeypatch.setattr("torchface.onnx.solver_export.solver_model", lambda graph, facts: other)
+    monkeypatch.setattr("torchface.onnx.solver_graph_export.solver_model", lambda graph, facts: other)
     with pytest.raises(ValueRangeError, match="ONNX Runtime differs from PyTorch"):
         export_solver(rig, attachment, tmp_path / "solver.onnx")
     assert not list(tmp_path.iterdir())

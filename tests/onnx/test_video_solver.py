@@ -17,12 +17,13 @@ from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMi
 from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.cli import main
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.calibration import CameraCalibration
+from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io import save_rig
-from torchface.io.cameras import save_calibration
-from torchface.onnx import VideoGraph, VideoReport, export_video_solver, video_export
-from torchface.onnx.sweep import swept_inverse
-from torchface.onnx.video_export import filmed
+from torchface.io.camera_files import save_calibration
+from torchface.onnx import VideoGraph, VideoReport, export_video_solver
+from torchface.onnx import video_graph_export as video_export
+from torchface.onnx.symmetric_inverse import swept_inverse
+from torchface.onnx.video_graph_export import filmed
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchface.errors import ShapeError, TopologyError
-from torchface.geometry.camera import look_at
-from torchface.geometry.normal_maps import flat_normal_map
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.meshes.normal_maps import flat_normal_map
 from torchface.mesh import Mesh
-from torchface.rendering.shading import Lighting, render
+from torchface.rendering.clay_shading import Lighting, render
 
 BARE = Lighting(occlusion_rays=0)
 

@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.calibration import CameraCalibration
-from torchface.geometry.camera import Camera
-from torchface.geometry.distortion import distort
-from torchface.geometry.operators import triangle_normals
-from torchface.geometry.uv_raster import rasterise_uvs
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import distort
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import triangle_normals
+from torchface.geometry.meshes.uv_raster import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.rendering.color_space import to_linear, to_srgb
-from torchface.rendering.footprint import footprint
-from torchface.rendering.overlay import FacePaint, overlay, relight, skin_faces
+from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
+from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.synthetic.light_stage import LightStageSettings, lit_picture, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, turning_cameras
 
 STAGE = LightStageSettings(width=240, height=240, samples=2, gloss=0.0, noise=0.0)
 LIGHT = PointLight(torch.tensor([0.3, 0.32, 0.35]), torch.tensor([0.65, 0.6, 0.55]), torch.tensor([-500.0, -250, 100]))

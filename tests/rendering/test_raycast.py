@@ -7,11 +7,11 @@ import torch
 import trimesh
 
 from torchface.errors import FileFormatError
-from torchface.geometry.camera import look_at
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import Lighting, render, sample_texture
 from torchface.rendering.compositing import heat_colors, save_picture, sheet
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.shading import Lighting, render, sample_texture
 
 
 def sphere(radius: float = 50.0) -> Mesh:

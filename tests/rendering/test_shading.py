@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import torch
 
-from torchface.geometry.camera import look_at
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.mesh import Mesh
-from torchface.rendering.shading import render
+from torchface.rendering.clay_shading import render
 
 RED, GREEN = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])
 

@@ -11,7 +11,7 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.evaluation import weight_jitter
-from torchface.synthetic.marker_stage import record
+from torchface.synthetic.stages.marker_stage import record
 from torchface.temporal import OneEuroFilter, OneEuroSettings, one_euro_filter
 
 FPS = 60.0

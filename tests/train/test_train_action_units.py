@@ -14,8 +14,8 @@ from torchface import zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.errors import NameMismatchError, TorchfaceError
 from torchface.io.action_labels import Performed, save_action_labels
-from torchface.synthetic.action_performance import ACTION_UNITS, PerformanceSettings
-from torchface.synthetic.camera_stage import FilmedSession, StageSettings, film_session
+from torchface.synthetic.stages.action_performance import ACTION_UNITS, PerformanceSettings
+from torchface.synthetic.stages.camera_stage import FilmedSession, StageSettings, film_session
 from train.action_units import Settings, performed_groups, train
 
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.ibug import box_around
+from torchface.landmarks.images.ibug import box_around
 from torchface.rendering.compositing import save_picture
-from torchface.synthetic.face_pictures import FacePicture, PictureSettings, face_pictures
+from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, face_pictures
 from train import landmarks as recipe
 from train.landmarks import Faces, Settings, evaluate, load_faces, rendered_faces, train
 

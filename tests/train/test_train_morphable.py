@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from torchface import Mesh, load_mesh, save_mesh, zoo
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
-from torchface.geometry.alignment import similarity_transform
+from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.rendering.color_space import to_linear, to_srgb
-from torchface.synthetic import draw_identities, head
-from torchface.synthetic.complexion import complexion_colors, draw_complexions
-from torchface.viz import model_pictures
-from torchface.workflows.fit import fit_photographs
+from torchface.synthetic import draw_identities, neutral_head
+from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
+from torchface.viz.figures import model_figures as model_pictures
+from torchface.workflows.fit.photograph_rig import fit_photographs
 from train import morphable as recipe
 from train.head_samples import registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train
@@ -29,7 +29,7 @@ def people(count: int) -> list[Mesh]:
     generator = torch.Generator().manual_seed(5)
     identities = draw_identities(count, generator)
     colors = complexion_colors(draw_complexions(count, generator))
-    return [replace(head(i, texture=False), colors=c) for i, c in zip(identities, colors, strict=True)]
+    return [replace(neutral_head(i, texture=False), colors=c) for i, c in zip(identities, colors, strict=True)]
 
 
 @pytest.fixture(scope="module")

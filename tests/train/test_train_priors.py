@@ -14,8 +14,8 @@ from torchface.capture.priors import ReciprocalPrior
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.synthetic.marker_stage import place_markers
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.synthetic.stages.weight_curves import perform
 from torchface.take import Track
 from train.prior_takes import made_up, read_takes, renamed, split
 from train.priors import Settings, train

@@ -13,8 +13,8 @@ import torch
 
 from torchface import zoo
 from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
-from torchface.geometry.alignment import Similarity
-from torchface.geometry.proximity import SurfaceIndex
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.similarity import Similarity
 from torchface.io import load_mesh
 from torchface.landmarks import (
     AutomaticLandmarks,
@@ -25,13 +25,13 @@ from torchface.landmarks import (
     load_detector,
     scan_landmarks,
 )
-from torchface.landmarks.correspondences import template_features
-from torchface.landmarks.evaluation import landmark_errors
-from torchface.landmarks.hog import HogLayout
-from torchface.landmarks.twelve import LINES
-from torchface.synthetic import draw_identities, head, performer
-from torchface.synthetic.photographs import Photography
-from torchface.synthetic.scanner import ScannerSettings, eyes_closed, write_scans
+from torchface.landmarks.scans.detector_evaluation import landmark_errors
+from torchface.landmarks.scans.hog import HogLayout
+from torchface.landmarks.scans.landmark_pairs import template_features
+from torchface.landmarks.scans.twelve_landmarks import LINES
+from torchface.synthetic import draw_identities, neutral_head, performer
+from torchface.synthetic.stages.scan_photographs import Photography
+from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, write_scans
 from train.uv_landmarks import Settings, Trained, train
 
 pytest.importorskip("safetensors")
@@ -84,7 +84,7 @@ def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder:
 def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], folder: Path) -> None:
     scan = load_mesh(folder / "scan_005.obj")
     truth = load_annotations(folder / "annotations.json")["scan_005.obj"]
-    template = head(texture=False)
+    template = neutral_head(texture=False)
     pairs = contour_correspondences(trained[0].detector, template, scan)
     assert set(LINES) <= set(pairs.names)
     assert SurfaceIndex(scan.vertices, scan.faces).nearest(pairs.points).distance.max() < 3.0
@@ -100,7 +100,7 @@ def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], fol
 
 
 def test_registration_is_given_landmarks(trained: tuple[Trained, Path], folder: Path) -> None:
-    template = head(texture=False)
+    template = neutral_head(texture=False)
     scan = load_mesh(folder / "scan_005.obj")
     closed = replace(template, annotations=replace(template.annotations, contacts=None))
     with pytest.raises(ValueRangeError, match="contact pairs"):

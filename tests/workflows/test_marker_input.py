@@ -12,7 +12,7 @@ from torchface.attachment import Attachment
 from torchface.cli import main
 from torchface.io import load_take, save_rig, save_take
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
 
 

@@ -11,11 +11,11 @@ import torch
 from torchface.capture import MarkerSolver
 from torchface.cli import main
 from torchface.io import load_take, save_rig, save_take
-from torchface.io.live_link import not_in_live_link
-from torchface.io.weights import ROTATIONS, load_weights_csv, save_weights_csv
+from torchface.io.weights.live_link_csv import not_in_live_link
+from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
-from torchface.synthetic.marker_stage import StageFlaws, place_markers, record
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
 
 DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")

@@ -42,10 +42,10 @@ def annotate(
         port: The first port to try.
         quiet: Show no progress.
     """
-    from torchface.workflows.annotate import prepare_annotation, write_proposals
+    from torchface.workflows.annotate_video import prepare_annotation, write_proposals
 
     if browser:
-        from torchface.viz.browser.page import import_viser
+        from torchface.viz.browser.browser_page import import_viser
 
         import_viser()
     with steps(quiet) as step:
@@ -54,7 +54,7 @@ def annotate(
             from torchface import zoo
             from torchface.errors import NameMismatchError
             from torchface.landmarks import LandmarkTrees
-            from torchface.landmarks.tracking import LandmarkTracker, track_landmarks
+            from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
 
             model = zoo.get_model(landmarks)
             if not isinstance(model, LandmarkTrees):
@@ -71,7 +71,7 @@ def annotate(
         for path in write_proposals(annotation):
             print(path)
         return
-    from torchface.viz.browser.annotating import AnnotationSession
+    from torchface.viz.browser.annotation_session import AnnotationSession
     from torchface.viz.browser.landmark_editor import LandmarkEditor
 
     session = AnnotationSession(annotation.frames, annotation.folder, annotation.saved)

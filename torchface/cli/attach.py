@@ -47,7 +47,7 @@ def attach(
             uncertain.
         quiet: Show no progress.
     """
-    from torchface.workflows.attach import attach as find_sites
+    from torchface.workflows.attach_markers import attach as find_sites
     from torchface.workflows.marker_input import MarkerOptions
 
     with steps(quiet) as step:

@@ -31,8 +31,8 @@ def calibrate(
         square: A square's side, millimetres.
         quiet: Show no progress.
     """
-    from torchface.workflows.calibrate import Board
-    from torchface.workflows.calibrate import calibrate as run
+    from torchface.workflows.calibrate_camera import Board
+    from torchface.workflows.calibrate_camera import calibrate as run
 
     match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", corners.strip())
     if match is None:

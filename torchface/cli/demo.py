@@ -32,8 +32,8 @@ def demo(
         seed: Decides the random head, the noise and the gaps.
         quiet: Show no progress.
     """
-    from torchface.workflows.demo import run_demo, scene_from
-    from torchface.workflows.demo_page import result_rows, scene_rows, write_demo_page
+    from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
+    from torchface.workflows.demo.main_job import run_demo, scene_from
 
     with steps(quiet) as step:
         step("preparing head and take")

@@ -136,9 +136,9 @@ def video_solver(
     """
     from torchface.errors import FileFormatError
     from torchface.io import load_rig, load_take
-    from torchface.io.cameras import load_calibration
+    from torchface.io.camera_files import load_calibration
     from torchface.onnx import export_video_solver
-    from torchface.workflows.track_models import load_priors
+    from torchface.workflows.track.track_models import load_priors
 
     with steps(quiet) as step:
         step("reading rig, camera and priors")

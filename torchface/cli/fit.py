@@ -59,7 +59,7 @@ def fit(
         quiet: Show no progress.
     """
     from torchface.modeling import FitSettings
-    from torchface.workflows.fit import fit_photographs
+    from torchface.workflows.fit.photograph_rig import fit_photographs
     from torchface.workflows.rig_names import naming_lines
 
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)

@@ -21,7 +21,7 @@ def info(
         attachment: Report which shapes of the rig these markers tell apart.
         part: Look at this region of the rig only, such as face.
     """
-    from torchface.workflows.describe import describe
+    from torchface.workflows.describe_file import describe
 
     table = Table(title=str(path), show_header=False)
     for row in describe(path, attachment, part):

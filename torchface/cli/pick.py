@@ -44,11 +44,11 @@ def pick(
     """
     from torchface.errors import FileFormatError
     from torchface.io import load_mesh, load_rig
-    from torchface.io.ict_facekit import region
+    from torchface.io.rigs.ict_facekit import region
     from torchface.mesh import Mesh, submesh
     from torchface.rig import BlendshapeRig
+    from torchface.viz.browser.browser_page import import_viser
     from torchface.viz.browser.landmark_sets import IBUG_68, TWELVE, free_set
-    from torchface.viz.browser.page import import_viser
     from torchface.viz.browser.picker import Picker
 
     def read() -> Mesh | BlendshapeRig:

@@ -55,8 +55,8 @@ def register(
             knows of heads does not slide along the scan.
         quiet: Show no progress.
     """
-    from torchface.registration.corpus_record import CorpusEntry
-    from torchface.workflows.register import register_scans
+    from torchface.registration.corpus.scan_record import CorpusEntry
+    from torchface.workflows.register_scans import register_scans
 
     columns = (
         TextColumn("{task.description}"),

@@ -37,8 +37,8 @@ def render(
         quiet: Show no progress.
     """
     from torchface.rendering.compositing import save_picture
-    from torchface.viz.faces import clay_colors, face_views
-    from torchface.workflows.pose import load_posed, pose_weights
+    from torchface.viz.figures.face_views import clay_colors, face_views
+    from torchface.workflows.posed_mesh import load_posed, pose_weights
 
     with steps(quiet) as step:
         step("reading")

@@ -40,7 +40,7 @@ def retarget(
         part: Keep this region of the target rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface.workflows.retarget import retarget_weights
+    from torchface.workflows.retarget_weights import retarget_weights
 
     with steps(quiet) as step:
         done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, step)

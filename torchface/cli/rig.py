@@ -62,8 +62,8 @@ def rig(
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         quiet: Show no progress.
     """
-    from torchface.workflows.pose import pose_weights
-    from torchface.workflows.rig import RigOptions, rig_actor
+    from torchface.workflows.posed_mesh import pose_weights
+    from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
     from torchface.workflows.rig_names import naming_lines
 
     options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names)

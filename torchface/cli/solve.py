@@ -76,9 +76,9 @@ def solve(
         quiet: Show no progress.
     """
     from torchface.errors import FileFormatError, ValueRangeError
-    from torchface.workflows.head_camera import HeadCamera
     from torchface.workflows.marker_input import MarkerOptions
-    from torchface.workflows.solve import SolveSettings, solve_take
+    from torchface.workflows.solve.head_camera import HeadCamera
+    from torchface.workflows.solve.solve_take import SolveSettings, solve_take
 
     if labels is not None and labels.suffix.lower() == ".toml":
         raise FileFormatError(f"{labels}: found TOML, expected a .csv; labels of a video go to --video-labels")

@@ -61,7 +61,7 @@ def track(
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
-    from torchface.workflows.track import TrackSettings
+    from torchface.workflows.track.track_video import TrackSettings
 
     if (video is None) == (live is None):
         found = "neither" if video is None else "both"
@@ -76,8 +76,8 @@ def track(
 
 
 def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> None:
-    from torchface.workflows.track import TrackSettings, track_video
-    from torchface.workflows.track_page import write_track_page
+    from torchface.workflows.track.track_page import write_track_page
+    from torchface.workflows.track.track_video import TrackSettings, track_video
 
     assert isinstance(settings, TrackSettings)
     with _bars(quiet) as progress:
@@ -104,8 +104,8 @@ def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> N
 def _live(
     camera: str, rig: Path, address: str, out: Path | None, settings: object, seconds: float | None, quiet: bool
 ) -> None:
-    from torchface.workflows.live_track import track_live
-    from torchface.workflows.track import TrackSettings
+    from torchface.workflows.live.live_track import track_live
+    from torchface.workflows.track.track_video import TrackSettings
 
     assert isinstance(settings, TrackSettings)
     with _bars(quiet) as progress:

@@ -34,8 +34,8 @@ def transfer(
         quiet: Show no progress.
     """
     from torchface.io import load_mesh, load_rig, save_rig
-    from torchface.modeling.transfer import transfer_with_report
-    from torchface.workflows.rig import check_out
+    from torchface.modeling.rigging.transfer import transfer_with_report
+    from torchface.workflows.rig.actor_rig import check_out
     from torchface.workflows.rig_names import naming_lines, renamed
 
     check_out(out)

@@ -31,8 +31,8 @@ def view(
         quiet: Show no progress.
     """
     from torchface.io import load_detail_maps, load_rig, load_take
-    from torchface.viz.browser.page import import_viser
-    from torchface.viz.browser.viewer import RigViewer
+    from torchface.viz.browser.browser_page import import_viser
+    from torchface.viz.browser.rig_viewer import RigViewer
 
     import_viser()  # what is missing should be said before a large rig is read
     if out is None:

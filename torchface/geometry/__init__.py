@@ -1,0 +1,1 @@
+"""What meshes, cameras and rotations compute of themselves; no room below knows of faces, files or learning."""

@@ -1,14 +1,11 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
-from torchface.io.cameras import load_calibration, save_calibration
+from torchface.io.camera_files import load_calibration, save_calibration
 from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation
-from torchface.io.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
-from torchface.io.images import load_image, save_image, save_image16
-from torchface.io.landmarks import load_landmark_points, save_pts
-from torchface.io.mesh_sequence import MeshSequence, MeshSequenceWriter
-from torchface.io.meshes import load_mesh, save_mesh
-from torchface.io.normal_maps import load_normal_map, save_normal_map
-from torchface.io.picks import (
+from torchface.io.images.image_files import load_image, save_image, save_image16
+from torchface.io.images.normal_map_files import load_normal_map, save_normal_map
+from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
+from torchface.io.landmarks.picks import (
     Correspondences,
     LandmarkVertices,
     load_correspondences,
@@ -16,9 +13,12 @@ from torchface.io.picks import (
     save_correspondences,
     save_landmarks,
 )
-from torchface.io.rig_folder import load_obj_folder
-from torchface.io.rigs import load_rig, save_rig
-from torchface.io.takes import load_take, save_take
+from torchface.io.mesh_files import load_mesh, save_mesh
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io.rig_files import load_rig, save_rig
+from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
+from torchface.io.rigs.rig_folder import load_obj_folder
+from torchface.io.take_files import load_take, save_take
 
 __all__ = [
     "Correspondences",

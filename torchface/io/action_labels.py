@@ -11,7 +11,7 @@ from typing import Any
 import tomli_w
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files import read_file, write_file
+from torchface.files.whole_files import read_file, write_file
 
 _FORMAT = "torchface.action_labels/1"
 _LARGEST_TEXT = 2**22

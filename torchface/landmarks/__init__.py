@@ -1,27 +1,34 @@
 """Landmarks on faces: in pictures, and on scans unwrapped into UV space."""
 
-from torchface.landmarks.annotations import ScanAnnotation, load_annotations, save_annotations
-from torchface.landmarks.appearance import AppearanceFit, AppearanceModel, AppearanceSettings
-from torchface.landmarks.contours import Contour, TraceSettings, trace_contour
-from torchface.landmarks.correspondences import AutomaticLandmarks, LandmarkPairs, contour_correspondences
-from torchface.landmarks.cylinder import CylinderLayout, UnwrappedHead, unwrap
-from torchface.landmarks.detector_files import load_detector, save_detector
-from torchface.landmarks.detector_settings import DetectorSettings
-from torchface.landmarks.face_box import FaceBoxes, HaarDetector, NoFaceError, YuNetDetector, find_face, find_faces
-from torchface.landmarks.face_frame import FaceFrame
-from torchface.landmarks.relief import relief
-from torchface.landmarks.scan import ScanLandmarks, appearance_image, line_image, scan_landmarks
-from torchface.landmarks.tracking import (
+from torchface.landmarks.images.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
+from torchface.landmarks.images.face_box import (
+    FaceBoxes,
+    HaarDetector,
+    NoFaceError,
+    YuNetDetector,
+    find_face,
+    find_faces,
+)
+from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.tracking import (
     LandmarkTracker,
     TrackedFace,
     find_landmarks,
     landmark_jitter,
     track_landmarks,
 )
-from torchface.landmarks.tree_training import TreeSettings
-from torchface.landmarks.trees import LandmarkTrees
-from torchface.landmarks.twelve import TWELVE, twelve_from_ibug
-from torchface.landmarks.uv import UVLandmarkDetector, UVLandmarks
+from torchface.landmarks.images.tree_training import TreeSettings
+from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
+from torchface.landmarks.scans.curvature_image import relief
+from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
+from torchface.landmarks.scans.detector_files import load_detector, save_detector
+from torchface.landmarks.scans.detector_settings import DetectorSettings
+from torchface.landmarks.scans.face_frame import FaceFrame
+from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs, contour_correspondences
+from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
+from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, appearance_image, line_image, scan_landmarks
+from torchface.landmarks.scans.twelve_landmarks import TWELVE, twelve_from_ibug
+from torchface.landmarks.scans.uv_detector import UVLandmarkDetector, UVLandmarks
 
 __all__ = [
     "TWELVE",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface import __version__
 from torchface.errors import ValueRangeError
 from torchface.modeling import ExpressionRegression
-from torchface.onnx.checked import ExportReport, write_checked
+from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 
 _PARITY = 1e-3  # millimetres

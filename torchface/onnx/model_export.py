@@ -13,14 +13,14 @@ from torchface.capture.video import VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkTrees, UVLandmarkDetector
 from torchface.modeling import ExpressionRegression, HeadModel
-from torchface.onnx.checked import ExportReport
-from torchface.onnx.dynamics_prior import export_dynamics_prior
+from torchface.onnx.checked_export import ExportReport
+from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.expression_graph import export_expression_regression
-from torchface.onnx.head_decoder import export_head_decoder
-from torchface.onnx.landmark_bank import export_landmark_bank
-from torchface.onnx.landmark_trees import export_landmark_trees
-from torchface.onnx.solver_export import SolverReport, export_marker_solver
-from torchface.onnx.video_export import VideoReport, write_video_solver
+from torchface.onnx.head_decoder_graph import export_head_decoder
+from torchface.onnx.landmark_trees_graph import export_landmark_trees
+from torchface.onnx.solver_graph_export import SolverReport, export_marker_solver
+from torchface.onnx.uv_landmark_graph import export_landmark_bank
+from torchface.onnx.video_graph_export import VideoReport, write_video_solver
 
 
 def export_model(

@@ -9,8 +9,8 @@ import torch
 
 from torchface import __version__
 from torchface.onnx.graph_builder import GraphBuilder
-from torchface.onnx.hybrid import HybridGraph
-from torchface.onnx.solver import NEWTON_START, SolverGraph, stretches
+from torchface.onnx.hybrid_graph import HybridGraph
+from torchface.onnx.solver_graph import NEWTON_START, SolverGraph, stretches
 from torchface.optim.splitting import RELAXATION
 
 

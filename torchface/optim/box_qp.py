@@ -11,7 +11,7 @@ from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.implicit import BoxSolution
-from torchface.optim.prepared import Prepared
+from torchface.optim.prepared_tensors import Prepared
 from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 
 # Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve

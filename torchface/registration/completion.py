@@ -7,8 +7,8 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torchface.geometry.alignment import similarity_transform
-from torchface.geometry.operators import edges, triangle_areas
+from torchface.geometry.meshes.operators import edges, triangle_areas
+from torchface.geometry.similarity import similarity_transform
 from torchface.optim.sparse import SparseCholesky
 
 _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles

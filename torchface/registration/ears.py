@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchface.geometry.operators import components, vertex_normals
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.files import read_file
-from torchface.io.landmarks import load_landmark_points
-from torchface.io.lengths import millimetres_per
-from torchface.io.picks import load_correspondences
+from torchface.files.whole_files import read_file
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io.landmarks.picks import load_correspondences
+from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
-from torchface.registration.preparation import Landmarks
+from torchface.registration.scan_preparation import Landmarks
 
 ENDINGS = (".ljson", ".json", ".pts")
 _METRES = (".glb", ".gltf")

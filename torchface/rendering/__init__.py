@@ -1,0 +1,1 @@
+"""Rays against meshes, and images of meshes, lights and paint."""

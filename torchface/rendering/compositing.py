@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.files import make_folder, write_file
+from torchface.files.whole_files import make_folder, write_file
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.camera import Camera
+from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.shading import sample_texture
 
 FARTHEST = 100_000.0
 """Millimetres; a light 100 m away shines from one direction: the directional limit."""

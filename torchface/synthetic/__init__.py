@@ -1,7 +1,7 @@
 """A performer made by code: head, identities, expressions, skin."""
 
-from torchface.synthetic.head import head
-from torchface.synthetic.identity import IDENTITY, IdentityParameter, draw_identities
-from torchface.synthetic.performer import performer
+from torchface.synthetic.head.identity import IDENTITY, IdentityParameter, draw_identities
+from torchface.synthetic.head.neutral_head import neutral_head
+from torchface.synthetic.head.performer import performer
 
-__all__ = ["IDENTITY", "IdentityParameter", "draw_identities", "head", "performer"]
+__all__ = ["IDENTITY", "IdentityParameter", "draw_identities", "neutral_head", "performer"]

@@ -1,11 +1,11 @@
 """What time does to signals: smoothing and filtering along frames."""
 
-from torchface.temporal.adaptive import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
-from torchface.temporal.bridging import bridged, nearest_rows
+from torchface.temporal.adaptive_kalman import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
+from torchface.temporal.gap_filling import bridged, nearest_rows
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
 from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
-from torchface.temporal.smoothing import savitzky_golay
+from torchface.temporal.savitzky_golay import savitzky_golay
 
 __all__ = [
     "AdaptiveFilter",

@@ -13,7 +13,7 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.io import load_take
-from torchface.io.label_maps import load_label_map
+from torchface.io.markers.label_maps import load_label_map
 from torchface.take import Take, Track
 
 _SHOWN = 6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from torchface.geometry.normal_maps import DetailMaps
+from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, arkit_sources
 

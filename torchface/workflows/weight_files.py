@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchface.errors import NameMismatchError
-from torchface.files import make_folder
-from torchface.io.live_link import not_in_live_link, save_live_link
-from torchface.io.weights import save_weights_csv
+from torchface.files.whole_files import make_folder
+from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
+from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take
 

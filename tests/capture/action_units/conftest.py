@@ -10,9 +10,9 @@ import torch
 from torchface.capture.action_units import GROUPS, ActionUnitClassifier, RegionVideo, read_regions
 from torchface.capture.action_units.classifier import group_regions
 from torchface.synthetic import draw_identities
-from torchface.synthetic.action_performance import PerformanceSettings
-from torchface.synthetic.camera_stage import FilmedSession, StageSettings, film_session
-from torchface.synthetic.helmet_camera import CameraFlaws
+from torchface.synthetic.stages.action_performance import PerformanceSettings
+from torchface.synthetic.stages.camera_stage import FilmedSession, StageSettings, film_session
+from torchface.synthetic.stages.helmet_camera import CameraFlaws
 
 SIZE = 40
 

@@ -20,16 +20,16 @@ from torchface.capture.action_units import (
     load_shape_table,
     read_regions,
 )
-from torchface.capture.action_units.evaluation import cross_validation, level_agreement
+from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
+from torchface.capture.action_units.classifier_training import TrainingSettings, label_group
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.intensity_labels import intensity_levels
+from torchface.capture.action_units.intensity_smoothing import smooth_intensities
 from torchface.capture.action_units.one_vs_one import OneVsOne
-from torchface.capture.action_units.smoothing import smooth_intensities
-from torchface.capture.action_units.training import TrainingSettings, label_group
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
-from torchface.synthetic.action_performance import MOVES
-from torchface.synthetic.camera_stage import FilmedSession
+from torchface.synthetic.stages.action_performance import MOVES
+from torchface.synthetic.stages.camera_stage import FilmedSession
 
 
 def planted(session: FilmedSession, units: tuple[str, ...]) -> torch.Tensor:

@@ -7,9 +7,9 @@ import torch
 from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver
 from torchface.capture.action_units import RegionVideo, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
-from torchface.synthetic.action_performance import MOVES
-from torchface.synthetic.camera_stage import FilmedSession, stage_markers
-from torchface.synthetic.marker_stage import record
+from torchface.synthetic.stages.action_performance import MOVES
+from torchface.synthetic.stages.camera_stage import FilmedSession, stage_markers
+from torchface.synthetic.stages.marker_stage import record
 
 LED = ("4", "9", "6+43", "18L")
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from torchface.capture.action_units import RegionVideo, read_regions
-from torchface.capture.action_units.alignment import aligned_grid, neutral_flow
 from torchface.capture.action_units.local_warps import local_warps
 from torchface.capture.action_units.pattern import otsu_threshold, pattern_levels
+from torchface.capture.action_units.pattern_flow import aligned_grid, neutral_flow
 from torchface.capture.action_units.regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
-from torchface.synthetic.camera_stage import FilmedSession
+from torchface.synthetic.stages.camera_stage import FilmedSession
 
 
 def test_a_region_of_its_own_size_is_a_cut() -> None:

@@ -9,7 +9,7 @@ import pytest
 from torchface import load_take, save_rig, zoo
 from torchface.capture.action_units import ActionUnitClassifier
 from torchface.cli import main
-from torchface.synthetic.camera_stage import FilmedSession
+from torchface.synthetic.stages.camera_stage import FilmedSession
 
 
 def test_the_video_leads_what_markers_hardly_see(

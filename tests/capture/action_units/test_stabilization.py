@@ -10,9 +10,9 @@ import torch
 from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import AlignmentError, ShapeError
-from torchface.synthetic.camera_stage import SIDE_MARKERS, FilmedSession
-from torchface.synthetic.filmed_head import MARKER_RADIUS
-from torchface.synthetic.helmet_camera import HELMET_POINT, helmet_camera
+from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, FilmedSession
+from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
+from torchface.synthetic.stages.helmet_camera import HELMET_POINT, helmet_camera
 
 
 def test_points_are_followed_through_the_shake(session: FilmedSession) -> None:

@@ -18,10 +18,10 @@ from torchface.capture.priors import (
     unlearned,
     windows_of,
 )
-from torchface.capture.priors.student import PARTING_VARIANCE
+from torchface.capture.priors.student_t import PARTING_VARIANCE
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mapping
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.weight_curves import perform
 
 NAMES = ("browInnerUp", "eyeBlinkLeft", "jawOpen", "cheekPuff", "tongueOut")
 SPLIT = ("jawOpen", "browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "cheekPuff")

@@ -19,8 +19,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from torchface.capture.priors import ShapePrior
 from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
-from torchface.capture.video.landmark_smoothing import LandmarkFilter, filter_landmarks, smooth_landmarks
-from torchface.capture.video.pose import (
+from torchface.capture.video.head_pose import (
     PoseSettings,
     PoseTracker,
     filter_poses,
@@ -28,13 +27,14 @@ from torchface.capture.video.pose import (
     smooth_poses,
     track_pose,
 )
+from torchface.capture.video.landmark_smoothing import LandmarkFilter, filter_landmarks, smooth_landmarks
 from torchface.capture.video.pose_filter import PoseFilterSettings
-from torchface.geometry.calibration import CameraCalibration
-from torchface.geometry.distortion import undistort
-from torchface.geometry.pnp import solve_pnp
-from torchface.geometry.robust_pnp import robust_pnp
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import undistort
+from torchface.geometry.cameras.pnp import solve_pnp
+from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix
-from torchface.onnx.video_export import filmed
+from torchface.onnx.video_graph_export import filmed
 from torchface.synthetic import performer
 from torchface.temporal import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.quaternions import filter_rotations, smooth_rotations

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchface.capture.video.landmark_smoothing import LandmarkFilter, filter_landmarks, smooth_landmarks
 from torchface.errors import ShapeError
-from torchface.geometry.calibration import assumed_calibration
-from torchface.geometry.pnp import pixel_jacobian
+from torchface.geometry.cameras.calibration import assumed_calibration
+from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_take
 from torchface.synthetic import performer

@@ -12,23 +12,23 @@ from torch import Tensor
 
 from torchface.capture.video.lighting import LightFit, estimate_light
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
-from torchface.geometry.calibration import CameraCalibration
-from torchface.geometry.camera import Camera
-from torchface.geometry.distortion import undistort
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import undistort
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import load_rig
 from torchface.io.video import open_video
 from torchface.mesh import Mesh
-from torchface.modeling.photo_texture import photo_texture
+from torchface.modeling.photographs.texture_projection import photo_texture
+from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight, in_camera_frame, irradiance, lit_by, vertex_albedo
 from torchface.rendering.raycast import RayCaster
-from torchface.rendering.visibility import shown_in
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.light_stage import LightStageSettings, film_under_light, lit_picture, turning_cameras
-from torchface.synthetic.performance import perform
+from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light, lit_picture, turning_cameras
+from torchface.synthetic.stages.weight_curves import perform
 
 STAGE = LightStageSettings(width=200, height=200, samples=1)
 

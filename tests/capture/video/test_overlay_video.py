@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.capture.video.overlay import overlay_video
+from torchface.capture.video.painted_video import overlay_video
 from torchface.errors import ShapeError
 from torchface.io.video import open_video
 from torchface.rendering.point_light import PointLight
 from torchface.synthetic import performer
-from torchface.synthetic.light_stage import LightStageSettings, LitFilm, film_under_light
+from torchface.synthetic.stages.light_stage import LightStageSettings, LitFilm, film_under_light
 
 LIGHT = PointLight(torch.full((3,), 0.3), torch.full((3,), 0.6), torch.tensor([-500.0, -200, 0]))
 BLUE = torch.tensor([0.0, 0.0, 1.0, 1.0])[:, None, None].expand(4, 16, 16)

@@ -10,10 +10,10 @@ import torch
 from torchface.capture.priors import ShapePrior
 from torchface.capture.video import VideoSolver
 from torchface.io import load_rig, load_take, save_animation
-from torchface.io.ict_facekit import load_identity_modes
+from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel, fit_images
+from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_picture, sheet
-from torchface.rendering.shading import render
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 

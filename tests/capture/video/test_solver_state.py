@@ -13,7 +13,7 @@ from torchface import zoo
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.onnx.video_export import filmed
+from torchface.onnx.video_graph_export import filmed
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 

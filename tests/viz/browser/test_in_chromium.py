@@ -15,10 +15,10 @@ from torch import Tensor
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
+from torchface.viz.browser.browser_page import SCALE
 from torchface.viz.browser.landmark_sets import free_set
-from torchface.viz.browser.page import SCALE
 from torchface.viz.browser.picker import Picker
-from torchface.viz.browser.viewer import RigViewer
+from torchface.viz.browser.rig_viewer import RigViewer
 
 pytestmark = pytest.mark.browser
 

@@ -13,9 +13,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchface.io.landmarks import load_landmark_points
-from torchface.landmarks.annotated_frames import AnnotatedFrame
-from torchface.viz.browser.annotating import AnnotationSession
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.landmarks.images.annotated_frames import AnnotatedFrame
+from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.viz.browser.landmark_editor import LandmarkEditor
 
 pytestmark = pytest.mark.browser

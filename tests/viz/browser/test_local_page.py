@@ -13,7 +13,7 @@ from torchface.errors import MissingExtraError, NameMismatchError, ValueRangeErr
 from torchface.io import load_take
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.viz.browser.viewer import RigViewer
+from torchface.viz.browser.rig_viewer import RigViewer
 
 on_linux = pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux who listens at which address")
 

@@ -6,12 +6,12 @@ import torch
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
 from torchface.io import load_mesh, load_rig
-from torchface.io.picks import load_correspondences, load_landmarks
+from torchface.io.landmarks.picks import load_correspondences, load_landmarks
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.landmark_sets import IBUG_68, TWELVE, free_set
-from torchface.viz.browser.picking import PickSession, SurfacePoint
-from torchface.viz.browser.saving import save_picks
+from torchface.viz.browser.pick_saving import save_picks
+from torchface.viz.browser.pick_session import PickSession, SurfacePoint
 
 EARS = free_set(["chin", "left ear", "right ear"])
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.synthetic.performance import GESTURES, perform
-from torchface.viz.browser.viewer import RigViewer
+from torchface.synthetic.stages.weight_curves import GESTURES, perform
+from torchface.viz.browser.rig_viewer import RigViewer
 
 FOLDER = os.environ.get("TORCHFACE_PICTURES")
 _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"

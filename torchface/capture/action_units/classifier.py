@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one import OneVsOne
-from torchface.capture.action_units.regions import GROUPS, RegionGroup
+from torchface.capture.action_units.regions import RegionGroup
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
 
 if TYPE_CHECKING:
-    from torchface.capture.action_units.region_video import RegionVideo
-    from torchface.capture.action_units.training import TrainingSettings
-    from torchface.io.action_labels import ActionLabels
+    pass
 
 _LARGEST = 4096
 _MOST_CLASSES = 256  # there is a plane for every two
@@ -99,6 +97,9 @@ class ActionUnitClassifier(nn.Module):
     Source: thesis 4.1.10 to 4.1.12.
     """
 
+    fit: ClassVar[Callable[..., ActionUnitClassifier]]
+    """:func:`torchface.capture.action_units.fit_classifier`, bound where this package begins."""
+
     neutral: Tensor
 
     def __init__(self, groups: Sequence[RegionGroup], sizes: Sequence[GroupSize], size: int) -> None:
@@ -149,20 +150,6 @@ class ActionUnitClassifier(nn.Module):
             groups.append(RegionGroup(str(entry.get("name")), *names))
             sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2, _MOST_CLASSES)))
         return cls(groups, sizes, _whole(config, "size", 8))
-
-    @classmethod
-    def fit(
-        cls,
-        videos: Sequence[RegionVideo],
-        labels: Sequence[ActionLabels],
-        groups: Sequence[RegionGroup] = GROUPS,
-        settings: TrainingSettings | None = None,
-        say: Callable[[str], None] | None = None,
-    ) -> ActionUnitClassifier:
-        """Learns from performed action units; see :func:`torchface.capture.action_units.fit_classifier`."""
-        from torchface.capture.action_units.training import TrainingSettings, fit_classifier  # it builds this class
-
-        return fit_classifier(videos, labels, groups, settings or TrainingSettings(), say)
 
     def group_classifiers(self) -> list[GroupClassifier]:
         """One a group."""

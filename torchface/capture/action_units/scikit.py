@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from torchface.extras import import_extra
+from torchface.files.extra_packages import import_extra
 
 
 def scikit(module: str) -> ModuleType:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files import read_file, write_file
+from torchface.files.whole_files import read_file, write_file
 
 _FORMAT = "torchface.action_unit_shapes/1"
 _LARGEST_TEXT = 2**20

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.rest_pose import pose_of_take, solve_weights
-from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
 # fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, swaps and gaps included; those of another head's rig,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.markers.marker_solver import MarkerSolver
 
 # What a report prints of each confusion, and how many of them; the tuples hold all.
 _SHOWN_SHAPES, _SHOWN_CONFUSIONS = 4, 8

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchface.capture.energy import marker_term
 from torchface.capture.markers.surface_motion import with_one
 from torchface.errors import AlignmentError
-from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.optim import BoxQP
 
 _ON_A_LINE = 1e-2

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchface.capture.markers.solve import MarkerSolver
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import ShapeError
 
 ACTIVE = 0.01

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.geometry.operators import components, vertex_normals
+from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.rig import BlendshapeRig
 
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
 from torchface.capture.markers.rest_pose import check_spread, pose_of_take
-from torchface.capture.markers.solve import MarkerSolver, check_labels
 from torchface.errors import ValueRangeError
-from torchface.geometry.alignment import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 

@@ -6,11 +6,12 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
 from torchface.capture.priors.gaussian_process import (
     Evidence,
     GaussianProcesses,
@@ -19,13 +20,10 @@ from torchface.capture.priors.gaussian_process import (
     posterior,
     whitening_of,
 )
-from torchface.capture.priors.motion import motion_basis, moving_parts, windows_of
+from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts, windows_of
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.extras import import_extra
-
-if TYPE_CHECKING:
-    from torchface.capture.priors.dynamics import DynamicsPrior, DynamicsSettings
+from torchface.files.extra_packages import import_extra
 
 _FOLDS = 4  # of a single take
 _STEP = 0.1  # of Adam
@@ -60,19 +58,45 @@ class _Part:
         return self.following - self.windows[:, -1] - (self.windows * coefficients).sum(1)
 
 
-def learn(
+def fit_dynamics_prior(
     takes: Sequence[Tensor],
-    names: tuple[str, ...],
-    window: int,
-    groups: tuple[tuple[int, ...], ...],
-    fps: float,
-    input_noise: float,
-    settings: DynamicsSettings,
-    progress: Callable[[str], None],
+    names: Sequence[str],
+    window: int = 4,
+    *,
+    fps: float = 60.0,
+    groups: Sequence[Sequence[int]] | None = None,
+    input_noise: float = 0.0,
+    settings: DynamicsSettings | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> DynamicsPrior:
-    """See ``DynamicsPrior.fit``."""
-    from torchface.capture.priors.dynamics import DynamicsPrior
+    """Learns from takes; what cannot be known from a take itself is judged on takes left out in turn.
 
+    The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). How far the
+    processes are trusted, and the noise, are such that takes that were left out are predicted best; of a single
+    take its quarters are left out.
+
+    Args:
+        takes: weights of each take, (T,N), all at one frame rate (see ``resampled``); windows with a NaN are left
+            out.
+        names: of the N shapes.
+        window: J, at least 1.
+        fps: frames a second of the takes.
+        groups: :func:`face_regions` if absent.
+        input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
+            for windows of solved weights should expect as much noise as these have, or it locks their errors in.
+        settings: of the learning.
+        progress: told what is being done.
+
+    Raises:
+        ShapeError: no takes, of another number of shapes, or too short for the window.
+        ValueRangeError: no window without a NaN, or a setting out of range.
+        MissingExtraError: gpytorch is not installed.
+
+    Source: thesis 4.2.10 and the appendix "Learning the prior".
+    """
+    names, settings = tuple(names), settings or DynamicsSettings()
+    regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
+    say = progress or (lambda line: None)
     import_gpytorch()
     _check(takes, names, window, fps, input_noise)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -92,8 +116,8 @@ def learn(
     inducing, some = everything[order[: settings.inducing]], order[: settings.subset]
     kernels: list[Kernel] = []
     chosen: list[CrossValidated] = []
-    for number, group in enumerate(groups):
-        progress(f"process {number + 1} of {len(groups)}")
+    for number, group in enumerate(regions):
+        say(f"process {number + 1} of {len(regions)}")
         looked_at = torch.zeros_like(feature_scale)
         looked_at[:, list(group)] = 1.0
         kernels.append(
@@ -101,10 +125,10 @@ def learn(
         )
         targets = [part[:, list(group)] for part in unseen]
         chosen.append(cross_validated(kernels[-1], inducing, inputs, targets, max(settings.memory * fps, 1.0)))
-    progress("noise")
+    say("noise")
     told, known = torch.zeros_like(steps), torch.zeros_like(steps)
-    weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in groups]
-    for group, one, row in zip(groups, chosen, weights, strict=True):
+    weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in regions]
+    for group, one, row in zip(regions, chosen, weights, strict=True):
         told[:, list(group)], known[:, list(group)] = one.mean, one.variance[:, None]
         row[:, list(group)] = one.posterior.weights
     moving = torch.cat([moving_parts(part.windows, motion) for part, motion in zip(parts, motions, strict=True)])
@@ -113,14 +137,14 @@ def learn(
         (torch.cat(unseen) - told) * target_scale,
         known * target_scale.square(),
         moving.square().mean(0).sqrt().clamp(min=_SMALLEST),
-        groups,
+        regions,
         settings.floor,
     )
     return (
         DynamicsPrior(
             names,
             window,
-            groups,
+            regions,
             GaussianProcesses.stacked(
                 [replace(one.posterior, weights=row) for one, row in zip(chosen, weights, strict=True)], kernels
             ),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.landmarks.mean_shift import mean_shift
+from torchface.optim.mean_shift import mean_shift
 
 _LARGEST = 2**28
 _SAMPLE = 1000

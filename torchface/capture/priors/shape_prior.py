@@ -13,7 +13,7 @@ from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.learned_names import name_matrices, require_same_names
 from torchface.capture.priors.parzen import ParzenDensity
-from torchface.capture.priors.student import PARTING_VARIANCE, StudentDensity
+from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.silhouette import LevelCurves, level_curves, outermost
+from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves, outermost
 from torchface.rig import BlendshapeRig
 
 LANDMARKS = 68

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchface.capture.video.belief import Belief, Expectation
 from torchface.capture.video.reprojection import HeadState
+from torchface.capture.video.state_estimate import Belief, Expectation
 from torchface.errors import ValueRangeError
 
 

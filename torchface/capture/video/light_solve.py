@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.video.seen_skin import SeenSkin
+from torchface.capture.video.skin_samples import SeenSkin
 from torchface.rendering.color_space import to_srgb
 from torchface.rendering.point_light import FARTHEST
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video.light_solve import LampFit, find_lamp, information
-from torchface.capture.video.seen_skin import SeenSkin, seen_skin
+from torchface.capture.video.skin_samples import SeenSkin, seen_skin
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.calibration import CameraCalibration
-from torchface.geometry.camera import Camera
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.pinhole import Camera
 from torchface.rendering.point_light import PointLight
 
 __all__ = ["LightFit", "PointLight", "estimate_light"]

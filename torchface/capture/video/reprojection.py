@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.video.face_points import JAW, FacePoints
-from torchface.geometry.pnp import pixel_jacobian
+from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.rotations import rotation_matrix
 
 

@@ -1,8 +1,8 @@
 """glTF 2.0 with morph targets, read from whoever wrote it and written for whoever reads it."""
 
-from torchface.io.gltf.detail import load_detail_maps
-from torchface.io.gltf.reading import read_gltf_mesh, read_gltf_rig
-from torchface.io.gltf.writing import ShapeMatch, save_animation, save_gltf_mesh, write_gltf_rig
+from torchface.io.gltf.gltf_reading import read_gltf_mesh, read_gltf_rig
+from torchface.io.gltf.gltf_writing import ShapeMatch, save_animation, save_gltf_mesh, write_gltf_rig
+from torchface.io.gltf.wrinkle_maps import load_detail_maps
 
 __all__ = [
     "ShapeMatch",

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from torchface.errors import FileFormatError
-from torchface.files import read_file, write_file
+from torchface.files.whole_files import read_file, write_file
 
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _LARGEST_JSON = 2**26

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.part_colors.surfaces import Surface
 from torchface.io.gltf.primitives import decode_srgb
-from torchface.io.gltf.surfaces import Surface
-from torchface.io.images import encode_png
-from torchface.io.region_materials import SKIN
+from torchface.io.gltf.region_materials import SKIN
+from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh
 
 _LINEAR, _MIPMAPS = 9729, 9987

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.part_colors.surfaces import Surface
 from torchface.io.gltf.primitives import decode_srgb
-from torchface.io.gltf.surfaces import Surface
-from torchface.io.lengths import millimetres_per
+from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
 
 STILL = 1e-4

@@ -9,7 +9,7 @@ from itertools import accumulate
 import numpy as np
 
 from torchface.io.gltf.container import Document
-from torchface.io.gltf.extras import read_mesh_count
+from torchface.io.gltf.mesh_extras import read_mesh_count
 from torchface.io.gltf.primitives import Part, filled
 from torchface.io.gltf.scene import Instance
 

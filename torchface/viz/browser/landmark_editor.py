@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from torchface.errors import TorchfaceError
-from torchface.viz.browser.annotating import AnnotationSession
+from torchface.viz.browser.annotation_session import AnnotationSession
+from torchface.viz.browser.browser_page import HOST, icon, start_server, stop_server
+from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68
-from torchface.viz.browser.listing import caption, pick_list
-from torchface.viz.browser.page import HOST, icon, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser

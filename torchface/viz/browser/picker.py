@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from torchface.errors import TorchfaceError
-from torchface.geometry.operators import vertex_normals
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-from torchface.viz.browser.head import HeadOnPage
+from torchface.viz.browser.browser_page import HOST, SCALE, frame_camera, icon, start_server, stop_server
+from torchface.viz.browser.head_mesh import HeadOnPage
+from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68, LandmarkSet
-from torchface.viz.browser.listing import caption, pick_list
-from torchface.viz.browser.page import HOST, SCALE, frame_camera, icon, start_server, stop_server
-from torchface.viz.browser.picking import PickSession, SurfacePoint
-from torchface.viz.browser.saving import save_picks
+from torchface.viz.browser.pick_saving import save_picks
+from torchface.viz.browser.pick_session import PickSession, SurfacePoint
 
 if TYPE_CHECKING:
     import viser

@@ -1,0 +1,135 @@
+"""Weights of a whole take at once: smoother where the face is slow, as high where it is fast."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.capture import MarkerSolver, WholeTakeSolver
+from torchface.capture.markers.take_smoothing import curvature
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.geometry.similarity import Similarity
+from torchface.optim import box_qp
+from torchface.synthetic.stages.marker_stage import StageFlaws, record
+
+Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
+
+
+def check_errors(performance: Performance, most: float, take: int, frames: int = 900) -> None:
+    rig, attachment, takes = performance
+    true = takes[take][:frames]
+    solver = MarkerSolver(rig, attachment)
+    whole = WholeTakeSolver(solver)
+    for missing in (0.0, 0.3):
+        flaws = StageFlaws(missing=missing)
+        markers = record(rig, attachment, true, torch.Generator().manual_seed(1), flaws).take.markers
+        assert markers is not None
+        every = 1 if missing == 0 else 10
+        error = (whole(markers.values) - true).abs().mean()
+        assert error <= most * (solver(markers.values[::every]) - true[::every]).abs().mean()
+
+
+def test_errors_on_the_performer_are_smaller(performance: Performance) -> None:
+    check_errors(performance, 0.8, 0)  # made-up curves have corners
+
+
+@pytest.mark.real
+def test_errors_on_a_real_take_are_smaller(real_capture: Performance) -> None:
+    check_errors(real_capture, 0.65, 2)
+
+
+def test_without_release_it_is_the_exact_quadratic_program(
+    small_rig: BlendshapeRig, small_attachment: Attachment
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    frames, shapes = 14, 12
+    weights = (2 * torch.rand(frames, shapes, generator=generator) - 0.7).clamp(0, 1)
+    take = record(small_rig, small_attachment, weights, generator, StageFlaws(noise=1.0)).take
+    assert take.markers is not None
+    solver = MarkerSolver(small_rig, small_attachment, ridge=0.01)
+    whole = WholeTakeSolver(solver, smoothness=5.0, release=float("inf"), sparsity=0.05)
+    markers = take.markers.values.double()
+    bend = curvature(torch.eye(frames, dtype=torch.float64))
+    energy = solver.energy(markers)
+    eye = torch.eye(shapes, dtype=torch.float64)
+    H = torch.kron(torch.eye(frames, dtype=torch.float64), energy.H) + 10 * torch.kron(bend.T @ bend, eye)
+    f = energy.f - solver.sparsity + 0.05
+    exact = box_qp(H, f.reshape(1, -1)).reshape(frames, shapes)
+    found = whole(markers)
+    torch.testing.assert_close(found, exact, rtol=0, atol=3e-3)
+    assert whole.energy(markers, found) <= whole.energy(markers, exact) + 1e-2
+
+
+def test_nothing_nearby_has_less_energy_whatever_is_hidden(
+    small_rig: BlendshapeRig, small_attachment: Attachment
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    curves = 0.5 + 0.6 * torch.sin(torch.arange(120)[:, None] / 9 + torch.arange(12))
+    flaws = StageFlaws(noise=0.5, missing=0.4)
+    take = record(small_rig, small_attachment, curves.clamp(0, 1), generator, flaws).take
+    assert take.markers is not None
+    markers = take.markers.values.double()
+    markers[50:56] = torch.nan  # frames that show nothing are bridged
+    whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment))
+    found = whole(markers)
+    assert (found[50:56] - curves.clamp(0, 1)[50:56]).abs().mean() < 0.06
+    least = whole.energy(markers, found)
+    for size in (0.003, 0.03):
+        for _ in range(10):
+            nearby = (found + size * torch.randn(found.shape, generator=generator)).clamp(0, 1)
+            assert whole.energy(markers, nearby) > least - 1e-3
+
+
+def test_a_blink_keeps_its_height(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
+    seconds = torch.arange(180) / 60
+    blink = torch.exp(-((seconds - 1.5) ** 2) / (2 * 0.04**2))
+    weights = torch.zeros(180, 12)
+    weights[:, 3] = 0.9 * blink
+    take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0)).take
+    assert take.markers is not None
+    solver = MarkerSolver(small_rig, small_attachment)
+    kept = WholeTakeSolver(solver)(take.markers.values)[:, 3].max()
+    flattened = WholeTakeSolver(solver, release=float("inf"))(take.markers.values)[:, 3].max()
+    assert kept > 0.85
+    assert kept > flattened
+
+
+def test_the_frame_rate_does_not_matter(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
+    weights = (0.5 + 0.5 * torch.sin(torch.arange(240)[:, None] / 12 + torch.arange(12))).clamp(0, 1)
+    take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0)).take
+    assert take.markers is not None
+    whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment), smoothness=100.0)
+    full, half = whole(take.markers.values, 60.0), whole(take.markers.values[::2], 30.0)
+    torch.testing.assert_close(half[5:-5], full[::2][5:-5], rtol=0, atol=0.01)
+
+
+def test_takes_by_label_in_another_space_and_bad_input(
+    small_rig: BlendshapeRig, small_attachment: Attachment, stage_space: Similarity
+) -> None:
+    weights = torch.full((20, 12), 0.3)
+    take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0)).take
+    assert take.markers is not None
+    whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment))
+    order = list(reversed(take.markers.names))
+    solved = whole.solve_take(Take(60.0, markers=take.markers.select(order))).weights
+    assert solved is not None
+    here = whole(take.markers.values)
+    torch.testing.assert_close(solved.values[..., 0], here, rtol=0, atol=1e-4)
+    elsewhere = WholeTakeSolver(MarkerSolver(small_rig, small_attachment, stage_space.inverse()))
+    torch.testing.assert_close(elsewhere(stage_space.apply(take.markers.values)), here, rtol=0, atol=5e-3)
+    with pytest.raises(NameMismatchError, match="no markers"):
+        whole.solve_take(Take(60.0))
+    with pytest.raises(NameMismatchError, match="unknown"):
+        whole.solve_take(Take(60.0, markers=Track(["unknown"], torch.zeros(2, 1, 3))))
+    with pytest.raises(ShapeError, match=r"expected \(T,40,3\)"):
+        whole(torch.zeros(2, 3, 3))
+    with pytest.raises(ValueRangeError, match="found none in any of 2 frames"):
+        whole(torch.full((2, 40, 3), torch.nan))
+    with pytest.raises(ValueRangeError, match="infinite"):
+        whole(torch.full((2, 40, 3), torch.inf))
+    with pytest.raises(ValueRangeError, match="smoothness: found -1"):
+        WholeTakeSolver(whole.markers, smoothness=-1)
+    with pytest.raises(ValueRangeError, match="fps: found 0"):
+        whole(take.markers.values, 0)

@@ -1,0 +1,66 @@
+"""Weights that an animated file plays are those that were written, at the rate that was meant."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+from rig_samples import sheet_rig, sheet_take
+
+from torchface.errors import FileFormatError
+from torchface.io import save_animation, save_rig
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.take import Take, Track
+
+
+def edited(path: Path, change: dict) -> Path:
+    """The file with members of its one animation changed."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    root = json.loads(data[20 : 20 + length])
+    root["animations"][0].update(change)
+    text = json.dumps(root).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text + rest)
+    return path
+
+
+@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, 60.0, 120.0, 23.7])
+def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
+    rig = sheet_rig()
+    weights = torch.rand(700, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
+    save_animation(rig, Take(fps, weights=Track(rig.names, weights)), tmp_path / "take.glb")
+    found = read_gltf_weights(tmp_path / "take.glb")
+    assert found is not None
+    assert found.weights is not None
+    assert found.fps == pytest.approx(fps, rel=1e-6)
+    assert found.weights.names == rig.names
+    assert torch.equal(found.weights.values, weights)
+
+
+def test_a_rig_at_rest_plays_nothing(tmp_path: Path) -> None:
+    save_rig(sheet_rig(), tmp_path / "rig.glb")
+    assert read_gltf_weights(tmp_path / "rig.glb") is None
+
+
+def test_what_is_broken_is_named(tmp_path: Path) -> None:
+    for change, told in (
+        ({"channels": [{"sampler": 7, "target": {"node": 0, "path": "weights"}}]}, "less than 1"),
+        ({"channels": [{"sampler": 0, "target": {"node": 9, "path": "weights"}}]}, "index into the 1 nodes"),
+        ({"samplers": [{"input": 0, "output": 0}]}, "expected SCALAR"),
+        ({"channels": 3}, "an array"),
+    ):
+        save_animation(sheet_rig(), sheet_take(), tmp_path / "take.glb")
+        with pytest.raises(FileFormatError, match=told):
+            read_gltf_weights(edited(tmp_path / "take.glb", change))
+
+
+def test_mutated_animations_are_refused_or_read(tmp_path: Path) -> None:
+    save_animation(sheet_rig(), sheet_take(), tmp_path / "take.glb")
+    check_reader(read_gltf_weights, [tmp_path / "take.glb"], ".glb")

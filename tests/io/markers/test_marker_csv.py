@@ -1,0 +1,100 @@
+"""Marker CSV: the layout, round trips, broken files."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from mutation import check_reader
+from take_strategies import marker_takes, same
+
+from torchface.errors import FileFormatError
+from torchface.io.markers.marker_csv import load_markers_csv, save_markers_csv
+from torchface.take import Take
+
+_GOOD = """frame,time,nose_x,nose_y,nose_z,chin_x,chin_y,chin_z
+0,0.0,1.5,2,3,4,5,6
+1,0.02,,,,7,8,9
+2,0.04,1,2,3,4,nan,6
+"""
+
+
+@given(marker_takes())
+@settings(max_examples=40)
+def test_a_take_comes_back_to_the_bit(take: Take) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        save_markers_csv(take, Path(folder, "take.csv"))
+        back = load_markers_csv(Path(folder, "take.csv"))
+    assert take.markers is not None
+    assert back.markers is not None
+    assert back.markers.names == take.markers.names
+    assert same(back.markers.values, take.markers.values)
+    assert back.fps == take.fps
+
+
+def test_the_layout_is_read_as_documented(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text(_GOOD.replace(",chin_x", ", chin_x"), encoding="utf-8-sig")
+    take = load_markers_csv(tmp_path / "take.csv", unit="in")
+    nan = torch.nan
+    expected = [[[1.5, 2, 3], [4, 5, 6]], [[nan] * 3, [7, 8, 9]], [[1, 2, 3], [nan] * 3]]
+    assert take.fps == 50
+    assert take.markers is not None
+    assert same(take.markers.values, (torch.tensor(expected).double() * 25.4).float())
+
+
+def test_columns_are_matched_by_name(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text("frame,time,a_z,b_y,a_x,b_x,a_y,b_z\n0,0,3,20,1,10,2,30\n")
+    take = load_markers_csv(tmp_path / "take.csv")
+    assert take.markers is not None
+    assert take.markers.names == ("a", "b")
+    assert take.markers.values.tolist() == [[[1, 2, 3], [10, 20, 30]]]
+
+
+def test_dropped_frames_are_reported_and_do_not_change_the_rate(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text(_GOOD.replace("2,0.04", "5,0.1"))
+    take = load_markers_csv(tmp_path / "take.csv")
+    assert take.fps == 50
+    assert take.extras["gaps"] == ((2, 3),)
+    save_markers_csv(take, tmp_path / "again.csv")
+    assert load_markers_csv(tmp_path / "again.csv").extras["gaps"] == ((2, 3),)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("chin_y", "chin_q", r"found the columns .*expected frame,time,<label>_x"),
+        (",chin_y", "", r"found no column 'chin_y', expected it in the header"),
+        ("chin_x", "nose_x", r"found more than one column 'nose_x', expected each once"),
+        ("frame,time", "image,time", r"found the columns 'image'"),
+        ("1.5", "one", r"row 2, column 'nose_x': found 'one', expected a number"),
+        ("1.5", "1_5", r"row 2, column 'nose_x': found '1_5', expected a number"),
+        ("1.5", "-inf", r"row 2, column 'nose_x': found '-inf', expected a number"),
+        (",7,8,9", ",7,8", r"row 3: found 7 cells, expected 8"),
+        ("1,0.02", "1,0", r"found time 0.0 after 0.0, expected rising"),
+        ("1,0.02", ",0.02", r"frame 2: found no frame number or no time"),
+        ("2,0.04", "2,0.00004", r"found time .* expected rising|found 50000.0 frames a second"),
+        ("\n0,0.0,1.5,2,3,4,5,6\n1,0.02,,,,7,8,9\n2,0.04,1,2,3,4,nan,6", "", r"found a header and no rows"),
+    ],
+)
+def test_a_broken_file_is_refused_by_name(old: str, new: str, message: str, tmp_path: Path) -> None:
+    assert old in _GOOD
+    (tmp_path / "broken.csv").write_text(_GOOD.replace(old, new, 1))
+    with pytest.raises(FileFormatError, match=r"broken\.csv: " + message):
+        load_markers_csv(tmp_path / "broken.csv")
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "broken.csv").write_bytes(b"frame,time,\xff\xfe_x\n")
+    with pytest.raises(FileFormatError, match=r"broken\.csv: found bytes that are no UTF-8"):
+        load_markers_csv(tmp_path / "broken.csv")
+    (tmp_path / "broken.csv").write_bytes(b"")
+    with pytest.raises(FileFormatError, match=r"broken\.csv: found an empty file"):
+        load_markers_csv(tmp_path / "broken.csv")
+
+
+def test_a_mutated_marker_csv_is_read_or_refused(tmp_path: Path) -> None:
+    (tmp_path / "good.csv").write_text(_GOOD)
+    check_reader(load_markers_csv, [tmp_path / "good.csv"], ".csv")

@@ -1,0 +1,86 @@
+"""Mesh sequences: what is written is read, a killed writer continues, damaged files are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+from safetensors.torch import load_file, save_file
+
+from torchface.errors import FileFormatError, ShapeError, TopologyError
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+
+FACES = torch.tensor([[0, 1, 2], [2, 3, 0]])
+MESHES = torch.randn(7, 4, 3, generator=torch.Generator().manual_seed(0))
+
+
+def written(path: Path) -> Path:
+    with MeshSequenceWriter(path, 7, 4, FACES) as writer:
+        writer.append(MESHES[0])
+        writer.append(MESHES[1:])
+    return path
+
+
+def open_all(path: Path) -> None:
+    sequence = MeshSequence(path)
+    sequence.read(0, len(sequence))
+
+
+def test_what_is_written_is_read_a_few_at_a_time(tmp_path: Path) -> None:
+    sequence = MeshSequence(written(tmp_path / "heads.safetensors"))
+    assert sequence.shape == (7, 4, 3)
+    assert torch.equal(sequence.faces, FACES)
+    assert torch.equal(sequence.read(2, 5), MESHES[2:5])
+    assert torch.equal(load_file(sequence.path)["vertices"], MESHES)
+    assert [p.name for p in tmp_path.iterdir()] == ["heads.safetensors"]
+
+
+def test_a_killed_writer_continues_where_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "heads.safetensors"
+    first = MeshSequenceWriter(path, 7, 4, FACES, key="a")
+    first.append(MESHES[:3])
+    assert not path.exists()
+    with (tmp_path / "heads.safetensors.part").open("ab") as part:
+        part.write(b"half a mesh")
+    with MeshSequenceWriter(path, 7, 4, FACES, key="a") as second:
+        assert second.done == 3
+        second.append(MESHES[3:])
+    assert MeshSequence(path).key == "a"
+    assert torch.equal(MeshSequence(path).read(0, 7), MESHES)
+    MeshSequenceWriter(path, 7, 4, FACES, key="a").append(MESHES[:3])
+    assert MeshSequenceWriter(path, 7, 4, FACES, key="b").done == 0  # made of something else
+
+
+def test_other_meshes_are_refused(tmp_path: Path) -> None:
+    with MeshSequenceWriter(tmp_path / "heads.safetensors", 2, 4, FACES) as writer:
+        with pytest.raises(TopologyError, match=r"found \(5, 3\), expected \(4, 3\)"):
+            writer.append(torch.zeros(5, 3))
+        with pytest.raises(ShapeError, match="more than the 2"):
+            writer.append(MESHES)
+
+
+def test_other_files_are_named(tmp_path: Path) -> None:
+    path = written(tmp_path / "heads.safetensors")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-4])
+    with pytest.raises(FileFormatError, match=r"heads\.safetensors"):
+        MeshSequence(path)
+    path.write_bytes(whole)
+    sequence = MeshSequence(path)
+    path.write_bytes(whole[:-4])
+    with pytest.raises(FileFormatError, match=r"heads\.safetensors"):
+        sequence.read(0, 1)
+    save_file({"vertices": MESHES, "faces": FACES + 3}, path)
+    with pytest.raises(FileFormatError, match="beyond the 4"):
+        MeshSequence(path)
+    save_file({"vertices": MESHES.double(), "faces": FACES}, path)
+    with pytest.raises(FileFormatError, match="F64"):
+        MeshSequence(path)
+    with pytest.raises(FileFormatError, match="no such file"):
+        MeshSequence(tmp_path / "none")
+
+
+def test_a_mutated_sequence_is_read_or_refused(tmp_path: Path) -> None:
+    check_reader(open_all, [written(tmp_path / "heads.safetensors")], ".safetensors")

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+from rig_samples import quad_sheet, sheet_rig
+
+from torchface.errors import FileFormatError, NameMismatchError, TopologyError
+from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io import load_normal_map, load_rig, save_mesh, save_rig
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+
+def save_folder(rig: BlendshapeRig, folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    save_mesh(rig.neutral, folder / "Face_Neutral.obj")
+    for name, delta in zip(rig.names, rig.deltas, strict=True):
+        save_mesh(rig.neutral.with_vertices(rig.neutral.vertices + delta), folder / f"{name}.obj")
+
+
+def test_a_folder_of_obj_files_is_a_rig(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_folder(rig, tmp_path / "rig")
+    found = load_rig(tmp_path / "rig")
+    assert found.names == tuple(sorted(rig.names))
+    assert (found.deltas - rig.select(found.names).deltas).abs().max() < 1e-4
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.uv_faces, rig.neutral.uv_faces)
+    assert found.neutral.texture is not None
+    assert load_rig(tmp_path / "rig", shapes=["jawOpen"]).names == ("jawOpen",)
+    assert load_rig(tmp_path / "rig", unit="cm").deltas[1].allclose(found.deltas[1] * 10, atol=1e-3)
+
+
+def test_the_neutral_is_the_one_that_is_named(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_folder(rig, tmp_path / "rig")
+    other = load_rig(tmp_path / "rig", neutral="jawOpen")
+    assert other.names == ("Face_Neutral", "eyeBlinkRight", "mouthSmileLeft")
+    assert (other.deltas[0] + rig.deltas[0]).abs().max() < 1e-4
+    with pytest.raises(FileFormatError, match=r"4 OBJ files, of them neutral: rest; expected one neutral"):
+        load_rig(tmp_path / "rig", neutral="rest")
+    shutil.copy(tmp_path / "rig" / "jawOpen.obj", tmp_path / "rig" / "neutral_2.obj")
+    with pytest.raises(FileFormatError, match=r"of them neutral: Face_Neutral, neutral_2; expected one neutral"):
+        load_rig(tmp_path / "rig")
+    with pytest.raises(NameMismatchError, match="no shape 'smile'"):
+        load_rig(tmp_path / "rig", neutral="Face_Neutral", shapes=["smile"])
+
+
+def test_shapes_that_do_not_fit_the_neutral_are_named(tmp_path: Path) -> None:
+    rig, mesh = sheet_rig(), quad_sheet()
+    save_folder(rig, tmp_path / "rig")
+    path = tmp_path / "rig" / "jawOpen.obj"
+    save_mesh(Mesh(torch.cat([mesh.vertices, mesh.vertices[:1]]), mesh.faces), path)
+    with pytest.raises(TopologyError, match=r"jawOpen.obj: found 31 vertices, expected the 30 of the neutral mesh"):
+        load_rig(tmp_path / "rig")
+    save_mesh(Mesh(mesh.vertices, mesh.faces.flip(0)), path)
+    with pytest.raises(TopologyError, match=r"jawOpen.obj: found other faces than in the neutral mesh"):
+        load_rig(tmp_path / "rig")
+    # The same triangles written without texture coordinates are the same topology.
+    save_mesh(Mesh(mesh.vertices + 1, mesh.faces), path)
+    assert torch.allclose(load_rig(tmp_path / "rig").deltas[1], torch.ones(30, 3), atol=1e-4)
+    path.write_text(re.sub(r"^v \S+", "v nan", path.read_text(), count=1, flags=re.MULTILINE))
+    with pytest.raises(FileFormatError, match=r"jawOpen.obj: found NaN or infinity in 1 of 30 vertices, first at 0"):
+        load_rig(tmp_path / "rig")
+
+
+def test_an_empty_folder_and_a_lone_neutral_are_no_rig(tmp_path: Path) -> None:
+    (tmp_path / "rig").mkdir()
+    with pytest.raises(FileFormatError, match=r"rig: found 0 OBJ files, of them neutral: none; expected one neutral"):
+        load_rig(tmp_path / "rig")
+    save_mesh(quad_sheet(), tmp_path / "rig" / "neutral.obj")
+    with pytest.raises(FileFormatError, match=r"rig: found only the neutral neutral.obj, expected a file for each"):
+        load_rig(tmp_path / "rig")
+
+
+def load_with_this_shape(path: Path) -> BlendshapeRig:
+    """A folder of a good neutral and, as its only shape, the file at ``path``."""
+    folder = path.parent / "rig"
+    if not folder.exists():
+        folder.mkdir()
+        save_mesh(quad_sheet(), folder / "neutral.obj")
+    shutil.copy(path, folder / "shape.obj")
+    return load_rig(folder)
+
+
+def test_a_mutated_shape_is_read_or_refused(tmp_path: Path) -> None:
+    save_mesh(quad_sheet(), tmp_path / "good.obj")
+    report = check_reader(load_with_this_shape, [tmp_path / "good.obj"], ".obj")
+    assert report.read > 0
+    assert report.refused > report.cases / 4
+
+
+def test_a_written_folder_is_the_same_rig(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "actor")
+    found = load_rig(tmp_path / "actor")
+    assert found.names == rig.names  # which are not sorted
+    assert (found.deltas - rig.deltas).abs().max() < 1e-5
+    assert torch.equal(found.neutral.vertices, rig.neutral.vertices)
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.uvs[found.neutral.uv_faces], rig.neutral.uvs[rig.neutral.uv_faces])
+    assert torch.equal(found.neutral.landmarks, rig.neutral.landmarks)
+    regions = rig.neutral.annotations.regions
+    assert all(torch.equal(found.neutral.annotations.regions[name], mask) for name, mask in regions.items())
+    assert torch.equal(found.neutral.annotations.mirror, rig.neutral.annotations.mirror)
+    assert (found.neutral.texture - rig.neutral.texture).abs().max() <= 0.5 / 255 + 1e-6
+    assert [path.name for path in tmp_path.iterdir()] == ["actor"]
+
+
+def test_a_rig_is_written_into_the_folder_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    save_rig(sheet_rig(), ".")
+    assert load_rig(".").names == sheet_rig().names
+
+
+def test_wrinkle_maps_lie_beside_their_shapes(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    maps = torch.nn.functional.normalize(torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0)), dim=1)
+    save_rig(rig, tmp_path / "actor", DetailMaps(("jawOpen",), maps[:1], maps[1]))
+    for name, normals in (("jawOpen", maps[0]), ("neutral", maps[1])):
+        assert (load_normal_map(tmp_path / "actor" / f"{name}_normals.png") - normals).abs().max() < 1e-3
+    with pytest.raises(NameMismatchError, match="no shape 'frown'"):
+        save_rig(rig, tmp_path / "other", DetailMaps(("frown",), maps[:1]))
+    assert not (tmp_path / "other").exists()
+
+
+def test_shapes_that_a_rigger_adds_or_takes_away_are_heeded(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "actor")
+    (tmp_path / "actor" / "mouthSmileLeft.obj").unlink()
+    shutil.copy(tmp_path / "actor" / "jawOpen.obj", tmp_path / "actor" / "aNewOne.obj")
+    found = load_rig(tmp_path / "actor")
+    assert found.names == ("jawOpen", "eyeBlinkRight", "aNewOne")
+    save_rig(found, tmp_path / "actor")
+    with pytest.raises(
+        FileFormatError, match=r"actor: found OBJ files of another rig \(aNewOne.obj\), expected an empty"
+    ):
+        save_rig(rig, tmp_path / "actor")
+
+
+def test_names_that_make_no_files_and_other_endings_are_refused(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    for name in ("../jawOpen", "a/b", ".hidden", "Neutral", "", "nul\0"):
+        with pytest.raises(NameMismatchError, match="expected file names; write a"):
+            save_rig(BlendshapeRig(rig.neutral, rig.deltas[:1], (name,)), tmp_path / "actor")
+    with pytest.raises(
+        FileFormatError, match=r"actor.fbx: found the ending '.fbx', expected .glb, or none for a folder"
+    ):
+        save_rig(rig, tmp_path / "actor.fbx")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(FileFormatError, match="cannot be written"):
+        save_rig(rig, tmp_path / "file" / "actor")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_broken_notes_are_named(tmp_path: Path) -> None:
+    save_rig(sheet_rig(), tmp_path / "actor")
+    for text, told in (
+        ("{", "found broken JSON"),
+        ("[]", "found JSON that is no object"),
+        ('{"shapes": 3}', "shapes: found 3, expected an array"),
+        ('{"mesh": {"version": 1, "vertices": 30, "landmarks": [30]}}', "vertices 30 to 30, expected 0 to 29"),
+    ):
+        (tmp_path / "actor" / "rig.json").write_text(text)
+        with pytest.raises(FileFormatError, match=f"rig.json.*{told}"):
+            load_rig(tmp_path / "actor")
+
+
+@pytest.mark.real
+def test_a_real_rig_keeps_its_vertices_and_quads_in_a_folder(ict_folder: Path, tmp_path: Path) -> None:
+    rig = load_rig(ict_folder, shapes=["jawOpen", "eyeBlink_L"])
+    save_rig(rig, tmp_path / "ict")
+    found = load_rig(tmp_path / "ict")
+    assert found.names == rig.names
+    assert torch.equal(found.neutral.polygons, rig.neutral.polygons)
+    assert torch.equal(found.neutral.landmarks, rig.neutral.landmarks)
+    assert (found.deltas - rig.deltas).abs().max() < 1e-4

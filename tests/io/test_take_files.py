@@ -1,0 +1,82 @@
+"""load_take and save_take: which format by suffix, header, and what the take holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from mutation import check_reader
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.take_files import load_take, save_take
+from torchface.shape_names import ARKIT
+from torchface.take import Take, Track
+
+
+def _markers() -> Track:
+    return Track(("nose", "chin"), torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(0)))
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".C3D", ".trc", ".csv"])
+def test_markers_go_to_the_format_of_the_suffix(suffix: str, tmp_path: Path) -> None:
+    take = Take(100.0, markers=_markers())
+    save_take(take, tmp_path / f"take{suffix}")
+    back = load_take(tmp_path / f"take{suffix}")
+    assert torch.equal(back.markers.values, take.markers.values)  # type: ignore[union-attr]
+    in_metres = load_take(tmp_path / f"take{suffix}", unit="m")
+    torch.testing.assert_close(in_metres.markers.values, 1000 * take.markers.values)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("names", "first"), [(ARKIT, "Timecode,BlendshapeCount,EyeBlinkLeft"), (ARKIT[:-1], "frame,time,eyeBlinkLeft")]
+)
+def test_only_arkits_whole_set_becomes_a_live_link_file(names: tuple[str, ...], first: str, tmp_path: Path) -> None:
+    take = Take(60.0, weights=Track(names, torch.rand(3, len(names), 1, generator=torch.Generator().manual_seed(0))))
+    save_take(take, tmp_path / "take.csv")
+    assert (tmp_path / "take.csv").read_text().startswith(first)
+    back = load_take(tmp_path / "take.csv").weights
+    assert back is not None
+    assert [name.lower() for name in back.names] == [name.lower() for name in names]
+    assert torch.equal(back.values, take.weights.values)  # type: ignore[union-attr]
+
+
+def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> None:
+    take = Take(60.0, markers=_markers(), weights=Track(("smile",), torch.full((4, 1, 1), 0.5)))
+    save_take(take, tmp_path / "take.csv")
+    back = load_take(tmp_path / "take.csv")
+    assert back.markers is None
+    assert back.weights is not None
+    assert back.weights.names == ("smile",)
+    landmarks = Track(("nose", "chin"), torch.zeros(4, 2, 2))
+    with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of markers and landmarks, expected one"):
+        save_take(Take(60.0, markers=_markers(), landmarks=landmarks), tmp_path / "take.csv")
+    with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of no track"):
+        save_take(Take(60.0), tmp_path / "take.csv")
+    save_take(take, tmp_path / "take.c3d")
+    assert load_take(tmp_path / "take.c3d").weights is None
+
+
+def test_what_no_reader_knows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"take\.fbx: found the suffix '\.fbx', expected '\.c3d', '\.trc' or"):
+        load_take(tmp_path / "take.fbx")
+    with pytest.raises(FileFormatError, match=r"take\.fbx: found the suffix"):
+        save_take(Take(60.0, markers=_markers()), tmp_path / "take.fbx")
+    with pytest.raises(FileFormatError, match=r"take\.c3d: found no such file"):
+        load_take(tmp_path / "take.c3d")
+    (tmp_path / "take.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(FileFormatError, match=r"take\.csv: found the columns 'a', 'b'; expected Timecode"):
+        load_take(tmp_path / "take.csv")
+
+
+def test_a_mutated_csv_of_any_kind_is_read_or_refused(tmp_path: Path) -> None:
+    values = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0))
+    takes = {
+        "markers": Take(60.0, markers=_markers()),
+        "landmarks": Take(60.0, landmarks=Track(("0", "1"), values)),
+        "weights": Take(60.0, weights=Track(("jawOpen", "smile"), values[..., :1])),
+        "live_link": Take(60.0, weights=Track(ARKIT, torch.zeros(3, 52, 1))),
+    }
+    for name, take in takes.items():
+        save_take(take, tmp_path / f"{name}.csv")
+    check_reader(load_take, [tmp_path / f"{name}.csv" for name in takes], ".csv")

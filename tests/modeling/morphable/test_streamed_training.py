@@ -1,0 +1,92 @@
+"""Fitting from disk gives what fitting in memory gives, and continues when it was stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.modeling import MorphableModel
+from torchface.modeling.morphable import streamed_training as module
+from torchface.modeling.morphable.streamed_training import fit_sequence
+
+
+class InMemory:
+    """Samples that count how often they are read."""
+
+    def __init__(self, values: torch.Tensor) -> None:
+        self.values, self.shape, self.read_count = values, tuple(values.shape), 0
+
+    def read(self, begin: int, end: int) -> torch.Tensor:
+        self.read_count += 1
+        return self.values[begin:end]
+
+
+@pytest.fixture(scope="module")
+def values() -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    basis = torch.randn(30, 60, generator=generator) * torch.linspace(4, 1, 30)[:, None]
+    noise = 0.05 * torch.randn(90, 60, generator=generator)
+    return (100 + torch.randn(90, 30, generator=generator) @ basis + noise).reshape(90, 20, 3)
+
+
+@pytest.mark.parametrize("lanczos", [False, True])
+def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)  # seven blocks of 13, the last of 12
+    if lanczos:
+        monkeypatch.setattr(module, "_WHOLE_SPECTRUM", 10)
+    steps: list[tuple[int, int]] = []
+    ours = fit_sequence(InMemory(values), 10, progress=lambda *step: steps.append(step))
+    whole = MorphableModel.fit(values, 10)
+    assert (ours.components - whole.components).abs().max() < 1e-6
+    assert (ours.standard_deviations / whole.standard_deviations - 1).abs().max() < 1e-6
+    assert torch.allclose(ours.mean, whole.mean)
+    assert float(ours.total_variance) == pytest.approx(float(whole.total_variance), rel=1e-6)
+    assert ours.samples == 90
+    assert [done for done, _ in steps] == list(range(1, steps[-1][1] + 1))
+
+
+def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
+
+    def stop(done: int, total: int) -> None:
+        if done == total - 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
+    finished = sorted((tmp_path / "check").glob("gram_*.npy"))
+    assert len(finished) == 6
+    finished[1].write_bytes(finished[1].read_bytes()[:-8])  # this one is computed again
+    again, whole = InMemory(values), InMemory(values)
+    ours, theirs = fit_sequence(again, 10, tmp_path / "check"), fit_sequence(whole, 10)
+    assert again.read_count < whole.read_count - 10
+    assert torch.equal(ours.components, theirs.components)
+    assert not (tmp_path / "check").exists()
+    with pytest.raises(KeyboardInterrupt):
+        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
+    other = fit_sequence(InMemory(2 * values), 10, tmp_path / "check")
+    assert torch.allclose(other.mean, 2 * ours.mean)
+    assert torch.allclose(other.standard_deviations, 2 * ours.standard_deviations, rtol=1e-5)
+
+
+@pytest.mark.parametrize("lanczos", [False, True])
+def test_samples_that_teach_nothing_are_refused(
+    values: torch.Tensor, lanczos: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if lanczos:
+        monkeypatch.setattr(module, "_WHOLE_SPECTRUM", 10)
+    with pytest.raises(ShapeError, match="found 1, expected at least two"):
+        fit_sequence(InMemory(values[:1]), 1)
+    with pytest.raises(ValueRangeError, match="found 90, expected 1 to 89"):
+        fit_sequence(InMemory(values), 90)
+    with pytest.raises(ValueRangeError, match="all the same"):
+        fit_sequence(InMemory(values[:1].expand(40, -1, -1)), 5)
+    with pytest.raises(ValueRangeError, match="found 5, expected at most 2"):
+        fit_sequence(InMemory(values[:3].repeat(20, 1, 1)), 5)
+    broken = values.clone()
+    broken[77, 3, 0] = float("inf")
+    with pytest.raises(ValueRangeError, match="number 77 holds NaN or infinity"):
+        fit_sequence(InMemory(broken), 5)

@@ -1,0 +1,57 @@
+"""Irises planted on a head come back from its picture, and a written eyeball wears them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.io.gltf.part_colors.eyes import painted_eye
+from torchface.mesh import Mesh
+from torchface.modeling.photographs.eye_colors import iris_color, part_vertices, with_part_colors
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.synthetic import neutral_head
+
+EVEN = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
+BLUE, BROWN = torch.tensor([0.25, 0.40, 0.60]), torch.tensor([0.30, 0.19, 0.10])
+
+
+@pytest.fixture(scope="module")
+def bare() -> Mesh:
+    mesh = neutral_head(texture=False)
+    return replace(mesh, colors=torch.tensor([0.8, 0.62, 0.55]).repeat(len(mesh.vertices), 1))
+
+
+@pytest.mark.parametrize("planted", [BLUE, BROWN], ids=["blue", "brown"])
+def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
+    worn = with_part_colors(bare, planted)
+    assert worn.colors is not None
+    assert bare.colors is not None
+    skin = ~part_vertices(bare)
+    assert torch.equal(worn.colors[skin], bare.colors[skin])
+    eyes = bare.vertices[bare.landmarks[36:48]].mean(0)
+    camera = look_at(eyes, 10.0, span=160.0, width=640, height=400)
+    found = iris_color(bare, [render(worn, camera, lighting=EVEN, samples=1)], [camera])
+    assert found is not None
+    assert float((found - planted).norm()) < 0.12
+    far = look_at(eyes, 10.0, span=2000.0, width=320, height=200)
+    assert iris_color(bare, [render(worn, far, lighting=EVEN, samples=1)], [far]) is None
+
+
+def test_a_written_eyeball_wears_the_iris(bare: Mesh) -> None:
+    assert bare.annotations is not None
+    ball = bare.annotations.regions["eyeball_left"]
+    triangles = ball[bare.faces].all(1).nonzero()[:, 0]
+
+    def bluest(mesh: Mesh) -> float:
+        paints = [paint for _, _, paint in painted_eye(mesh, triangles) if paint is not None]
+        values = [paint.image.flatten(1).T if paint.image is not None else paint.colors for paint in paints]
+        colors = torch.cat([value[:, :3] for value in values if value is not None])
+        return float((colors[:, 2] - colors[:, 0]).max())
+
+    assert bluest(with_part_colors(bare, BLUE)) > 0.2
+    assert bluest(with_part_colors(bare, BROWN)) < 0.05
+    assert bluest(bare) < 0.05  # colours that are skin's all over are no painted eye

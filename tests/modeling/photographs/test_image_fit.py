@@ -1,0 +1,238 @@
+"""Planted heads come back from the landmarks that cameras see of them; what is no such landmark is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.similarity import similarity_transform
+from torchface.mesh import Mesh
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.photographs.image_fit import ImageFit, fit_images
+from torchface.modeling.photographs.image_solve import FitSettings
+from torchface.modeling.rigging.transfer import transfer_deformation
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.head.identity import anatomy
+
+SIZE = (1280, 1024)
+FIXED = FitSettings(sliding=False, contour_slide=1.0)
+EXPRESSION = {"jawOpen": 0.3, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.6, "browInnerUp": 0.5}
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A planted head and what cameras see of it."""
+
+    coefficients: Tensor
+    weights: Tensor
+    rest: Tensor
+    face: Tensor
+    cameras: list[Camera]
+    landmarks: Tensor
+
+    @property
+    def focal(self) -> float:
+        return float(self.cameras[0].intrinsics[0, 0])
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    return performer(texture=False)
+
+
+@pytest.fixture(scope="module")
+def model(rig: BlendshapeRig) -> HeadModel:
+    heads = torch.stack([anatomy(who).vertices for who in draw_identities(60, torch.Generator().manual_seed(0))])
+    return HeadModel.on(rig.neutral, MorphableModel.fit(heads.float(), 15))
+
+
+def portraits(face: Tensor, rig: BlendshapeRig) -> list[Camera]:
+    centre = face[rig.neutral.landmarks].mean(0)
+    return [look_at(centre, yaw, 3.0, span=300.0, width=SIZE[0], height=SIZE[1]) for yaw in (-40.0, 0.0, 40.0)]
+
+
+def person(
+    rig: BlendshapeRig, model: HeadModel, seed: int, noise: float = 0.5, weights: Tensor | None = None
+) -> Person:
+    """Three portraits of a head of the model, as landmarks."""
+    generator = torch.Generator().manual_seed(seed)
+    coefficients = torch.randn(model.shape.count, generator=generator)
+    if weights is None:
+        weights = torch.zeros(len(rig.names))
+        weights[rig.index(list(EXPRESSION))] = torch.tensor(list(EXPRESSION.values()))
+    rest = model.shape(coefficients[None])[0]
+    face = rest + rig(weights[None])[0] - rig.vertices
+    cameras = portraits(face, rig)
+    seen = torch.stack([camera.project(face[rig.neutral.landmarks].double()) for camera in cameras])
+    seen = seen + noise * torch.randn(seen.shape, generator=generator).double()
+    return Person(coefficients, weights, rest, face, cameras, seen)
+
+
+def aligned_error(found: Tensor, true: Tensor) -> float:
+    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
+    return float((moved - true.double()).norm(dim=-1).mean())
+
+
+@pytest.fixture(scope="module")
+def planted(rig: BlendshapeRig, model: HeadModel) -> list[tuple[Person, ImageFit]]:
+    people = [person(rig, model, seed) for seed in range(4)]
+    return [(p, fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=FIXED, transfers=0)) for p in people]
+
+
+def test_planted_heads_come_back(planted: list[tuple[Person, ImageFit]], model: HeadModel) -> None:
+    skin = model.annotations.regions["face"]
+    ours = sum(aligned_error(fit.mesh.vertices[skin], p.rest[skin]) for p, fit in planted)
+    mean = sum(aligned_error(model.shape.mean[skin], p.rest[skin]) for p, _ in planted)
+    assert ours < 0.25 * mean
+    for p, fit in planted:
+        assert float(fit.coefficients.abs().max()) <= 3.0
+        assert float(fit.weights.min()) >= 0.0
+        assert float(fit.weights.max()) <= 1.0
+        assert abs(fit.noise - 0.5) < 0.15
+        assert float(fit.errors.max()) < 1.0
+        for camera, truth in zip(fit.cameras, p.cameras, strict=True):
+            turned = (torch.trace(camera.rotation @ truth.rotation.T) - 1) / 2
+            assert math.degrees(math.acos(min(1.0, float(turned)))) < 3.0
+
+
+def test_the_mouth_opens_as_far_as_it_is_open(planted: list[tuple[Person, ImageFit]], rig: BlendshapeRig) -> None:
+    upper, lower = rig.neutral.landmarks[61:64], rig.neutral.landmarks[[67, 66, 65]]
+    for p, fit in planted:
+        found, true = ((v[upper] - v[lower]).norm(dim=-1) for v in (fit.posed.vertices, p.face))
+        assert float((found - true).mean().abs()) < 0.3
+
+
+def test_a_lopsided_smile_stays_lopsided(rig: BlendshapeRig, model: HeadModel) -> None:
+    left, right = rig.index(["mouthSmileLeft", "mouthSmileRight"])
+    weights = torch.zeros(len(rig.names))
+    weights[left] = 0.7
+    p = person(rig, model, 3, weights=weights)
+    fit = fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=FIXED, transfers=0)
+    assert float(fit.weights[left] - fit.weights[right]) > 0.5
+
+
+def test_residuals_are_what_the_cameras_see(planted: list[tuple[Person, ImageFit]], rig: BlendshapeRig) -> None:
+    p, fit = planted[0]
+    at = fit.posed.vertices[rig.neutral.landmarks].double()
+    seen = torch.stack([camera.project(at) for camera in fit.cameras])
+    torch.testing.assert_close(fit.residuals, seen - p.landmarks, rtol=0, atol=1e-2)
+
+
+def test_covariance_tells_how_far_off_coefficients_are(rig: BlendshapeRig, model: HeadModel) -> None:
+    p = person(rig, model, 5, noise=0.0)
+    settings = replace(FIXED, noise=1.0)
+    generator = torch.Generator().manual_seed(0)
+    found, told = [], []
+    for _ in range(12):
+        noisy = p.landmarks + torch.randn(p.landmarks.shape, generator=generator).double()
+        fit = fit_images(model, rig, noisy, SIZE, camera=p.focal, settings=settings, transfers=0)
+        found.append(fit.coefficients)
+        told.append(fit.covariance.diagonal()[: model.shape.count].sqrt())
+    spread, told_mean = torch.stack(found).std(0), torch.stack(told).mean(0)
+    # The posterior also counts what the prior leaves open: it may tell more than noise alone spreads, never much less.
+    assert float((spread / told_mean).mean()) < 1.1
+    assert float((spread / told_mean).mean()) > 0.4
+
+
+def test_missing_landmarks_are_left_out(rig: BlendshapeRig, model: HeadModel) -> None:
+    p = person(rig, model, 6)
+    gaps = p.landmarks.clone()
+    gaps[0, :20] = torch.nan
+    gaps[2, ::3] = torch.nan
+    skin = model.annotations.regions["face"]
+    fit = fit_images(model, rig, gaps, SIZE, camera=p.focal, settings=FIXED, transfers=0)
+    assert torch.equal(torch.isnan(fit.residuals), torch.isnan(gaps))
+    assert torch.isfinite(fit.errors).all()
+    assert aligned_error(fit.mesh.vertices[skin], p.rest[skin]) < 0.4 * aligned_error(
+        model.shape.mean[skin], p.rest[skin]
+    )
+
+
+def test_focal_lengths_are_estimated(rig: BlendshapeRig, model: HeadModel) -> None:
+    p = person(rig, model, 7)
+    settings = replace(FIXED, focal_spread=0.15)
+    fit = fit_images(model, rig, p.landmarks, SIZE, camera=1.2 * p.focal, settings=settings, transfers=0)
+    found = torch.stack([camera.intrinsics[0, 0] for camera in fit.cameras])
+    assert float((found / p.focal - 1).abs().max()) < 0.1
+    known = fit_images(model, rig, p.landmarks, SIZE, camera=6000.0, settings=FIXED, transfers=0)
+    assert all(float(camera.intrinsics[0, 0]) == 6000.0 for camera in known.cameras)
+
+
+def test_transferred_shapes_explain_a_persons_own(rig: BlendshapeRig, model: HeadModel) -> None:
+    few = rig.select(list(EXPRESSION))
+    weights = torch.tensor([list(EXPRESSION.values())])
+    skin = model.annotations.regions["face"]
+    errors = []
+    for seed in (11, 12):
+        rest = model.shape(torch.randn(1, model.shape.count, generator=torch.Generator().manual_seed(seed)))[0]
+        face = transfer_deformation(few, few.neutral.with_vertices(rest))(weights)[0]
+        cameras = portraits(face, rig)
+        seen = torch.stack([camera.project(face[rig.neutral.landmarks].double()) for camera in cameras])
+        focal = float(cameras[0].intrinsics[0, 0])
+        for turns in (0, 1):
+            fit = fit_images(model, few, seen, SIZE, camera=focal, settings=FIXED, transfers=turns)
+            errors.append(aligned_error(fit.posed.vertices[skin], face[skin]))
+    without, with_transfer = errors[0] + errors[2], errors[1] + errors[3]
+    assert with_transfer < 0.8 * without
+
+
+@pytest.fixture(scope="module")
+def seen(rig: BlendshapeRig, model: HeadModel) -> Tensor:
+    return person(rig, model, 8).landmarks
+
+
+def test_too_few_or_none(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
+    none = seen.clone()
+    none[1] = torch.nan
+    with pytest.raises(ValueRangeError, match="found none in view 1"):
+        fit_images(model, rig, none, SIZE)
+    few = seen.clone()
+    few[2, 22:] = torch.nan
+    with pytest.raises(ValueRangeError, match="found 5 on brows, eyes, nose and mouth in view 2, expected at least 6"):
+        fit_images(model, rig, few, SIZE)
+
+
+def test_pixels_of_another_picture(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
+    with pytest.raises(ValueRangeError, match="most of them outside a picture of 320 x 256"):
+        fit_images(model, rig, seen, (320, 256))
+    with pytest.raises(ValueRangeError, match="expected pixels in a picture of 1280 x 1024"):
+        fit_images(model, rig, seen / 1280, SIZE)
+
+
+def test_another_order(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
+    with pytest.raises(AlignmentError, match="iBUG's order"):
+        fit_images(model, rig, seen.flip(1), SIZE)
+    with pytest.raises(AlignmentError, match="iBUG's order"):
+        fit_images(model, rig, seen[:, torch.randperm(68, generator=torch.Generator().manual_seed(0))], SIZE)
+
+
+def test_seen_from_behind(rig: BlendshapeRig, model: HeadModel) -> None:
+    marks = rig.vertices[rig.neutral.landmarks].double()
+    camera = look_at(marks.mean(0), 170.0, span=300.0, width=SIZE[0], height=SIZE[1])
+    with pytest.raises(AlignmentError, match=r"turned by 1\d\d° in view 0, as if seen from behind"):
+        fit_images(model, rig, camera.project(marks)[None], SIZE)
+
+
+def test_wrong_shapes_and_other_topology(
+    rig: BlendshapeRig, model: HeadModel, seen: Tensor, dome_rig: BlendshapeRig
+) -> None:
+    with pytest.raises(ShapeError, match=r"landmarks: found \(3, 51, 2\), expected \(I,68,2\)"):
+        fit_images(model, rig, seen[:, 17:], SIZE)
+    with pytest.raises(ShapeError, match="for each of 3 views"):
+        fit_images(model, rig, seen, [SIZE, SIZE])
+    with pytest.raises(TopologyError, match="expected the same triangles"):
+        fit_images(model, dome_rig, seen, SIZE)
+    with pytest.raises(ValueRangeError, match="focal length of -1"):
+        fit_images(model, rig, seen, SIZE, camera=-1.0)
+    bare = Mesh(rig.vertices, rig.neutral.faces)
+    plain, plain_rig = HeadModel.on(bare, model.shape), BlendshapeRig(bare, rig.deltas, rig.names)
+    with pytest.raises(ValueRangeError, match="landmark_vertices: found none"):
+        fit_images(plain, plain_rig, seen, SIZE)

@@ -1,0 +1,278 @@
+"""Expressions from a neutral face: planted laws come back, pose does not matter, identity does not leak."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from sklearn.decomposition import PCA
+from sklearn.linear_model import LinearRegression, Ridge
+from torch import Tensor
+
+from torchface import BlendshapeRig, load_rig, zoo
+from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.modeling import ExpressionRegression, rig_from_neutral, transfer_deformation
+from torchface.modeling.rigging.component_choice import choose_components
+from torchface.synthetic import draw_identities, performer
+
+V = 40
+SHOWN = ["jawOpen", "mouthClose", "mouthSmileLeft"]
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def turned(points: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Points (V,3) after a large rigid move, and its rotation."""
+    rotation = torch.linalg.qr(noise(3, 3, seed=seed).double())[0]
+    rotation = (rotation * torch.linalg.det(rotation)).to(points)
+    return points @ rotation.T + torch.tensor([30.0, -400, 90]).to(points), rotation
+
+
+@pytest.fixture(scope="module")
+def performers() -> list[BlendshapeRig]:
+    """Seven heads with three shapes."""
+    identities = draw_identities(7, torch.Generator().manual_seed(4))
+    return [performer(identity, texture=False).select(SHOWN) for identity in identities]
+
+
+@pytest.fixture(scope="module")
+def people() -> tuple[Tensor, Tensor]:
+    """24 people whose two expressions are linear in four ways in which their neutrals differ; vertex 0 stays still."""
+    mean, ways = 50 * noise(V, 3), noise(4, V, 3, seed=1)
+    who = noise(24, 4, seed=2) * torch.tensor([6.0, 4, 3, 2])
+    neutrals = (mean + torch.einsum("mk,kvc->mvc", who, ways)).double()
+    law, usual = 0.2 * noise(4, 2, V, 3, seed=3), 5 * noise(2, V, 3, seed=4)
+    offsets = usual + torch.einsum("mk,knvc->mnvc", who, law)
+    offsets[:, :, 0] = 0.0
+    return neutrals, neutrals[:, None] + offsets
+
+
+def test_a_planted_law_comes_back_on_new_people(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    model = ExpressionRegression.fit(neutrals[:20], expressions[:20])
+    found = model(neutrals[20:])
+    assert found.shape == (4, 2, V, 3)
+    left = (found - expressions[20:]).norm(dim=-1).mean()
+    of_mean = (expressions - neutrals[:, None])[:20].mean(0)
+    assert left < 0.05 * (neutrals[20:, None] + of_mean - expressions[20:]).norm(dim=-1).mean()
+
+
+def test_what_never_moves_stays_exactly(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    model = ExpressionRegression.fit(neutrals, expressions)
+    assert len(model.places) == 2 * (V - 1)
+    assert torch.equal(model(neutrals.float())[:, :, 0], neutrals.float()[:, None, 0].expand(-1, 2, -1))
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.1])
+def test_agrees_with_scikit_learn(people: tuple[Tensor, Tensor], ridge: float) -> None:
+    neutrals, expressions = people
+    expressions = expressions + 0.5 * noise(*expressions.shape, seed=5)
+    neutrals = neutrals + 0.5 * noise(*neutrals.shape, seed=6)
+    model = ExpressionRegression.fit(neutrals[:20], expressions[:20], 6, 5, ridge, region=torch.ones(V) > 0)
+    # The reference is told the people as they are laid together, the rest is its own.
+    laid = neutrals.clone()
+    for i in range(len(neutrals)):
+        pose = model_pose(model, neutrals[i])
+        laid[i] = neutrals[i] @ pose.T
+        expressions[i] = expressions[i] @ pose.T
+    X = laid.flatten(1) - laid.reshape(len(laid), V, 3).mean(1).repeat(1, V)
+    offsets = (expressions - laid[:, None]).flatten(1)
+    inner, outer = PCA(6).fit(X[:20]), PCA(5).fit(offsets[:20])
+    scores = inner.transform(X[:20])
+    strength = ridge * (scores**2).sum() / 6
+    line = (Ridge(strength, fit_intercept=False) if ridge else LinearRegression(fit_intercept=False)).fit(
+        scores, outer.transform(offsets[:20])
+    )
+    expected = torch.from_numpy(outer.inverse_transform(line.predict(inner.transform(X[20:]))))
+    found = torch.stack([model.offsets(laid[i : i + 1])[0] for i in range(20, 24)]).flatten(1)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+
+
+def model_pose(model: ExpressionRegression, neutral: Tensor) -> Tensor:
+    """The rotation that lays a neutral onto the model's mean, by Kabsch's method."""
+    a, b = neutral - neutral.mean(0), model.neutral_mean.double() - model.neutral_mean.double().mean(0)
+    u, _, vh = torch.linalg.svd(b.T @ a)
+    return u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vh))]).double()) @ vh
+
+
+def test_the_head_may_have_any_pose(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    model = ExpressionRegression.fit(neutrals, expressions)
+    moved, rotation = turned(neutrals[3])
+    expected = model.offsets(neutrals[3:4]) @ rotation.T
+    torch.testing.assert_close(model.offsets(moved[None]), expected, rtol=0, atol=1e-9)
+    # Nor need those have the same pose whom it learns from.
+    pairs = [turned(torch.cat([n[None], e]), seed)[0] for seed, (n, e) in enumerate(zip(*people, strict=True))]
+    mixed = ExpressionRegression.fit(torch.stack([p[0] for p in pairs]), torch.stack([p[1:] for p in pairs]))
+    torch.testing.assert_close(mixed.offsets(neutrals[3:4]), model.offsets(neutrals[3:4]), rtol=0, atol=1e-3)
+
+
+def test_gradients_go_through(people: tuple[Tensor, Tensor]) -> None:
+    model = ExpressionRegression.fit(*people, 3, 3).double()
+    neutral = people[0][:1].clone().requires_grad_()
+    weight = noise(1, 2, V, 3, seed=9).double()
+    assert torch.autograd.gradcheck(lambda n: (model(n) * weight).sum(), neutral, atol=1e-4, rtol=1e-3)
+
+
+def test_the_first_form_of_the_thesis_leaks_identity(performers: list[BlendshapeRig]) -> None:
+    """Equation 31: nothing should move behind the ears in a smile, but the head that comes back is another's."""
+    neutrals = torch.stack([rig.vertices for rig in performers])
+    smiles = torch.stack([rig.select(["mouthSmileLeft"])(torch.ones(1, 1)) for rig in performers])
+    left = {}
+    for form in ("offsets", "expressions"):
+        model = ExpressionRegression.fit(neutrals[:6], smiles[:6], form=form)
+        still = (smiles - neutrals[:, None]).abs().amax((0, 1, 3)) == 0
+        left[form] = (model(neutrals[6:]) - neutrals[6:, None])[0, 0, still].norm(dim=-1).mean()
+    assert left["offsets"] == 0
+    assert left["expressions"] > 0.5
+
+
+def test_components_are_chosen_as_one_by_one_would_choose(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    offsets = (expressions - neutrals[:, None] + 0.5 * noise(*expressions.shape, seed=8)).flatten(1)[:9]
+    inputs = (neutrals + noise(*neutrals.shape, seed=7)).flatten(1)[:9]
+    for ridge in (0.0, 0.1):
+        errors = torch.zeros(7, 7, dtype=torch.float64)
+        for i in range(9):
+            rest = torch.arange(9) != i
+            mean, middle = inputs[rest].mean(0), offsets[rest].mean(0)
+            inner = torch.linalg.svd(inputs[rest] - mean, full_matrices=False)[2]
+            outer = torch.linalg.svd(offsets[rest] - middle, full_matrices=False)[2]
+            for k in range(7):
+                scores = (inputs[rest] - mean) @ inner[: k + 1].T
+                gram = scores.T @ scores
+                gram = gram + ridge * gram.diagonal().mean() * torch.eye(k + 1)
+                line = torch.linalg.solve(gram, scores.T @ (offsets[rest] - middle))
+                told = ((inputs[i] - mean) @ inner[: k + 1].T) @ line
+                for j in range(7):
+                    error = middle + told @ outer[: j + 1].T @ outer[: j + 1] - offsets[i]
+                    errors[k, j] += error.square().sum()
+        found = choose_components(inputs, offsets, ridge=ridge)
+        k, j = divmod(int(errors.argmin()), 7)
+        assert (found.inputs, found.outputs) == (k + 1, j + 1)
+        assert abs(found.error - float(errors.min())) < 1e-6 * float(errors.min())
+        fixed = choose_components(inputs, offsets, 3, 2, ridge)
+        assert abs(fixed.error - float(errors[2, 1])) < 1e-6 * float(errors[2, 1])
+
+
+def test_what_is_chosen_predicts_better_than_too_many(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    seen = neutrals + 2.0 * noise(24, V, 3, seed=6)
+    shown = seen[:, None] + (expressions - neutrals[:, None]) + 2.0 * noise(*expressions.shape, seed=5)
+    error = {}
+    for name, asked in {"chosen": (None, None, None), "default": (14, 13, 0.0)}.items():
+        model = ExpressionRegression.fit(seen[:16], shown[:16], *asked)
+        error[name] = (model.offsets(seen[16:]) - (expressions - neutrals[:, None])[16:]).square().sum()
+    assert error["chosen"] < 0.8 * error["default"]
+
+
+def test_a_rig_is_predicted_where_it_can_be_and_transferred_elsewhere(performers: list[BlendshapeRig]) -> None:
+    learned = ["mouthSmileLeft", "jawOpen"]
+    neutrals = torch.stack([rig.vertices for rig in performers[:6]])
+    faces = torch.stack([rig.select(learned)(torch.eye(2)) for rig in performers[:6]])
+    topology = performers[0].neutral.fingerprint()
+    model = ExpressionRegression.fit(neutrals, faces, names=learned, topology=topology)
+    template = performer(texture=False).select(SHOWN)
+    made = rig_from_neutral(model, template, performers[6].neutral)
+    assert made.names == tuple(SHOWN)
+    transferred = transfer_deformation(template, performers[6].neutral)
+    assert torch.equal(made.deltas[1], transferred.deltas[1])
+    predicted = model.offsets(performers[6].vertices[None])[0]
+    assert torch.equal(made.deltas[[2, 0]], predicted)
+    whole = rig_from_neutral(model, template.select(learned), performers[6].neutral)
+    assert torch.equal(whole.deltas, predicted)
+
+    with pytest.raises(TopologyError, match="topology"):
+        rig_from_neutral(
+            model, template, replace(performers[6].neutral, faces=performers[6].neutral.faces.flip(1), polygons=None)
+        )
+    with pytest.raises(NameMismatchError, match="found a regression of mouthSmileLeft"):
+        rig_from_neutral(model, template.select(["mouthClose"]), performers[6].neutral)
+
+
+def test_a_rig_of_other_names_is_predicted_too(performers: list[BlendshapeRig]) -> None:
+    """Other spellings are the same shapes; the halves of a whole add up to it, and split it as transfer does."""
+    names = ("jawOpen", "mouthClose", "mouthSmileLeft")
+    neutrals = torch.stack([rig.vertices for rig in performers])
+    shown = torch.stack([rig.vertices + rig.select(names).deltas for rig in performers])
+    model = ExpressionRegression.fit(neutrals[:6], shown[:6], names=names)
+    template = performers[0].select(names)
+    left = template.vertices[:, 0] < 0
+    lips = template.deltas[1]
+    halves = torch.stack([torch.where(left[:, None], lips, 0.0), torch.where(left[:, None], 0.0, lips)])
+    other = BlendshapeRig(
+        template.neutral,
+        torch.cat([template.deltas[[2, 0]], halves]),
+        ("mouthSmile_L", "JawOpen", "mouthClose_L", "mouthClose_R"),
+    )
+    made = rig_from_neutral(model, other, performers[6].neutral)
+    whole = rig_from_neutral(model, template, performers[6].neutral)
+    assert made.names == other.names
+    torch.testing.assert_close(made.deltas[:2], whole.deltas[[2, 0]])
+    torch.testing.assert_close(made.deltas[2:].sum(0), whole.deltas[1], rtol=0, atol=1e-3)
+    middle = template.vertices[:, 0].abs() > 8
+    assert made.deltas[2][middle & ~left].norm(dim=1).max() < 0.05 * whole.deltas[1].norm(dim=1).max()
+
+
+def test_saved_and_loaded(people: tuple[Tensor, Tensor], tmp_path: Path) -> None:
+    model = ExpressionRegression.fit(*people, names=["smile", "frown"])
+    zoo.save_model(model, tmp_path / "m", licence="MIT", data="noise", metrics={}, recipe="")
+    again = zoo.get_model(tmp_path / "m")
+    assert again.names == ("smile", "frown")
+    assert torch.equal(again(people[0]), model(people[0]))
+
+
+def test_awkward_people(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    few = ExpressionRegression.fit(neutrals[:3], expressions[:3])
+    assert (len(few.neutral_components), len(few.offset_components)) == (2, 2)
+    twice = ExpressionRegression.fit(neutrals[:3].repeat(2, 1, 1), expressions[:3].repeat(2, 1, 1, 1))
+    torch.testing.assert_close(twice(neutrals[:2]), few(neutrals[:2]), rtol=0, atol=1e-3)
+    alike = ExpressionRegression.fit(neutrals, neutrals[:, None] + noise(1, 2, V, 3).double())
+    assert len(alike.offset_components) <= 13
+    still = ExpressionRegression.fit(neutrals, neutrals[:, None])
+    assert torch.equal(still(neutrals), neutrals[:, None])
+
+
+def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
+    neutrals, expressions = people
+    fit = ExpressionRegression.fit
+    with pytest.raises(ShapeError, match=r"found \(1,40,3\)|at least two people"):
+        fit(neutrals[:1], expressions[:1])
+    with pytest.raises(ShapeError, match=r"expected \(24,N,40,3\)"):
+        fit(neutrals, expressions[:, :, 1:])
+    with pytest.raises(ShapeError, match="three at least"):
+        fit(neutrals[:2], expressions[:2], None)
+    with pytest.raises(ValueRangeError, match="expressions: 1 of 24 hold NaN"):
+        fit(neutrals, torch.where(torch.arange(24).view(24, 1, 1, 1) == 3, torch.nan, expressions))
+    with pytest.raises(ValueRangeError, match="all the same"):
+        fit(neutrals[:1].expand(5, -1, -1), expressions[:5])
+    with pytest.raises(NameMismatchError, match="found 1, expected one for each of 2"):
+        fit(neutrals, expressions, names=["smile"])
+    with pytest.raises(NameMismatchError, match="distinct"):
+        fit(neutrals, expressions, names=["smile", "smile"])
+    with pytest.raises(ValueRangeError, match="ridge: found -1"):
+        fit(neutrals, expressions, ridge=-1.0)
+    with pytest.raises(ValueRangeError, match="neutral_components: found 0"):
+        fit(neutrals, expressions, 0)
+    with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
+        fit(neutrals, expressions)(neutrals[:, 1:])
+
+
+@pytest.mark.real
+def test_real_heads_get_the_shapes_that_they_have(ict_folder: Path) -> None:
+    """ICT's shapes are the same for every identity: whatever head comes, it gets them."""
+    from torchface.io.rigs.ict_facekit import load_identity_modes
+
+    rig: BlendshapeRig = load_rig(ict_folder, part="face").select(["mouthSmile_L", "jawOpen"])
+    modes = load_identity_modes(ict_folder, 10, part="face").deltas
+    heads = rig.vertices + torch.einsum("mk,kvc->mvc", noise(12, 10), modes)
+    model = ExpressionRegression.fit(heads[:10], heads[:10, None] + rig.deltas, names=rig.names)
+    made = rig_from_neutral(model, rig, rig.neutral.with_vertices(heads[11]))
+    moved = rig.deltas.norm(dim=-1).max()
+    assert (made.deltas - rig.deltas).norm(dim=-1).max() < 0.05 * moved

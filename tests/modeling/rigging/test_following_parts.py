@@ -1,0 +1,143 @@
+"""Parts inside a head: how far they stand out, where they belong in a new head, and shapes that keep them in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.mesh import Mesh
+from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
+from torchface.modeling.rigging.penetration import TOLERANCE
+from torchface.modeling.rigging.shape_transfer import ShapeTransfer
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.identity import IDENTITY
+from torchface.synthetic.head.performer import performer
+
+MOVED = torch.tensor([1.5, -1.0, -2.5])
+
+
+def sphere(radius: float, rings: int = 24, opening: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Vertices and triangles of a ball about z, open in front within ``opening`` radians of the axis."""
+    polar = torch.linspace(max(opening, 0.02), torch.pi - 0.02, rings, dtype=torch.float64)
+    turn = torch.arange(2 * rings, dtype=torch.float64) * (torch.pi / rings)
+    a, b = torch.meshgrid(polar, turn, indexing="ij")
+    vertices = radius * torch.stack([a.sin() * b.cos(), a.sin() * b.sin(), a.cos()], dim=-1).view(-1, 3)
+    columns = 2 * rings
+    row, column = torch.meshgrid(torch.arange(rings - 1) * columns, torch.arange(columns), indexing="ij")
+    beside = (column + 1) % columns
+    first = torch.stack([row + column, row + columns + column, row + columns + beside], dim=-1)
+    second = torch.stack([row + column, row + columns + beside, row + beside], dim=-1)
+    return vertices, torch.cat([first.view(-1, 3), second.view(-1, 3)])
+
+
+def ball_in_a_head() -> BlendshapeRig:
+    """A ball of 12 mm behind a skin of 20 mm with a hole in front; the shape moves it 9.5 mm sideways, through."""
+    skin, skin_faces = sphere(20.0, 40, opening=0.5)
+    ball, ball_faces = sphere(12.0)
+    vertices = torch.cat([skin, ball])
+    delta = torch.zeros_like(vertices)
+    delta[len(skin) :, 0] = 9.5
+    out = torch.zeros_like(vertices)
+    out[len(skin) :, 2] = 9.5
+    mesh = Mesh(vertices, torch.cat([skin_faces, ball_faces + len(skin)]))
+    return BlendshapeRig(mesh, torch.stack([delta, out]), ["through", "out"])
+
+
+def test_a_ball_stands_out_by_what_it_came_through_the_skin_and_not_by_what_a_hole_shows() -> None:
+    rig = ball_in_a_head()
+    parts = inner_parts(rig)
+    assert len(parts.vertices) == 48 * 24
+    assert parts.hard.all()
+    rest, through, out = shape_depths(rig, parts)
+    assert float(rest.max()) == 0
+    assert float(through.max()) == pytest.approx(1.5, abs=0.1)
+    found = through[through > 0]
+    assert len(found) > 10
+    # 1.5 mm beyond the rim of the hole is air, with no skin behind it.
+    assert float(out.max()) == 0
+
+
+def test_bone_that_comes_through_pushes_the_skin_out_and_shapes_without_fault_stay_as_they_are() -> None:
+    rig = ball_in_a_head()
+    parts = inner_parts(rig)
+    moving = BlendshapeRig(rig.neutral, rig.deltas + 0.02, rig.names)
+    cleared = clear_parts(moving, parts)
+    assert float(shape_depths(moving, parts)[1].max()) > 1
+    assert float(shape_depths(cleared, parts)[1].max()) <= TOLERANCE
+    assert torch.equal(cleared.deltas[1], moving.deltas[1])
+    ball = parts.vertices
+    assert torch.equal(cleared.deltas[:, ball], moving.deltas[:, ball])
+
+
+def eyes(rig: BlendshapeRig, parts: InnerParts, mesh: Mesh) -> tuple[Tensor, Tensor]:
+    """Centres (2,3) and radii (2,) of the eyeballs."""
+    places = [mesh.vertices[parts.vertices[parts.group == k]].double() for k in (0, 1)]
+    centres = torch.stack([place.mean(0) for place in places])
+    radii = torch.stack([(place - place.mean(0)).norm(dim=-1).mean() for place in places])
+    return centres, radii
+
+
+def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
+    """What the registration of a scan that shows no eyeballs leaves of them does not matter."""
+    template = performer(texture=False)
+    parts = inner_parts(template)
+    assert parts.group.bincount().tolist() == [314, 314]
+    assert torch.equal(place_parts(template, template.neutral, parts).vertices, template.vertices)
+    generator = torch.Generator().manual_seed(4)
+    for _ in range(3):
+        true = performer(torch.randn(len(IDENTITY), generator=generator), texture=False).neutral
+        spoiled = true.vertices.clone()
+        balls = parts.vertices
+        spoiled[balls] = MOVED + template.vertices[balls] * torch.tensor([1.0, 0.8, 1.2])
+        placed = place_parts(template, true.with_vertices(spoiled), parts)
+        wanted, radius = eyes(template, parts, true)
+        found, found_radius = eyes(template, parts, placed)
+        assert float((found - wanted).norm(dim=-1).max()) < 1.5
+        assert float((found_radius / radius - 1).abs().max()) < 0.05
+        skin = parts.label == parts.body
+        assert float((placed.vertices - true.vertices)[skin].norm(dim=-1).max()) < 0.5
+        _, template_radius = eyes(template, parts, template.neutral)
+        sphere_error = (placed.vertices[balls] - found.float()[parts.group]).norm(dim=-1)
+        own_error = (template.vertices[balls] - eyes(template, parts, template.neutral)[0].float()[parts.group]).norm(
+            dim=-1
+        )
+        assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 1e-3
+
+
+@pytest.mark.real
+def test_shells_stay_behind_the_closed_lids_of_random_heads(ict_folder: Path) -> None:
+    names = ["eyeBlink_L", "eyeBlink_R"]
+    template = load_ict_facekit(ict_folder, names)
+    parts = inner_parts(template)
+    regions = template.neutral.annotations.regions  # type: ignore[union-attr]
+    hard = {name for name, mask in regions.items() if bool(mask[parts.vertices[parts.hard]].any())}
+    assert hard == {"gums_and_tongue", "teeth", "eyeball_left", "eyeball_right", "eye_blend_left", "eye_blend_right"}
+    assert parts.group.unique().tolist() == [0, 1, 2]
+    modes = load_identity_modes(ict_folder)
+    for seed in (0, 1):
+        head = modes.random_head(seed)
+        job = ShapeTransfer(template, head, 30.0)
+        before = job.rig(template, head, job.transfer())
+        after = transfer_with_report(template, head).rig
+        assert float(shape_depths(before, parts).max()) > 2 * TOLERANCE
+        assert float(shape_depths(after, parts).max()) <= TOLERANCE
+
+
+@pytest.mark.real
+def test_parts_that_registration_left_before_the_lips_go_behind_them(ict_folder: Path) -> None:
+    template = load_ict_facekit(ict_folder, ["jawOpen", "eyeBlink_L"])
+    parts = inner_parts(template)
+    head = load_identity_modes(ict_folder).random_head(2)
+    spoiled = head.vertices.clone()
+    spoiled[parts.vertices] += torch.tensor([0.0, 1.0, 9.0])
+    target = replace(head, vertices=spoiled)
+    assert float(parts.depth(spoiled).max()) > 1
+    placed = place_parts(template, target, parts)
+    assert float(parts.depth(placed.vertices).max()) <= TOLERANCE
+    moved = (placed.vertices - head.vertices)[parts.vertices[parts.hard]]
+    assert float(moved.norm(dim=-1).mean()) < 3.0

@@ -1,0 +1,255 @@
+"""A corpus is registered as its scans one by one would be, whatever is bad among them and whenever it is killed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.errors import FileFormatError, MissingExtraError, ShapeError, TopologyError, ValueRangeError
+from torchface.io import load_mesh, save_mesh
+from torchface.io.landmarks.picks import Correspondences, save_correspondences
+from torchface.mesh import Mesh
+from torchface.registration import Level, Schedule, Stage, register
+from torchface.registration.corpus.register_corpus import CorpusReport, find_scans, register_corpus
+from torchface.registration.corpus.scan_record import CorpusEntry
+from torchface.registration.landmark_files import load_scan_landmarks
+
+SHORT = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
+COUNT = 5
+
+
+@pytest.fixture(scope="module")
+def template(make_mask: Callable[[int, int], Mesh]) -> Mesh:
+    return make_mask(17, 23)
+
+
+@pytest.fixture(scope="module")
+def scans(
+    template: Mesh,
+    warp: Callable[[torch.Tensor], torch.Tensor],
+    moved: Callable[..., torch.Tensor],
+    rescanned: Callable[..., Mesh],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A folder of scans in random poses with LJSON landmarks beside them, and ``bad.ply``, which is none."""
+    folder = tmp_path_factory.mktemp("scans")
+    for i in range(COUNT):
+        true = moved(warp(template.vertices), i)
+        save_mesh(rescanned(template.with_vertices(true), i), folder / f"s{i}.ply")
+        points = {"points": true[template.landmarks].tolist()}
+        (folder / f"s{i}.ljson").write_text(json.dumps({"version": 2, "labels": [], "landmarks": points}))
+    (folder / "bad.ply").write_bytes(b"junk")
+    return folder
+
+
+def run(template: Mesh, scans: Path, out: Path, **more: object) -> CorpusReport:
+    return register_corpus(template, [scans], out, landmarks=scans, schedule=SHORT, texture_size=0, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def done(template: Mesh, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> CorpusReport:
+    return run(template, scans, tmp_path_factory.mktemp("done"))
+
+
+def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans: Path, done: CorpusReport) -> None:
+    assert [entry.name for entry in done.registered] == [f"s{i}" for i in range(COUNT)]
+    for entry in done.registered[:2]:
+        assert entry.result is not None
+        landmarks = load_scan_landmarks(scans / f"{entry.name}.ljson", template, entry.scan)
+        alone = register(template, load_mesh(entry.scan), landmarks, schedule=SHORT)
+        found = load_mesh(entry.result)
+        torch.testing.assert_close(found.vertices.double(), alone.mesh.vertices, atol=2e-4, rtol=0)
+        assert torch.equal(found.faces, template.faces)
+        assert found.annotations is not None
+        assert torch.equal(found.landmarks, template.landmarks)
+        assert entry.median_distance == pytest.approx(alone.record.median_distance, rel=1e-6)
+
+
+def test_bad_scans_are_told_and_skipped(scans: Path, done: CorpusReport) -> None:
+    assert [entry.name for entry in done.skipped] == ["bad"]
+    assert "bad.ply" in done.skipped[0].error
+    with done.summary.open() as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    assert len(rows) == COUNT + 1
+    assert rows["bad"]["status"] == "skipped"
+    assert "no PLY header" in rows["bad"]["remarks"]
+    assert float(rows["s0"]["median_mm"]) == pytest.approx(done.registered[0].median_distance, abs=1e-4)
+    record = json.loads((done.out / "s0.json").read_text())
+    assert record["stages"][0]["stiffness"] == 8.0
+
+
+def test_only_what_has_changed_is_registered_again(
+    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+) -> None:
+    own, out = tmp_path / "scans", tmp_path / "out"
+    shutil.copytree(scans, own)
+    for i in range(2, COUNT):
+        (own / f"s{i}.ply").unlink()
+    first = run(template, own, out)
+    assert not any(entry.reused for entry in first.entries)
+    told: list[tuple[int, int, CorpusEntry]] = []
+    again = run(template, own, out, progress=lambda *what: told.append(what))
+    assert all(entry.reused for entry in again.entries)
+    assert [(number, total) for number, total, _ in told] == [(1, 3), (2, 3), (3, 3)]
+    assert [e.median_distance for e in again.registered] == [e.median_distance for e in first.registered]
+    (out / "s0.glb").write_bytes((out / "s0.glb").read_bytes()[:-5])  # somebody has damaged a result
+    os.utime(own / "s1.ljson", (1, 1))
+    after = run(template, own, out)
+    assert {entry.name: entry.reused for entry in after.entries} == {"bad": True, "s0": False, "s1": False}
+    (out / "s0.json").write_text("{")
+    shutil.copy(own / "s1.ply", own / "bad.ply")
+    mended = run(template, own, out)
+    assert {entry.name: entry.reused for entry in mended.entries} == {"bad": False, "s0": False, "s1": True}
+    assert len(mended.registered) == 3
+    other = template.with_vertices(template.vertices * 1.01)
+    assert not any(entry.reused for entry in run(other, own, out).entries)
+
+
+def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
+    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+) -> None:
+    # A server that has loaded the library forks each run: a second's work a kill instead of ten.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchface.registration.corpus.register_corpus"])
+    out, chance = tmp_path / "out", random.Random(0)
+    kept: dict[str, int] = {}
+    kills = 0
+    settings = {"landmarks": scans, "schedule": SHORT, "texture_size": 0}
+    for number in range(1, 11):
+        process = context.Process(target=register_corpus, args=(template, [scans], out), kwargs=settings)
+        process.start()
+        limit = time.monotonic() + 60
+        while not (out / ".lock").exists() and time.monotonic() < limit:
+            time.sleep(0.01)
+        process.join(chance.uniform(0.02, 0.12 * number))
+        if process.is_alive():
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.join()
+        for record in out.glob("*.json"):
+            told = json.loads(record.read_text())
+            if told["status"] == "registered":
+                assert len(load_mesh(out / told["result"]).vertices) == len(template.vertices)
+        for result in out.glob("*.glb"):
+            load_mesh(result)
+        for name, when in kept.items():
+            assert (out / name).stat().st_mtime_ns == when  # what was finished is not made again
+        kept = {path.with_suffix(".glb").name: 0 for path in out.glob("s*.json")}
+        kept = {name: (out / name).stat().st_mtime_ns for name in kept}
+    assert kills >= 2
+    end = run(template, scans, out)
+    assert [entry.name for entry in end.registered] == [entry.name for entry in done.registered]
+    assert sum(entry.reused for entry in end.entries) >= len(kept)
+    assert not list(out.glob(".*.part"))
+    for entry, whole in zip(end.registered, done.registered, strict=True):
+        assert entry.result is not None
+        assert whole.result is not None
+        torch.testing.assert_close(
+            load_mesh(entry.result).vertices, load_mesh(whole.result).vertices, atol=1e-3, rtol=0
+        )
+
+
+def test_processes_give_the_same_and_one_that_dies_takes_only_its_scan(
+    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+) -> None:
+    killed: list[int] = []
+
+    def kill_one(number: int, total: int, entry: CorpusEntry) -> None:
+        victims = [child for child in multiprocessing.active_children() if child.pid is not None]
+        if not killed and victims and entry.registered:
+            killed.append(victims[0].pid or 0)
+            os.kill(killed[0], signal.SIGKILL)
+
+    first = run(template, scans, tmp_path, jobs=2, progress=kill_one)
+    assert killed
+    assert len(first.entries) == COUNT + 1
+    lost = [entry for entry in first.skipped if entry.name != "bad"]
+    assert len(lost) <= 1
+    assert all("signal 9" in entry.error for entry in lost)
+    end = run(template, scans, tmp_path)  # what died is tried again
+    assert [entry.name for entry in end.skipped] == ["bad"]
+    for entry, whole in zip(end.registered, done.registered, strict=True):
+        assert entry.result is not None
+        assert whole.result is not None
+        torch.testing.assert_close(
+            load_mesh(entry.result).vertices, load_mesh(whole.result).vertices, atol=1e-3, rtol=0
+        )
+
+
+def test_scans_of_one_name_get_results_of_different_names(template: Mesh, scans: Path, tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "same.ply").write_bytes(b"junk")
+    (tmp_path / "b" / "same.obj").write_bytes(b"junk")
+    report = register_corpus(template, [tmp_path / "a", tmp_path / "b", tmp_path / "missing.ply"], tmp_path / "out")
+    names = [entry.name for entry in report.entries]
+    assert len(set(names)) == 4
+    assert names[-1] == "missing"
+    assert "no such file" in report.entries[-1].error
+
+
+def test_landmarks_come_as_points_in_the_templates_order_or_as_correspondences(template: Mesh, tmp_path: Path) -> None:
+    points = template.vertices[template.landmarks] + 3
+    rows = "\n".join(" ".join(f"{x:.6f}" for x in row) for row in (points / 10).tolist())
+    (tmp_path / "a.pts").write_text(f"version: 1\nn_points: {len(points)}\n{{\n{rows}\n}}\n")
+    ids, found = load_scan_landmarks(tmp_path / "a.pts", template, "scan.ply", unit="cm")
+    assert torch.equal(ids, template.landmarks)
+    torch.testing.assert_close(found, points, atol=1e-4, rtol=0)
+    labels = tuple("abc")
+    pairs = Correspondences(torch.tensor([5, 1, 9]), points[:3], labels, template.fingerprint())
+    save_correspondences(pairs, tmp_path / "a.json")
+    ids, found = load_scan_landmarks(tmp_path / "a.json", template, "scan.glb")
+    assert ids.tolist() == [5, 1, 9]
+    torch.testing.assert_close(found, points[:3])
+    (tmp_path / "few.ljson").write_text(json.dumps({"version": 2, "landmarks": {"points": points[:4].tolist()}}))
+    with pytest.raises(ShapeError, match="found 4 points, expected the template's 8"):
+        load_scan_landmarks(tmp_path / "few.ljson", template, "scan.ply")
+    with pytest.raises(TopologyError, match="made for topology"):
+        load_scan_landmarks(tmp_path / "a.json", Mesh(template.vertices, template.faces[:-1]), "scan.ply")
+    with pytest.raises(ValueRangeError, match="without annotated landmarks"):
+        load_scan_landmarks(tmp_path / "a.pts", Mesh(template.vertices, template.faces), "scan.ply")
+
+
+def test_mistakes_are_told_before_anything_is_done(
+    template: Mesh, scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(FileFormatError, match="found no scan in the folder"):
+        find_scans([tmp_path / "empty"])
+    with pytest.raises(FileFormatError, match="none named"):
+        register_corpus(template, [], tmp_path / "out")
+    with pytest.raises(FileFormatError, match="cannot be made"):
+        register_corpus(template, [scans], tmp_path / "file" / "out")
+    with pytest.raises(ValueRangeError, match="which holds scans"):
+        register_corpus(template, [scans], scans)
+    with pytest.raises(TopologyError, match="template: found 0 triangles"):
+        register_corpus(Mesh(template.vertices, template.faces[:0]), [scans], tmp_path / "out")
+    with pytest.raises(ValueRangeError, match="jobs: found 0"):
+        register_corpus(template, [scans], tmp_path / "out", jobs=0)
+    with pytest.raises(FileFormatError, match="landmarks: found no folder"):
+        register_corpus(template, [scans], tmp_path / "out", landmarks=tmp_path / "none")
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"-m pip install 'ray>=2.40'"):
+        register_corpus(template, [scans], tmp_path / "out", cluster="auto")
+
+
+def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: CorpusReport) -> None:
+    def second(number: int, total: int, entry: CorpusEntry) -> None:
+        with pytest.raises(ValueRangeError, match="another run writing"):
+            run(template, scans, done.out)
+
+    run(template, scans, done.out, progress=second)

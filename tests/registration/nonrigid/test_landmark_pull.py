@@ -1,0 +1,68 @@
+"""Landmarks along the jaw that lie elsewhere than their vertices: they let go, and it is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.io import load_identity_modes, load_mesh
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.mesh import Annotations, Mesh
+from torchface.registration import register
+
+
+@pytest.fixture(scope="module")
+def annotated(mask: Mesh) -> Mesh:
+    """The mask with 68 landmarks: 17 near the rim on both sides and below, the rest spread inside."""
+    x, y = mask.vertices[:, 0], mask.vertices[:, 1]
+    angle = torch.linspace(0, torch.pi, 17, dtype=torch.float64)
+    outline = torch.stack([-62 * angle.cos(), -90 * angle.sin()], dim=-1)
+    inner = torch.cartesian_prod(torch.linspace(-40, 40, 9), torch.linspace(-50, 60, 6)).double()[:51]
+    places = torch.cat([outline, inner])
+    ids = torch.cdist(places, torch.stack([x, y], dim=-1).double()).argmin(1)
+    return replace(mask, annotations=Annotations(landmarks=ids))
+
+
+def test_a_jaw_that_is_drawn_elsewhere_spoils_nothing(annotated: Mesh, warp, rescanned) -> None:
+    truth = warp(annotated.vertices)
+    scan = rescanned(annotated.with_vertices(truth))
+    points = truth[annotated.landmarks].clone()
+    # The outline is drawn 14 mm further up the cheek, on the surface.
+    slid = points[:17] + torch.tensor([0.0, 14.0, 0.0], dtype=torch.float64)
+    points[:17] = SurfaceIndex(scan.vertices, scan.faces).nearest(slid).points
+    found = register(annotated, scan, (annotated.landmarks, points))
+    inner = register(annotated, scan, (annotated.landmarks[17:], truth[annotated.landmarks[17:]]))
+
+    def error(result) -> float:
+        return float((result.mesh.vertices - truth).norm(dim=1).mean())
+
+    assert error(found) < 1.1 * error(inner)
+    (note,) = (note for note in found.record.notes if "disagree" in note)
+    assert "17 of 17 along the jaw" in note
+    assert "inside the face" not in note
+    assert not any("disagree" in note for note in inner.record.notes)
+
+
+def test_a_jaw_that_is_drawn_right_still_leads(annotated: Mesh, warp, rescanned) -> None:
+    truth = warp(annotated.vertices)
+    scan = rescanned(annotated.with_vertices(truth))
+    points = truth[annotated.landmarks]
+    found = register(annotated, scan, (annotated.landmarks, points))
+    assert float((found.mesh.vertices - truth)[annotated.landmarks[:17]].norm(dim=1).mean()) < 0.5
+    assert not any("disagree" in note for note in found.record.notes)
+
+
+@pytest.mark.real
+def test_a_real_registration_is_no_worse_with_landmarks(data: Path, ict_folder: Path) -> None:
+    template = load_identity_modes(ict_folder, count=1, part="face").neutral
+    scan = load_mesh(data / "scans" / "james" / "james.obj")
+    points = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug()
+    given, none = (register(template, scan, marks, texture_size=0) for marks in ((template.landmarks, points), None))
+    assert given.record.matched >= none.record.matched - 0.005
+    off = (given.mesh.vertices[template.landmarks[17:]].double() - points[17:]).norm(dim=1)
+    assert float(off.mean()) < 1.2
+    assert any("along the jaw" in note for note in given.record.notes)

@@ -1,0 +1,103 @@
+"""A scan's colours on the template, where every point's colour is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.mesh import Mesh
+from torchface.registration import register
+
+
+def paint(points: Tensor) -> Tensor:
+    """Smooth colours by position on the mask."""
+    x, y, z = points.unbind(-1)
+    return torch.stack([0.5 + x / 200, 0.5 + y / 280, 0.5 + 0.3 * torch.sin(z / 30)], dim=-1).clamp(0, 1).float()
+
+
+def painted_texture(mesh: Mesh, height: int, width: int) -> Tensor:
+    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, height, width)
+    image = torch.zeros(3, height * width)
+    image[:, texels.texels] = paint(texels.interpolate(mesh.vertices, mesh.faces)).T
+    return image.reshape(3, height, width)
+
+
+def given(template: Mesh) -> tuple[Tensor, Tensor]:
+    return template.landmarks, template.vertices[template.landmarks]
+
+
+@pytest.fixture(scope="module")
+def finer(make_mask) -> Mesh:
+    """The scan: the same surface at another resolution, its texture turned by a quarter against the template's."""
+    mesh = make_mask(61, 83)
+    return replace(mesh, uvs=torch.stack([mesh.uvs[:, 1], 1 - mesh.uvs[:, 0]], dim=-1), annotations=None)
+
+
+@pytest.fixture(scope="module")
+def textured(finer: Mesh) -> Mesh:
+    return replace(finer, texture=painted_texture(finer, 200, 300))
+
+
+def check_colors(result: Mesh, matched: Tensor) -> None:
+    wrong = (result.colors - paint(result.vertices)).abs().amax(1)
+    assert float(wrong[matched].quantile(0.95)) < 0.02
+    assert float(wrong.mean()) < 0.02
+
+
+def check_texture(result: Mesh, size: int) -> None:
+    assert result.texture.shape == (3, size, size)
+    texels = rasterise_uvs(result.uvs, result.uv_faces, size, size)
+    expected = paint(texels.interpolate(result.vertices, result.faces))
+    wrong = (result.texture.reshape(3, -1)[:, texels.texels].T - expected).abs().amax(1)
+    assert float(wrong.quantile(0.95)) < 0.02
+
+
+def test_a_textured_scans_colours_come_over(mask: Mesh, textured: Mesh) -> None:
+    result = register(mask, textured, given(mask), texture_size=128)
+    check_colors(result.mesh, result.matched)
+    check_texture(result.mesh, 128)
+    assert torch.equal(result.mesh.uvs, mask.uvs)
+
+
+def test_an_inside_out_scans_colours_come_over_alike(mask: Mesh, textured: Mesh) -> None:
+    turned = replace(textured, faces=textured.faces.flip(1), uv_faces=textured.uv_faces.flip(1))
+    result = register(mask, turned, given(mask), texture_size=128)
+    check_colors(result.mesh, result.matched)
+    check_texture(result.mesh, 128)
+
+
+def test_vertex_colours_serve_where_there_is_no_texture(mask: Mesh, finer: Mesh) -> None:
+    result = register(mask, replace(finer, colors=paint(finer.vertices)), given(mask), texture_size=64)
+    check_colors(result.mesh, result.matched)
+    check_texture(result.mesh, 64)
+
+
+def test_a_texture_that_no_coordinates_reach_is_told(mask: Mesh, textured: Mesh) -> None:
+    result = register(mask, replace(textured, uvs=None, uv_faces=None), given(mask))
+    assert result.mesh.colors is None
+    assert result.mesh.texture is None
+    assert any("neither a texture with coordinates nor vertex colours" in note for note in result.record.notes)
+
+
+def test_a_template_without_coordinates_gets_vertex_colours_and_a_note(mask: Mesh, textured: Mesh) -> None:
+    result = register(replace(mask, uvs=None, uv_faces=None), textured, given(mask))
+    check_colors(result.mesh, result.matched)
+    assert result.mesh.texture is None
+    assert any("no texture coordinates" in note for note in result.record.notes)
+
+
+def test_a_texture_of_size_zero_is_none(mask: Mesh, textured: Mesh) -> None:
+    result = register(mask, textured, given(mask), texture_size=0)
+    assert result.mesh.texture is None
+    assert result.mesh.colors is not None
+
+
+def test_a_texture_of_one_texel_colours_everything_alike(mask: Mesh, finer: Mesh) -> None:
+    one = replace(finer, texture=torch.tensor([0.2, 0.4, 0.6]).reshape(3, 1, 1))
+    result = register(mask, one, given(mask), texture_size=32)
+    assert torch.allclose(result.mesh.colors, torch.tensor([0.2, 0.4, 0.6]).expand(len(mask.vertices), 3))
+    assert torch.allclose(result.mesh.texture.amin((1, 2)), result.mesh.texture.amax((1, 2)))

@@ -1,0 +1,274 @@
+"""A template bent onto scans whose true correspondence is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import triangle_cross
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.io import load_identity_modes, load_mesh
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.mesh import Mesh
+from torchface.registration import FULL_SCHEDULE, Registration, register
+from torchface.registration.scan_preparation import Landmarks
+
+
+def error(result: Registration, truth: Tensor) -> Tensor:
+    return (result.mesh.vertices.double() - truth.double()).norm(dim=1)
+
+
+def turned_over(result: Registration, template: Mesh) -> int:
+    """Triangles whose normal opposes that of the template laid on the scan."""
+    laid = result.pose.apply(template.vertices.double())[0]
+    facing = triangle_cross(result.mesh.vertices.double(), template.faces) * triangle_cross(laid, template.faces)
+    return int((facing.sum(-1) < 0).sum())
+
+
+@pytest.fixture(scope="module")
+def truth(mask: Mesh, warp, moved) -> Tensor:
+    """Where the mask's vertices lie on another person, elsewhere."""
+    return moved(warp(mask.vertices), 4)
+
+
+@pytest.fixture(scope="module")
+def scan(mask: Mesh, truth: Tensor, rescanned) -> Mesh:
+    return rescanned(mask.with_vertices(truth))
+
+
+@pytest.fixture(scope="module")
+def landmarks(mask: Mesh, truth: Tensor) -> Landmarks:
+    return mask.landmarks, truth[mask.landmarks]
+
+
+@pytest.fixture(scope="module")
+def registered(mask: Mesh, scan: Mesh, landmarks: Landmarks) -> Registration:
+    return register(mask, scan, landmarks)
+
+
+@pytest.fixture(scope="module")
+def by_shape(mask: Mesh, scan: Mesh) -> Registration:
+    return register(mask, scan)
+
+
+def test_a_mesh_registered_to_itself_is_itself(mask: Mesh) -> None:
+    result = register(mask, mask, (mask.landmarks, mask.vertices[mask.landmarks]))
+    assert float(error(result, mask.vertices).max()) < 0.05
+    assert float(error(register(mask, mask), mask.vertices).max()) < 0.1
+
+
+@pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (1, 0.9), (2, 1.15)])
+def test_a_mesh_registered_to_a_moved_copy_is_the_copy(mask: Mesh, moved, seed: int, scale: float) -> None:
+    copy = mask.with_vertices(moved(mask.vertices, seed, scale))
+    result = register(mask, copy, (mask.landmarks, copy.vertices[mask.landmarks]))
+    assert float(error(result, copy.vertices).max()) < 0.05
+    assert float(result.pose.scale[0]) == pytest.approx(scale, abs=1e-3)
+
+
+def test_without_landmarks_the_copy_is_found_too(mask: Mesh, moved) -> None:
+    copy = mask.with_vertices(moved(mask.vertices, 3, 1.1))
+    result = register(mask, copy)
+    assert result.record.start == "shape"
+    assert float(error(result, copy.vertices).max()) < 0.3
+
+
+def test_a_planted_deformation_is_recovered(mask: Mesh, truth: Tensor, registered: Registration) -> None:
+    """Where there is form or a landmark; the smooth outskirts can slide along themselves unseen, within limits."""
+    rigid = (registered.pose.apply(mask.vertices)[0] - truth).norm(dim=1)
+    bent = error(registered, truth)
+    near = torch.cdist(mask.vertices, mask.vertices[mask.landmarks]).amin(1) < 15
+    assert float(bent[near].mean()) < 0.2 * float(rigid[near].mean())
+    assert float(bent.mean()) < 0.45 * float(rigid.mean())
+    assert float(registered.distance[registered.matched].mean()) < 0.05
+    assert registered.record.median_distance == pytest.approx(
+        float(registered.distance[registered.matched].median()), abs=1e-9
+    )
+
+
+def test_the_full_system_of_the_paper_comes_to_the_same(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
+) -> None:
+    full = register(mask, scan, landmarks, schedule=FULL_SCHEDULE)
+    assert float((full.mesh.vertices - registered.mesh.vertices).norm(dim=1).mean()) < 0.5
+    assert float(error(registered, truth).mean()) < 1.15 * float(error(full, truth).mean())
+
+
+def test_no_triangle_turns_over(mask: Mesh, registered: Registration) -> None:
+    assert turned_over(registered, mask) == 0
+
+
+def test_the_same_input_gives_the_same_result(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, registered: Registration, by_shape: Registration
+) -> None:
+    again = register(mask, scan, landmarks)
+    assert torch.equal(again.mesh.vertices, registered.mesh.vertices)
+    assert again.record == registered.record
+    assert torch.equal(register(mask, scan).mesh.vertices, by_shape.mesh.vertices)
+
+
+def test_the_energy_falls_in_every_linear_step(registered: Registration) -> None:
+    steps = [pair for stage in registered.record.stages for pair in stage.energies]
+    assert len(steps) >= len(registered.record.stages)
+    assert all(after <= before * (1 + 1e-9) for before, after in steps)
+
+
+def test_the_record_counts_every_correspondence(mask: Mesh, registered: Registration) -> None:
+    stages = registered.record.stages
+    assert [stage.stiffness for stage in stages] == sorted((s.stiffness for s in stages), reverse=True)
+    assert stages[-1].distance < stages[0].distance
+    assert stages[-1].used + sum(stages[-1].dropped.values()) == len(mask.vertices)
+    assert registered.record.start == "landmarks"
+    assert "stiffness" in str(registered.record)
+
+
+def test_the_result_keeps_topology_coordinates_and_annotations(mask: Mesh, registered: Registration) -> None:
+    result = registered.mesh
+    assert torch.equal(result.faces, mask.faces)
+    assert torch.equal(result.uvs, mask.uvs)
+    assert torch.equal(result.landmarks, mask.landmarks)
+    assert result.vertices.dtype == mask.vertices.dtype
+
+
+def test_a_part_of_a_face_leaves_the_rest_to_its_neighbours(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
+) -> None:
+    """Half of the forehead is missing; nothing collapses onto the border of the hole."""
+    inverse = registered.pose.inverse()
+    local = inverse.apply(scan.vertices)[0]
+    hole = (local[:, 1] > 60) & (local[:, 0] > 0)
+    holed = Mesh(scan.vertices, scan.faces[~hole[scan.faces].any(1)])
+    result = register(mask, holed, landmarks)
+    missing = (mask.vertices[:, 1] > 66) & (mask.vertices[:, 0] > 6)
+    assert not result.matched[missing].any()
+    assert float(error(result, truth)[missing].mean()) < 3.0
+    assert float(error(result, truth)[~missing].mean()) < 1.5 * float(error(registered, truth).mean()) + 0.1
+    assert result.record.stages[-1].dropped["border"] > registered.record.stages[-1].dropped["border"]
+
+
+def test_lumps_of_hair_leave_the_face_alone(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
+) -> None:
+    local = registered.pose.inverse().apply(scan.vertices)[0]
+    generator = torch.Generator().manual_seed(0)
+    lump = 25 * ((local[:, 1] - 70) / 30).clamp(0, 1) + 4 * torch.randn(len(local), generator=generator).double() * (
+        local[:, 1] > 70
+    )
+    hairy = Mesh(registered.pose.apply(local + lump[:, None] * torch.tensor([0.0, 0.3, 0.95]))[0], scan.faces)
+    result = register(mask, hairy, landmarks)
+    face = mask.vertices[:, 1] < 50
+    assert float(error(result, truth)[face].mean()) < float(error(registered, truth)[face].mean()) + 0.3
+    assert turned_over(result, mask) == 0
+
+
+def test_crumbs_are_dropped_and_told(mask: Mesh, scan: Mesh, landmarks: Landmarks, registered: Registration) -> None:
+    crumb = scan.vertices[:30] * 0.02 + scan.vertices.mean(0) * 0.98
+    faces = torch.arange(30).reshape(10, 3) + len(scan.vertices)
+    result = register(mask, Mesh(torch.cat([scan.vertices, crumb]), torch.cat([scan.faces, faces])), landmarks)
+    assert any("loose parts" in note for note in result.record.notes)
+    assert torch.allclose(result.mesh.vertices, registered.mesh.vertices, atol=1e-6)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_flipped_normals_are_turned_and_told(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, registered: Registration, by_shape: Registration, given: bool
+) -> None:
+    inside_out = Mesh(scan.vertices, scan.faces.flip(1))
+    result = register(mask, inside_out, landmarks if given else None)
+    assert any("flipped normals" in note for note in result.record.notes)
+    expected = registered if given else by_shape
+    assert float((result.mesh.vertices - expected.mesh.vertices).norm(dim=1).max()) < 0.1
+
+
+def test_landmarks_off_the_surface_or_missing_are_left_out_and_told(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
+) -> None:
+    points = landmarks[1].clone()
+    points[0] = torch.nan
+    points[1] += 60.0
+    result = register(mask, scan, (landmarks[0], points))
+    told = [note for note in result.record.notes if "landmarks" in note]
+    assert len(told) == 1
+    assert "1 are NaN" in told[0]
+    assert "1 lie more than 15 mm off" in told[0]
+    assert float(error(result, truth).mean()) < float(error(registered, truth).mean()) + 0.4
+
+
+def test_a_detector_is_asked_where_no_landmarks_are_given(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
+) -> None:
+    seen: list[Tensor] = []
+
+    def detector(laid: Mesh, surface: Mesh, pose) -> Landmarks | None:  # type: ignore[no-untyped-def]
+        seen.append((laid.vertices - truth).norm(dim=1).mean())
+        assert surface is scan
+        return landmarks
+
+    found = register(mask, scan, detector=detector)
+    assert found.record.start == "detected landmarks"
+    assert float(seen[0]) < 8.0
+    assert torch.allclose(found.mesh.vertices, registered.mesh.vertices, atol=1e-6)
+
+
+def test_parts_that_share_no_vertex_follow(
+    mask: Mesh, scan: Mesh, landmarks: Landmarks, registered: Registration
+) -> None:
+    """A bead behind the surface keeps its distance to the face and its form."""
+    bead = torch.tensor([[-4.0, 0, 0], [4, 0, 0], [0, 5, 0], [0, 0, 5]]).double() + torch.tensor([33.0, 25, 40])
+    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]) + len(mask.vertices)
+    both = Mesh(torch.cat([mask.vertices, bead]), torch.cat([mask.faces, faces]))
+    result = register(both, scan, landmarks)
+    assert float((result.mesh.vertices[:-4] - registered.mesh.vertices).norm(dim=1).mean()) < 0.2
+    end = result.mesh.vertices[-4:]
+    scale = torch.pdist(end) / torch.pdist(bead)
+    assert 0.8 < float(scale.min()) <= float(scale.max()) < 1.25
+    laid = result.pose.apply(bead)[0]
+    assert float((end - laid).norm(dim=1).max()) < 8.0
+
+
+def test_progress_is_told_a_line_a_step(mask: Mesh, scan: Mesh, landmarks: Landmarks) -> None:
+    lines: list[str] = []
+    result = register(mask, scan, landmarks, progress=lines.append)
+    assert sum("bending" in line for line in lines) == len(result.record.stages)
+    assert lines[0] == "checking the scan"
+
+
+@pytest.mark.real
+def test_a_head_of_the_identity_modes_is_recovered(ict_folder: Path, rescanned: Callable[..., Mesh], moved) -> None:
+    modes = load_identity_modes(ict_folder, part="face")
+    template, generator = modes.neutral, torch.Generator().manual_seed(1)
+    truth = moved(modes.head(torch.randn(len(modes.names), generator=generator)).vertices.double(), 6)
+    scan = rescanned(template.with_vertices(truth.float()), noise=0.1)
+    result = register(template, scan, (template.landmarks, truth[template.landmarks]))
+    assert float(error(result, truth).mean()) < 0.9
+    assert float(result.distance.mean()) < 0.1
+    assert turned_over(result, template) == 0
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("given", [True, False])
+def test_a_real_scan_is_met_inside_the_face(data: Path, ict_folder: Path, given: bool) -> None:
+    """Hair, ears under hair, collar and holes are left; lips, lids and nose lie where they were annotated."""
+    template = load_identity_modes(ict_folder, count=1, part="face").neutral
+    scan = load_mesh(data / "scans" / "james" / "james.obj")
+    points = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug()
+    result = register(template, scan, (template.landmarks, points) if given else None, texture_size=256)
+    face = template.annotations.regions["narrow_face"]
+    assert float(result.distance[face].median()) < 0.15
+    inner = (result.mesh.vertices[template.landmarks].double() - points).norm(dim=1)[17:]
+    assert float(inner.median()) < (2.0 if given else 3.5)
+    assert turned_over(result, template) == 0
+    on_scan = SurfaceIndex(scan.vertices, scan.faces).nearest(result.mesh.vertices[result.matched].double())
+    beyond = result.distance[result.matched] - on_scan.distance  # a loose part that was left out may be nearer
+    assert float(beyond.min()) > -1e-4
+    assert float((beyond < 1e-4).double().mean()) > 0.99
+    assert 0.6 < result.record.matched < 0.95
+
+
+def test_float32_templates_come_back_as_float32(mask: Mesh, scan: Mesh, landmarks: Landmarks) -> None:
+    single = replace(mask, vertices=mask.vertices.float())
+    assert register(single, scan, landmarks).mesh.vertices.dtype == torch.float32

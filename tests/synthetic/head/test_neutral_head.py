@@ -1,0 +1,206 @@
+"""The embedded head: its topology, its measurements, and how they answer to the identity."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.meshes.operators import border_vertices, components, triangle_areas, triangle_normals
+from torchface.synthetic import IDENTITY, draw_identities, neutral_head
+from torchface.synthetic.head.measurements import measure
+from torchface.synthetic.head.topology import topology
+
+# Adult human means, millimetres.
+HUMAN = {
+    "face_height": 120, "face_width": 137, "jaw_width": 105, "pupil_distance": 63, "eye_width": 30, "nose_length": 50,
+    "nose_width": 35, "nose_protrusion": 19, "mouth_width": 51, "philtrum": 15, "head_length": 190, "head_width": 152,
+}  # fmt: skip
+MEASURED = [p.name for p in IDENTITY if p.mean]
+
+
+def identity(**coefficients: float) -> torch.Tensor:
+    names = [p.name for p in IDENTITY]
+    vector = torch.zeros(len(IDENTITY))
+    for name, value in coefficients.items():
+        vector[names.index(name)] = value
+    return vector
+
+
+@pytest.fixture(scope="module")
+def mean():
+    return neutral_head()
+
+
+def test_mean_head_measures_as_people_do(mean):
+    found = measure(mean)
+    for name, expected in HUMAN.items():
+        assert found[name] == pytest.approx(expected, rel=0.05), name
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_two_deviations_change_the_measurement_by_what_they_say(mean, name):
+    parameter = next(p for p in IDENTITY if p.name == name)
+    changed = measure(neutral_head(identity(**{name: 2.0}), texture=False))[name] - measure(mean)[name]
+    assert changed == pytest.approx(2 * parameter.standard_deviation, rel=0.12)
+
+
+def test_every_parameter_moves_the_face_by_human_amounts(mean):
+    for parameter in IDENTITY:
+        moved = neutral_head(identity(**{parameter.name: 1.0}), texture=False).vertices - mean.vertices
+        largest = float(moved.norm(dim=1).max())
+        assert 0.3 <= largest <= 9.0, parameter.name
+    assert len(IDENTITY) >= 20
+
+
+def test_quads_of_four_to_eight_thousand_vertices_with_one_border_at_the_neck(mean):
+    assert 4000 <= len(mean.vertices) <= 8000
+    assert mean.polygons.shape[1] == 4
+    assert (mean.polygons >= 0).all()
+    border = border_vertices(mean.faces, len(mean.vertices))
+    regions = mean.annotations.regions
+    assert regions["neck"][border].all()
+    assert mean.vertices[border, 1].max() < -150
+    # One skin with its mouth and sockets, two eyeballs.
+    part = components(mean.faces, len(mean.vertices))
+    assert int(part.max()) == 2
+    assert len(part[regions["eyeball_left"]].unique()) == 1
+
+
+def test_each_edge_has_at_most_two_faces_that_run_opposite_ways(mean):
+    f = mean.faces
+    directed = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+    assert len(directed.unique(dim=0)) == len(directed)
+
+
+def test_topology_and_position_mirror_exactly():
+    generator = torch.Generator().manual_seed(4)
+    mesh = neutral_head(draw_identities(1, generator)[0], texture=False)
+    mirror = mesh.annotations.mirror
+    assert torch.equal(mirror[mirror], torch.arange(len(mirror)))
+    reflected = mesh.vertices[mirror] * torch.tensor([-1.0, 1.0, 1.0])
+    assert (reflected - mesh.vertices).abs().max() < 1e-4
+    quads = {tuple(sorted(q)) for q in mesh.polygons.tolist()}
+    assert quads == {tuple(sorted(q)) for q in mirror[mesh.polygons].tolist()}
+
+
+def test_landmarks_follow_ibug_order(mean):
+    p = mean.vertices[mean.landmarks]
+    assert len(set(mean.landmarks.tolist())) == 68
+    assert (p[:17, 0].diff() > 0).all()  # the jaw from the viewer's left to the right
+    assert p[8, 1] == p[:17, 1].min()
+    assert (p[17:27, 0].diff() > 0).all()
+    assert (p[27:31, 1].diff() < 0).all()
+    assert p[30, 2] == p[:, 2].max()
+    assert (p[31:36, 0].diff() > 0).all()
+    assert p[36, 0] < p[39, 0] < 0 < p[42, 0] < p[45, 0]
+    assert (p[[37, 38], 1] > p[[41, 40], 1]).all()
+    assert (p[[43, 44], 1] > p[[47, 46], 1]).all()
+    assert (p[48:55, 0].diff() > 0).all()
+    assert (p[54:60, 0].diff() < 0).all()
+    assert p[51, 1] > p[62, 1] > p[66, 1] > p[57, 1]
+    # Landmarks mirror each other as 68 points do.
+    pairs = [(i, 16 - i) for i in range(8)] + [(17 + i, 26 - i) for i in range(5)] + [(31, 35), (32, 34)]
+    pairs += [(36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46), (48, 54), (49, 53), (50, 52), (59, 55)]
+    pairs += [(58, 56), (60, 64), (61, 63), (67, 65)]
+    for a, b in pairs:
+        assert mean.annotations.mirror[mean.landmarks[a]] == mean.landmarks[b]
+
+
+def test_regions_lie_where_they_are_named(mean):
+    regions, y = mean.annotations.regions, mean.vertices[:, 1]
+    order = ["forehead", "brow_left", "nose", "upper_lip", "lower_lip", "chin", "neck"]
+    heights = [float(y[regions[name]].mean()) for name in order]
+    assert heights == sorted(heights, reverse=True)
+    for name in ("brow", "lids", "eye", "eyeball", "cheek", "ear"):
+        left, right = regions[f"{name}_left"], regions[f"{name}_right"]
+        assert (mean.vertices[left, 0] > 0).all(), name
+        assert torch.equal(left[mean.annotations.mirror], right), name
+    assert not (regions["face"] & (regions["neck"] | regions["cranium"])).any()
+
+
+def test_lips_touch_lightly_and_lids_stand_open_on_every_head():
+    for coefficients in draw_identities(6, torch.Generator().manual_seed(1)):
+        mesh = neutral_head(coefficients, texture=False)
+        v, pairs, regions = mesh.vertices, mesh.annotations.contacts, mesh.annotations.regions
+        apart = (v[pairs[:, 0]] - v[pairs[:, 1]]).norm(dim=1)
+        on_lips = regions["upper_lip"][pairs[:, 0]]
+        assert on_lips.sum() >= 20
+        assert (~on_lips).sum() >= 50
+        assert apart[on_lips].max() <= 0.5
+        assert (v[pairs[on_lips, 0], 1] >= v[pairs[on_lips, 1], 1]).all()
+        assert apart[~on_lips].max() > 6
+
+
+def test_texture_coordinates_have_seams_and_do_not_overlap(mean):
+    # Signed area of every triangle on the page: none is turned over.
+    corners = mean.uvs[mean.uv_faces]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    assert (area > 0).all()
+    assert mean.uvs.min() >= 0
+    assert mean.uvs.max() <= 1
+    pairs = torch.stack([mean.faces.flatten(), mean.uv_faces.flatten()], dim=1).unique(dim=0)
+    assert len(pairs) > len(mean.vertices)
+
+
+def test_texture_paints_lips_redder_and_brows_darker_than_the_cheek(mean):
+    from torchface.rendering.clay_shading import sample_texture
+
+    regions = mean.annotations.regions
+    color = {}
+    for name in ("cheek_left", "upper_lip", "brow_left", "mouth_interior"):
+        inside = regions[name][mean.faces].all(1)
+        if name == "brow_left":  # the region is skin round the brow as well; its hair is what lies near its arch
+            centre = mean.vertices[mean.faces].mean(1)
+            inside &= ((centre[:, 1] - 21).abs() < 2.5) & (centre[:, 0] > 15) & (centre[:, 0] < 42)
+        color[name] = sample_texture(mean.texture, mean.uvs[mean.uv_faces[inside]].mean(1)).mean(0)
+    redness = {name: float(c[0] / c[1]) for name, c in color.items()}
+    assert redness["upper_lip"] > 1.15 * redness["cheek_left"]
+    assert color["brow_left"].mean() < 0.75 * color["cheek_left"].mean()
+    assert color["mouth_interior"].mean() < 0.4 * color["cheek_left"].mean()
+
+
+def test_identity_moves_the_head_smoothly():
+    drawn = draw_identities(1, torch.Generator().manual_seed(9))[0].double()
+    step = 1e-2 * torch.randn(len(IDENTITY), generator=torch.Generator().manual_seed(2)).double()
+    at = [neutral_head(drawn + k * step, texture=False).vertices.double() for k in (-1, 0, 1)]
+    first, second = (at[2] - at[0]).norm() / 2, (at[2] - 2 * at[1] + at[0]).norm()
+    assert second < 0.02 * first
+
+
+def test_random_heads_do_not_fold(mean):
+    normals = triangle_normals(mean.vertices, mean.faces)
+    regions = mean.annotations.regions
+    shown = ~(regions["mouth_interior"] | regions["eye_sockets"] | regions["nostrils"])[mean.faces].any(1)
+    shown &= triangle_areas(mean.vertices, mean.faces) > 0.1  # corners of lids and lips come to points
+    for coefficients in draw_identities(8, torch.Generator().manual_seed(3)):
+        other = neutral_head(coefficients, texture=False).vertices
+        assert ((triangle_normals(other, mean.faces) * normals).sum(1)[shown] > 0).all()
+        assert (triangle_areas(other, mean.faces) > 0.15 * triangle_areas(mean.vertices, mean.faces))[shown].all()
+
+
+def test_drawn_identities_are_clipped_repeatable_and_spread():
+    drawn = draw_identities(4000, torch.Generator().manual_seed(0))
+    assert drawn.shape == (4000, len(IDENTITY))
+    assert drawn.abs().max() == 2.5
+    assert float(drawn.std()) == pytest.approx(0.99, abs=0.02)
+    assert torch.equal(drawn, draw_identities(4000, torch.Generator().manual_seed(0)))
+    near = draw_identities(4000, torch.Generator().manual_seed(0), spread=0.5)
+    assert float(near.std()) == pytest.approx(0.5, abs=0.01)
+
+
+def test_wrong_identities_are_refused():
+    with pytest.raises(ShapeError, match=r"identity: found \(3,\), expected"):
+        neutral_head(torch.zeros(3))
+    with pytest.raises(ValueRangeError, match="NaN"):
+        neutral_head(torch.full((len(IDENTITY),), float("nan")))
+
+
+def test_rings_run_round_eye_and_mouth():
+    rings = topology().rings
+    mesh = neutral_head(texture=False)
+    for name in ("eye", "mouth"):
+        ring = mesh.vertices[rings[name]]
+        size = (ring.amax(1) - ring.amin(1))[:, :2].norm(dim=1)
+        assert (size[:8].diff() < 0).all(), name  # each loop lies inside the one before

@@ -1,0 +1,96 @@
+"""The main job end to end: what it writes is what it solved, and what it solved is close to the truth."""
+
+import html
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from torchface.capture import MarkerSolver
+from torchface.errors import TopologyError, ValueRangeError
+from torchface.io import load_rig, load_take, save_mesh, save_rig
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
+from torchface.workflows.demo.main_job import FLAWS, embedded_scene, run_demo, scene_from
+
+
+def test_the_embedded_performer_comes_back_and_every_file_says_the_same(tmp_path: Path) -> None:
+    result = run_demo(embedded_scene(seed=4, frames=150), tmp_path, seed=4)
+    noise = 3**0.5 * FLAWS.noise
+    solved, single = result.solved, result.frame_by_frame
+    for one in (solved, single):
+        assert 0.8 * noise < float(one.marker_rmse.nanmedian()) < 1.1 * noise
+        assert one.mesh_error.mean < 0.3
+        assert one.mesh_error.relative < 0.3
+    assert solved.mesh_error.mean < 0.85 * single.mesh_error.mean
+    assert solved.jitter < 2 < single.jitter
+    assert solved.correlation > single.correlation
+    assert solved.correlation > 0.9
+
+    rig = load_rig(result.files["transferred rig"])
+    torch.testing.assert_close(rig.vertices, result.scene.head.vertices, atol=1e-3, rtol=0)
+    take = load_take(result.files["marker take"])
+    again = MarkerSolver(rig, result.attachment).solve_take(take).weights
+    assert again is not None
+    torch.testing.assert_close(again.values[..., 0].float(), single.weights, atol=5e-3, rtol=0)
+    written = load_take(result.files["solved weights"]).weights
+    assert written is not None
+    torch.testing.assert_close(rig.weights_from(written).float(), solved.weights, atol=1e-5, rtol=0)
+
+    assert take.markers is not None
+    session = onnxruntime.InferenceSession(result.files["solver for applications"].read_bytes())
+    markers = take.markers.select(result.attachment.labels or ()).values.float().numpy()
+    previous = np.zeros((len(markers), len(rig.names)), np.float32)
+    (solved,) = session.run(None, {"markers": markers, "previous": previous})
+    rmse = np.sqrt(np.mean((rig(torch.from_numpy(solved)) - rig(single.weights)).square().sum(-1).numpy()))
+    assert rmse < 0.02  # millimetres over the whole mesh
+
+    page = write_demo_page(result, tmp_path)
+    text = page.read_text()
+    for name in re.findall(r'src="([^"]+)"', text):
+        assert (tmp_path / name).stat().st_size > 1000
+    for what, *_ in [*result_rows(result), *scene_rows(result)]:
+        assert html.escape(what) in text
+    assert len(re.findall(r"[.] ", re.findall(r"<p>(.*?)</p>", text)[0])) == 0  # the story is one sentence
+
+
+def test_a_rig_without_landmarks_and_names_gets_markers_where_it_moves(tmp_path: Path) -> None:
+    scene = embedded_scene(seed=1, frames=20)
+    names = [f"shape{i}" for i in range(len(scene.template.names))]
+
+    def nameless(rig: BlendshapeRig) -> BlendshapeRig:
+        return BlendshapeRig(replace(rig.neutral, annotations=None), rig.deltas, names)
+
+    result = run_demo(
+        replace(
+            scene, template=nameless(scene.template), head=nameless(scene.truth).neutral, truth=nameless(scene.truth)
+        ),
+        tmp_path,
+    )
+    assert result.layout is None
+    assert len(result.attachment.triangles) == 100
+    assert "neither 68 landmarks nor" in write_demo_page(result, tmp_path).read_text()
+
+
+def test_parts_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    run_scene = embedded_scene(seed=1, frames=2)
+    save_rig(run_scene.template, tmp_path / "template.glb")
+    square = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]]))
+    save_mesh(square, tmp_path / "square.obj")
+    with pytest.raises(ValueRangeError, match=r"template.glb: found no identity modes"):
+        scene_from(tmp_path / "template.glb", None, None, 1)
+    with pytest.raises(TopologyError, match="target: found Mesh"):
+        scene_from(tmp_path / "template.glb", None, tmp_path / "square.obj", 1)
+
+
+@pytest.mark.real
+def test_a_real_take_moves_a_random_real_head(ict_folder: Path, performances: list[Path]) -> None:
+    scene = scene_from(ict_folder, performances[0], None, seed=3)
+    assert scene.weights.shape == (1846, 53)
+    assert (scene.head.vertices - scene.template.vertices).norm(dim=1).mean() > 1.0
+    assert torch.equal(scene.truth.deltas, scene.template.deltas)

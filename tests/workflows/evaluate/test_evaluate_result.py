@@ -1,0 +1,205 @@
+"""A result's files against the truth's: whatever form they have, the figures are those of what was planted."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchface import BlendshapeRig, Mesh, Take, Track, load_mesh, save_animation, save_mesh, save_rig
+from torchface.cli import main
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
+from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.mesh import Annotations
+from torchface.workflows.evaluate.evaluate_result import ALL, EvaluationSettings, evaluate
+from torchface.workflows.evaluate.scan_truth import surface_distances
+
+FRAMES = 6
+NAMES = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
+
+
+@pytest.fixture
+def rig(dome_rig: BlendshapeRig) -> BlendshapeRig:
+    """The dome, with a region and many landmarks."""
+    upper = dome_rig.vertices[:, 1] > -20
+    marks = torch.arange(70, 625, 17)
+    notes = Annotations(landmarks=marks, regions={"upper": upper})
+    return BlendshapeRig(replace(dome_rig.neutral, annotations=notes), dome_rig.deltas, dome_rig.names)
+
+
+@pytest.fixture
+def weights() -> torch.Tensor:
+    return torch.rand(FRAMES, 4, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def folder(rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path) -> Path:
+    """The truth in every form that a file may have."""
+    take = Take(30.0, weights=Track(NAMES, weights[..., None]))
+    save_rig(rig, tmp_path / "rig.glb")
+    save_weights_csv(take, tmp_path / "true.csv")
+    save_animation(rig, take, tmp_path / "true.glb")
+    write_sequence(tmp_path / "true.safetensors", rig(weights), rig.neutral.faces)
+    (tmp_path / "meshes").mkdir()
+    for frame, vertices in enumerate(rig(weights)):
+        save_mesh(rig.neutral.with_vertices(vertices), tmp_path / "meshes" / f"f{frame}.ply")
+    return tmp_path
+
+
+def write_sequence(path: Path, vertices: torch.Tensor, faces: torch.Tensor) -> None:
+    with MeshSequenceWriter(path, len(vertices), vertices.shape[1], faces) as writer:
+        writer.append(vertices)
+
+
+@pytest.mark.parametrize("truth", ["true.csv", "true.glb", "true.safetensors", "meshes"])
+def test_a_planted_displacement_is_found_against_every_form_of_the_truth(
+    truth: str, folder: Path, rig: BlendshapeRig, weights: torch.Tensor
+) -> None:
+    vertices = rig(weights)
+    vertices[:, :300, 2] += 1.5  # no two vertices are moved alike, but for these
+    vertices[2] = torch.nan
+    write_sequence(folder / "found.safetensors", vertices, rig.neutral.faces)
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    found = evaluate(folder / "found.safetensors", [folder / truth], folder / "out", settings)
+    assert found.regions[ALL].mean == pytest.approx(1.5 * 300 / 625, rel=1e-4)
+    assert found.regions[ALL].largest == pytest.approx(1.5, rel=1e-4)
+    assert found.regions[ALL].total == pytest.approx(450, rel=1e-4)
+    upper = rig.neutral.annotations.regions["upper"]  # type: ignore[union-attr]
+    assert found.regions["upper"].mean == pytest.approx(1.5 * float((upper.nonzero() < 300).float().mean()), rel=1e-3)
+    assert torch.isnan(found.frame_mean[2])
+    assert "1 of 6 frames are NaN" in " ".join(found.lines())
+    rows = list(csv.DictReader((folder / "out" / "frames.csv").open()))
+    assert [row["mean_mm"] == "" for row in rows] == [False, False, True, False, False, False]
+    assert float(rows[0]["total_mm"]) == pytest.approx(450, rel=1e-4)
+    told = json.loads((folder / "out" / "summary.json").read_text())
+    assert told["regions"][ALL]["mean"] == found.regions[ALL].mean
+    assert told["alignment"] == "none"
+
+
+def test_weights_are_compared_by_shape_and_the_report_shows_it_all(
+    folder: Path, weights: torch.Tensor, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = (weights * torch.tensor([1.0, 0.5, 1, 1])).clamp(0, 1)
+    save_weights_csv(Take(30.0, weights=Track(NAMES, wrong[..., None])), folder / "found.csv")
+    words = (
+        "evaluate",
+        folder / "found.csv",
+        folder / "true.glb",
+        "--rig",
+        folder / "rig.glb",
+        "--out",
+        folder / "out",
+    )
+    main([*map(str, words), "--quiet", "--height", "40"])
+    told = capsys.readouterr()
+    assert told.out.strip() == str(folder / "out" / "index.html")
+    assert "over 4 shapes" in told.err
+    rows = {row["shape"]: row for row in csv.DictReader((folder / "out" / "shapes.csv").open())}
+    assert float(rows["browInnerUp"]["mean"]) == pytest.approx(float(weights[:, 1].mean() / 2), rel=1e-4)
+    assert float(rows["jawOpen"]["mean"]) == pytest.approx(0, abs=1e-6)
+    page = (folder / "out" / "index.html").read_text()
+    assert "RdYlGn_r" in page
+    for picture in ("heat_mean.png", "frames.png", "shapes.png"):
+        assert picture in page
+        assert (folder / "out" / picture).is_file()
+    assert not list((folder / "out").glob(".*part*"))
+
+
+def test_alignment_is_done_where_it_is_asked_for(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
+    turn = rotation_matrix(torch.tensor([0.0, 0.2, 0.0]))
+    moved = rig(weights) @ turn.T + torch.tensor([10.0, 0.0, 0.0])
+    write_sequence(folder / "found.safetensors", moved, rig.neutral.faces)
+    paths = folder / "found.safetensors", [folder / "true.glb"], folder / "out"
+    assert evaluate(*paths).regions[ALL].mean > 5
+    laid = evaluate(*paths, EvaluationSettings(align=True))
+    assert laid.regions[ALL].mean < 1e-3
+    assert laid.turned is not None
+    torch.testing.assert_close(
+        laid.turned, torch.full((FRAMES,), float(torch.rad2deg(torch.tensor(0.2)))), rtol=1e-3, atol=0
+    )
+
+
+def test_frames_may_be_picked(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
+    save_weights_csv(Take(30.0, weights=Track(NAMES, weights[[4, 1]][..., None])), folder / "some.csv")
+    settings = EvaluationSettings(rig=folder / "rig.glb", frames=(4, 1))
+    found = evaluate(folder / "true.csv", [folder / "some.csv"], folder / "out", settings)
+    assert found.regions[ALL].largest < 1e-4
+    assert found.frames.tolist() == [4, 1]
+    with pytest.raises(ShapeError, match=r"found 6 frames, expected the 2 .*--frames"):
+        evaluate(folder / "true.csv", [folder / "some.csv"], folder / "out", EvaluationSettings(folder / "rig.glb"))
+    for wrong, message in (((4, 6), "found frame 6"), ((1,), "found 1 frames")):
+        with pytest.raises(ShapeError, match=message):
+            evaluate(folder / "true.csv", [folder / "some.csv"], folder / "out", replace(settings, frames=wrong))
+
+
+def test_what_does_not_fit_is_told(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
+    true, out = folder / "true.glb", folder / "out"
+    with pytest.raises(NameMismatchError, match="weights without a rig"):
+        evaluate(folder / "true.csv", [true], out)
+    sheet = Mesh(torch.rand(4, 3), torch.tensor([[0, 1, 2], [1, 2, 3]]))
+    save_mesh(sheet, folder / "sheet.ply")
+    with pytest.raises(TopologyError, match=r"found 4 vertices and 2 triangles.*--scans"):
+        evaluate(true, [folder / "sheet.ply"], out)
+    write_sequence(folder / "nan.safetensors", torch.full((FRAMES, 625, 3), torch.nan), rig.neutral.faces)
+    with pytest.raises(ValueRangeError, match="NaN in every frame"):
+        evaluate(folder / "nan.safetensors", [true], out)
+    with pytest.raises(FileFormatError, match=r"ending '\.txt'"):
+        evaluate(folder / "a.txt", [true], out)
+    with pytest.raises(ValueRangeError, match="found 2 files"):
+        evaluate(true, [true, true], out)
+    with pytest.raises(ValueRangeError, match="scale"):
+        evaluate(true, [true], out, EvaluationSettings(maximum=0.0))
+    (folder / "empty").mkdir()
+    with pytest.raises(FileFormatError, match="no mesh"):
+        evaluate(true, [folder / "empty"], out)
+    assert not (out / "summary.json").exists()
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(true), str(true), "--align", "--as-is", "--quiet"])
+
+
+def test_distances_to_a_surface_are_trimeshs() -> None:
+    sphere = trimesh.creation.icosphere(2, 60.0)
+    points = 65 * np.random.default_rng(0).normal(size=(200, 3))
+    surface = Mesh(torch.from_numpy(sphere.vertices.copy()), torch.from_numpy(sphere.faces.astype(np.int64)))
+    _, expected, _ = trimesh.proximity.closest_point(sphere, points)
+    torch.testing.assert_close(surface_distances(torch.from_numpy(points), surface), torch.from_numpy(expected))
+
+
+def test_raw_scans_are_registered_once_and_then_compared(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor
+) -> None:
+    """A scan of another topology and pose, with a hole: the right result is near, a wrong one is not."""
+    turn = rotation_matrix(torch.tensor([0.3, -0.5, 0.2]))
+    (folder / "scans").mkdir()
+    for row, frame in enumerate((5,)):
+        true = rig(weights[frame : frame + 1])[0] @ turn.T + torch.tensor([200.0, 0, 50])
+        kept = rig.neutral.faces[(rig.neutral.faces > 60).all(1)]
+        points, faces = trimesh.remesh.subdivide(true.double().numpy(), kept.numpy())
+        scan = Mesh(torch.from_numpy(points).float(), torch.from_numpy(faces.astype(np.int64)))
+        save_mesh(scan, folder / "scans" / f"s{row}.ply")
+        marks = {"points": true[rig.neutral.landmarks].tolist()}
+        content = {"version": 2, "labels": [], "landmarks": marks}
+        (folder / "scans" / f"s{row}.ljson").write_text(json.dumps(content))
+    settings = EvaluationSettings(folder / "rig.glb", frames=(5,), scans=True, landmarks=folder / "scans")
+    found = evaluate(folder / "true.csv", [folder / "scans"], folder / "out", settings)
+    assert found.aligned
+    assert found.surface is not None
+    assert found.surface.mean < 0.05
+    assert found.regions[ALL].vertices < 575  # the hole and its border show nothing
+    still = Take(30.0, weights=Track(NAMES, torch.zeros(FRAMES, 4, 1)))
+    save_weights_csv(still, folder / "still.csv")
+    worse = evaluate(folder / "still.csv", [folder / "scans"], folder / "out", settings)
+    assert worse.regions[ALL].mean > 2 * found.regions[ALL].mean
+    assert worse.surface is not None
+    assert worse.surface.mean > 20 * found.surface.mean
+    assert all("known from an earlier run" in note for note in worse.notes)
+    registered = load_mesh(folder / "out" / "registered" / "s0.glb")
+    assert torch.equal(registered.faces, rig.neutral.faces)

@@ -1,0 +1,295 @@
+"""A performer is photographed, and the command makes a rig of the pictures that looks as the performer does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import load_rig, save_rig, zoo
+from torchface.cli import main
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, TopologyError
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.similarity import similarity_transform
+from torchface.io import load_identity_modes
+from torchface.io.camera_files import load_calibration
+from torchface.io.images.image_files import load_image, save_image
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.landmarks import NoFaceError, TrackedFace, find_faces
+from torchface.modeling import HeadModel, ImageFit, MorphableModel, fit_images
+from torchface.rendering.clay_shading import render
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
+from torchface.synthetic.head.identity import anatomy
+from torchface.workflows.fit.fit_checks import one_person_lines
+from torchface.workflows.fit.fit_model import load_head_model, matching
+from torchface.workflows.fit.found_landmarks import FoundLandmarks
+from torchface.workflows.fit.given_landmarks import landmarks_of
+from torchface.workflows.fit.photograph_rig import fit_photographs
+
+YAWS = (-35.0, 0.0, 35.0)
+SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
+
+
+@pytest.fixture(scope="module")
+def actor() -> BlendshapeRig:
+    return performer(draw_identities(1, torch.Generator().manual_seed(9))[0])
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory, actor: BlendshapeRig) -> Path:
+    """A folder with a head model, three photographs of a smile and their landmarks."""
+    folder = tmp_path_factory.mktemp("studio")
+    generator = torch.Generator().manual_seed(0)
+    heads = torch.stack([anatomy(who).vertices for who in draw_identities(60, generator)]).float()
+    colors = complexion_colors(draw_complexions(30, generator))
+    model = HeadModel.on(actor.neutral, MorphableModel.fit(heads, 15), MorphableModel.fit(colors, 4))
+    template = performer().select(SHAPES)
+    carrying = HeadModel.on(actor.neutral, model.shape, model.color, template)
+    for name, saved in (("heads", model), ("heads_with_rig", carrying)):
+        zoo.save_model(saved, folder / name, licence="MIT", data="performers", metrics={}, recipe="none")
+    save_rig(template, folder / "template.glb")
+    weights = torch.zeros(1, len(actor.names))
+    weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
+    smiling = actor.neutral.with_vertices(actor(weights)[0])
+    for i, yaw in enumerate(YAWS):
+        camera = look_at(smiling.vertices[smiling.landmarks].mean(0), yaw, span=320.0, width=240, height=300)
+        save_image(render(smiling, camera, background=(0.2, 0.3, 0.6), samples=1), folder / f"p{i}.png")
+        marks = camera.project(smiling.vertices[smiling.landmarks].double()) + 1
+        rows = "\n".join(f"{x:.3f} {y:.3f}" for x, y in marks.tolist())
+        (folder / f"p{i}.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
+    return folder
+
+
+def aligned_error(found: Tensor, true: Tensor) -> float:
+    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
+    return float((moved - true.double()).norm(dim=-1).mean())
+
+
+def test_the_command_makes_the_actors_rig(
+    studio: Path, actor: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rig.glb"
+    photographs = [str(studio / f"p{i}.png") for i in range(3)]
+    marks = [str(studio / f"p{i}.pts") for i in range(3)]
+    rest = ["--model", str(studio / "heads"), "--template", str(studio / "template.glb"), "--out", str(out)]
+    main(["fit", *photographs, "--landmarks", *marks, *rest, "--texture-size", "256", "--quiet"])
+    printed = capsys.readouterr()
+    assert str(out) in printed.out
+    assert "mouthSmile" in printed.err
+    made = load_rig(out)
+    assert list(made.names) == SHAPES
+    assert made.neutral.annotations is not None
+    assert actor.neutral.annotations is not None
+    skin = actor.neutral.annotations.regions["face"]
+    mean = performer(texture=False)
+    assert aligned_error(made.vertices[skin], actor.vertices[skin]) < 0.6 * aligned_error(
+        mean.vertices[skin], actor.vertices[skin]
+    )
+    assert made.neutral.texture is not None
+    assert made.neutral.texture.shape == (3, 256, 256)
+    blue = made.neutral.texture[2] > made.neutral.texture[0] + 0.15
+    assert float(blue.float().mean()) < 0.01  # none of the background
+    for i in range(3):
+        assert load_image(tmp_path / f"rig_{i + 1}_p{i}.png").shape == (3, 480, 1440)
+        camera = load_calibration(tmp_path / f"rig_{i + 1}_p{i}.toml")
+        assert (camera.width, camera.height) == load_image(studio / f"p{i}.png").shape[:0:-1]
+        assert not camera.assumed
+
+
+def test_landmarks_that_no_file_gives_are_found(
+    studio: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "rig.glb"
+    rest = ["--model", str(studio / "heads"), "--template", str(studio / "template.glb"), "--texture-size", "0"]
+    main(["fit", str(studio / "p1.png"), *rest, "--out", str(out), "--quiet"])
+    printed = capsys.readouterr()
+    assert "p1.png: landmarks found by face_landmarks in the face at" in printed.err
+    assert "confidence 0." in printed.err
+    written = tmp_path / "rig_1_p1.pts"
+    assert str(written) in printed.out
+    found, true = load_landmark_points(written).ibug(), load_landmark_points(studio / "p1.pts").ibug()
+    assert (found - true).norm(dim=1).mean() < 0.05 * (true[36] - true[45]).norm()
+    assert list(load_rig(out).names) == SHAPES
+
+
+def test_photographs_without_a_face_are_said(studio: Path, tmp_path: Path) -> None:
+    save_image(torch.full((3, 120, 160), 0.4), tmp_path / "wall.png")
+    template, out = studio / "template.glb", tmp_path / "rig.glb"
+    with pytest.raises(NoFaceError, match=r"wall\.png: found no face, expected one at least; .* with --landmarks"):
+        fit_photographs([tmp_path / "wall.png"], [], studio / "heads", out, template)
+    with pytest.raises(NoFaceError, match=r"p1\.png: found 1 face, expected more than 1"):
+        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, face=1)
+    with pytest.raises(NameMismatchError, match="a HeadModel, expected a LandmarkTrees"):
+        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, landmark_model=studio / "heads")
+    assert not out.exists()
+
+
+def test_unsure_landmarks_are_left_out(studio: Path) -> None:
+    points = torch.linspace(10, 60, 68)[:, None].expand(-1, 2).clone()
+    points[3] = torch.tensor([-4.0, 20.0])
+    confidence = torch.full((68,), 0.8)
+    confidence[60:] = 0.05
+    face = TrackedFace(points, torch.tensor([10.0, 10, 60, 60]), confidence)
+    boxes = torch.tensor([[200.0, 5, 80, 80], [10, 10, 60, 60]])
+    found = FoundLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
+    assert found.trusted.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
+    assert "lowest at the mouth with 0.50; 9 left out" in found.lines()[0]
+    assert found.lines()[1] == "  number 1 of 2 faces; others with --face 0: at (200, 5)"
+    unsure = TrackedFace(points, face.box, torch.full((68,), 0.1))
+    kept = FoundLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).trusted
+    assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
+
+
+def test_a_rig_that_travels_with_the_model_needs_no_template(studio: Path, tmp_path: Path) -> None:
+    photographs, marks = [studio / "p1.png"], [studio / "p1.pts"]
+    plain = fit_photographs(photographs, marks, studio / "heads", tmp_path / "a.glb", studio / "template.glb")
+    own = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "b.glb")
+    assert own.rig.names == tuple(SHAPES)
+    torch.testing.assert_close(own.rig.deltas, plain.rig.deltas, rtol=0, atol=0.02)
+    skin = performer(texture=False).neutral.annotations
+    assert skin is not None
+    face = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "c.glb", part="face")
+    assert len(face.rig.vertices) == int(skin.regions["face"].sum())
+    assert aligned_error(face.rig.vertices, own.rig.vertices[skin.regions["face"]]) < 0.5
+
+
+def test_a_model_of_a_part_says_which_part_of_the_template_it_meets(studio: Path) -> None:
+    template = performer(texture=False)
+    assert template.neutral.annotations is not None
+    heads = load_head_model(studio / "heads").part(template.neutral.annotations.regions["face"])
+    with pytest.raises(TopologyError, match=r"found 6419 vertices .*; try --part face"):
+        matching(heads, studio / "template.glb")
+    model, rig = matching(heads, studio / "template.glb", "face")
+    assert model is heads
+    assert len(rig.vertices) == len(heads.shape.mean)
+
+
+def dlib_xml(path: Path, faces: list[tuple[str, int]]) -> Path:
+    boxes = "".join(
+        f"<image file='{name}'><box top='1' left='{k}' width='9' height='9'>"
+        + "".join(f"<part name='{n:02d}' x='{n + k}' y='{2 * n}'/>" for n in range(count))
+        + "</box></image>"
+        for k, (name, count) in enumerate(faces)
+    )
+    path.write_text(f"<dataset><images>{boxes}</images></dataset>")
+    return path
+
+
+def test_an_xml_tells_whose_face_is_meant(tmp_path: Path) -> None:
+    photographs = [tmp_path / name for name in ("a.png", "b.png")]
+    for path in photographs:
+        save_image(torch.full((3, 60, 80), 0.5), path)
+    file = dlib_xml(tmp_path / "faces.xml", [("x/a.png", 68), ("b.png", 68), ("b.png", 68), ("c.png", 5)])
+    with pytest.raises(NameMismatchError, match=r"found 2 faces in b\.png, choose one of --face 0: at \(1, 1\), 1: at"):
+        landmarks_of(photographs, [file])
+    with pytest.raises(NameMismatchError, match=r"found 1 faces in a\.png, expected more than 1"):
+        landmarks_of(photographs, [file], face=1)
+    first, second = landmarks_of(photographs, [file], face=0)
+    assert (float(first[0, 0]), float(second[0, 0])) == (0.0, 1.0)
+    with pytest.raises(NameMismatchError, match=r"found no face in d\.png"):
+        landmarks_of([Path("d.png")], [file])
+    with pytest.raises(ShapeError, match=r"found 5 landmarks in c\.png, expected 68"):
+        landmarks_of([Path("c.png")], [file])
+
+
+def test_files_that_do_not_belong_together_are_named(studio: Path, tmp_path: Path, dome_rig: BlendshapeRig) -> None:
+    photographs = [studio / f"p{i}.png" for i in range(3)]
+    with pytest.raises(NameMismatchError, match="found 1 files for 3 photographs"):
+        landmarks_of(photographs, [studio / "p0.pts"])
+    (tmp_path / "space.pts").write_text("version: 1\nn_points: 68\n{\n" + "1 2 3\n" * 68 + "}\n")
+    with pytest.raises(FileFormatError, match="three numbers each"):
+        landmarks_of(photographs[:1], [tmp_path / "space.pts"])
+    with pytest.raises(FileFormatError, match=r"expected \.glb"):
+        fit_photographs(photographs, [], studio / "heads", tmp_path / "rig.obj")
+    dome = HeadModel.on(dome_rig.neutral, MorphableModel(dome_rig.vertices, dome_rig.deltas[:1], torch.ones(1)))
+    with pytest.raises(TopologyError, match="name a rig with --template"):
+        matching(dome)
+
+
+@pytest.mark.real
+def test_a_face_has_one_number_with_and_without_a_file(data: Path) -> None:
+    folder = data / "images" / "dlib_faces"
+    file, compared = folder / "training_with_face_landmarks.xml", 0
+    for photograph in sorted(folder.glob("*.jpg"))[::3]:
+        image = load_image(photograph)
+        detected = find_faces((image * 255).to(torch.uint8))
+        for number, box in enumerate(detected.boxes):
+            points = landmarks_of([photograph], [file], number)[0]
+            inside = ((points >= box[:2] - 0.3 * box[2:]) & (points <= box[:2] + 1.3 * box[2:])).all(1)
+            if not bool(((points.mean(0) >= box[:2]) & (points.mean(0) <= box[:2] + box[2:])).all()):
+                continue  # a face that the file does not label
+            assert float(inside.double().mean()) > 0.9
+            compared += 1
+    assert compared >= 6
+
+
+PEOPLE = ("einstein.jpg", "lfpw_1.png", "lfpw_2.png", "takeo.ppm")
+"""The second and third are one woman."""
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """A model of people, and photographs with their landmarks."""
+
+    model: Path
+    photographs: list[Path]
+    heads: HeadModel
+    rig: BlendshapeRig
+
+    def remarks(self, *which: int, insist: bool = False) -> list[str]:
+        photographs = [self.photographs[i] for i in which]
+        marks = torch.stack(landmarks_of(photographs, [path.with_suffix(".pts") for path in photographs]))
+        sizes = [load_image(path).shape[:0:-1] for path in photographs]
+
+        def bare(points: Tensor, rows: list[int]) -> ImageFit:
+            return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], transfers=0)
+
+        return one_person_lines(photographs, marks, bare, insist)
+
+
+@pytest.fixture(scope="module")
+def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> People:
+    modes, rig = load_identity_modes(ict_folder, part="face"), load_rig(ict_folder, part="face")
+    sizes = modes.deltas.flatten(1).norm(dim=1)
+    heads = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes.deltas / sizes[:, None, None], sizes), rig=rig)
+    model = tmp_path_factory.mktemp("models") / "people"
+    zoo.save_model(heads, model, licence="MIT", data="ICT", metrics={}, recipe="none")
+    return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
+
+
+@pytest.mark.real
+def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) -> None:
+    photographs, out = [people.photographs[0], people.photographs[3]], tmp_path / "rig.glb"
+    marks = [path.with_suffix(".pts") for path in photographs]
+    with pytest.raises(AlignmentError, match=r"shows another person than the rest.*einstein\.jpg -[45]\..*--insist"):
+        fit_photographs(photographs, marks, people.model, out)
+    assert not out.exists()
+    assert any("may show different people" in line for line in people.remarks(0, 3, insist=True))
+    for stranger in (0, 3):
+        for known in (1, 2):
+            assert any("may show different people" in line for line in people.remarks(stranger, known, insist=True))
+    assert people.remarks(1, 2) == []
+    with pytest.raises(AlignmentError, match=r"einstein\.jpg: shows another person"):
+        people.remarks(0, 1, 2)
+
+
+@pytest.mark.real
+def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path) -> None:
+    photograph = people.photographs[3]
+    files = [photograph.with_suffix(".pts")]
+    made = fit_photographs([photograph], files, people.model, tmp_path / "rig.glb", texture_size=0)
+    assert len(made.remarks) == 1
+    assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
+    assert "those that face_landmarks finds are" in made.remarks[0]
+    assert made.remarks[0] in made.lines([photograph])
+
+
+def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Path) -> None:
+    photographs, marks = ([studio / f"p{i}.{ending}" for i in range(3)] for ending in ("png", "pts"))
+    made = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "rig.glb", texture_size=0)
+    assert made.remarks == ()

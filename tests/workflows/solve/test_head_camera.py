@@ -1,0 +1,50 @@
+"""Curves of a video, brought to the frames of a take."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchface import Take, Track
+from torchface.capture.action_units import ActionUnitCurves
+from torchface.workflows.solve.head_camera import laid_beside
+
+
+def curves(frames: int, fps: float) -> ActionUnitCurves:
+    """A brow that goes up between 0.5 and 1 s, and a jaw that no unit moves."""
+    time = torch.arange(frames) / fps
+    up = ((time > 0.5) & (time < 1.0)).float()
+    weights = torch.stack([up * (2 * torch.pi * (time - 0.5)).sin(), torch.zeros(frames)], 1)
+    active = torch.stack([up > 0, torch.zeros(frames, dtype=torch.bool)], 1)
+    return ActionUnitCurves(("browInnerUp", "jawOpen"), weights, active, ("1+2",), up[:, None], up[:, None], fps)
+
+
+def take(frames: int, fps: float) -> Take:
+    return Take(fps, markers=Track(("m",), torch.zeros(frames, 1, 3)))
+
+
+def test_the_same_rate_leaves_the_curves_as_they_are() -> None:
+    found = laid_beside(curves(90, 60), take(90, 60))
+    assert found.weights.names == found.gamma.names == ("browInnerUp",)
+    assert torch.equal(found.weights.values[:, 0, 0], curves(90, 60).weights[:, 0])
+    assert found.notes == ("take and video are taken to begin together",)
+    assert float(found.gamma.values[45, 0, 0]) == 4.0
+    assert not found.gamma.values[:15].any()
+
+
+@pytest.mark.parametrize("fps", [30.0, 50.0, 120.0])
+def test_another_rate_is_brought_to_the_takes(fps: float) -> None:
+    found = laid_beside(curves(int(1.5 * fps), fps), take(85, 60))
+    true = curves(85, 60).weights[:, 0]
+    inside = (torch.arange(85) > 33) & (torch.arange(85) < 57)
+    assert float((found.weights.values[:, 0, 0] - true)[inside].abs().max()) < 0.05
+    assert "brought to the take's 60" in found.notes[0]
+
+
+def test_where_the_video_ends_the_markers_are_alone() -> None:
+    found = laid_beside(curves(50, 60), take(90, 60))
+    assert "ends 40 frames before the take" in found.notes[0]
+    assert not found.gamma.values[60:].any()
+    longer = laid_beside(curves(90, 60), take(50, 60))
+    assert "40 frames after the take" in longer.notes[0]
+    assert len(longer.weights) == 50

@@ -1,0 +1,183 @@
+"""What ``torchface solve`` refuses, and what it only warns of, with the figure and the way out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture import HelmetSolver, MarkerSolver
+from torchface.cli import main
+from torchface.errors import ValueRangeError
+from torchface.geometry.similarity import Similarity
+from torchface.io import load_take, save_rig, save_take
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
+from torchface.take import Take, Track
+from torchface.workflows.solve.take_check import check_coverage
+
+FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def stage(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a rig, an attachment, and a take that fits them."""
+    folder = tmp_path_factory.mktemp("stage")
+    sites = place_markers(dome_rig, 30)
+    weights = 0.5 + 0.5 * torch.sin(torch.arange(FRAMES)[:, None] / torch.tensor([7.0, 11, 5, 13]))
+    flaws = StageFlaws(noise=0.05, missing=0.05)
+    take = record(dome_rig, sites, weights, torch.Generator().manual_seed(0), flaws).take
+    save_rig(dome_rig, folder / "rig.glb")
+    sites.save(folder / "attachment.json")
+    save_take(take, folder / "take.c3d")
+    return folder
+
+
+def changed(stage: Path, name: str, change: Callable[[Tensor], Tensor]) -> Path:
+    take = load_take(stage / "take.c3d")
+    assert take.markers is not None
+    save_take(Take(take.fps, markers=Track(take.markers.names, change(take.markers.values))), stage / name)
+    return stage / name
+
+
+def solve(stage: Path, take: Path, *more: str | Path, attachment: str = "attachment.json") -> Path:
+    out = stage / "weights.csv"
+    out.unlink(missing_ok=True)
+    words = ["solve", stage / "rig.glb", take, "--attachment", stage / attachment, "--out", out, "--quiet", *more]
+    main([str(word) for word in words])
+    return out
+
+
+def elsewhere(markers: Tensor) -> Tensor:
+    turn = torch.tensor([[math.cos(0.7), -math.sin(0.7), 0], [math.sin(0.7), math.cos(0.7), 0], [0, 0, 1]])
+    return Similarity(torch.ones(1), turn[None], torch.tensor([[100.0, -900, 40]])).apply(markers)
+
+
+def mixed_up(stage: Path) -> str:
+    sites = Attachment.load(stage / "attachment.json")
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(0))
+    replace(sites, triangles=sites.triangles[order], barycentric=sites.barycentric[order]).save(stage / "mixed.json")
+    return "mixed.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "attachment", "more", "cause"),
+    [
+        (elsewhere, False, (), "in another space: add --align"),
+        (lambda markers: markers / 1000, False, (), "seems to be in metres: add --unit m"),
+        (lambda markers: markers / 10, False, (), "seems to be in centimetres: add --unit cm"),
+        (lambda markers: markers, True, (), "labels are mixed up"),
+        (lambda markers: markers, True, ("--align",), "labels are mixed up"),
+    ],
+)
+def test_a_take_that_the_rig_does_not_explain_is_refused_with_the_cause(
+    stage: Path,
+    change: Callable[[Tensor], Tensor],
+    attachment: bool,
+    more: tuple[str, ...],
+    cause: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    take = changed(stage, "bad.c3d", change)
+    where = mixed_up(stage) if attachment else "attachment.json"
+    with pytest.raises(SystemExit) as ended:
+        solve(stage, take, *more, attachment=where)
+    assert ended.value.code == 2
+    assert not (stage / "weights.csv").exists()
+    told = " ".join(capsys.readouterr().err.split())
+    assert "bad.c3d" in told
+    assert "mm (median)" in told
+    assert cause in told
+    assert solve(stage, take, *more, "--insist", attachment=where).is_file()
+    assert "warning: the rig brings the marker sites no nearer" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_unit_said_by_hand_gives_the_same_weights(stage: Path) -> None:
+    metres = changed(stage, "metres.c3d", lambda markers: markers / 1000)
+    right = load_take(solve(stage, stage / "take.c3d")).weights
+    said = load_take(solve(stage, metres, "--unit", "m")).weights
+    assert right is not None
+    assert said is not None
+    torch.testing.assert_close(said.values, right.values, atol=1e-3, rtol=0)
+
+
+def test_a_take_that_fits_is_solved_without_a_warning(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    solve(stage, stage / "take.c3d")
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_coverage_is_of_the_attachment(
+    stage: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    take = load_take(stage / "take.c3d")
+    assert take.markers is not None
+    for count, name in ((12, "some.c3d"), (1, "one.c3d")):
+        save_take(replace(take, markers=take.markers.select(take.markers.names[:count])), stage / name)
+    solve(stage, stage / "some.c3d")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "warning: the take shows 12 of the attachment's 30 markers" in told
+    share = float(torch.isfinite(take.markers.values[:, :12, 0]).double().mean()) * 12 / 30
+    assert f"{100 * share:.1f} % of the attachment's marker samples seen" in told
+    with pytest.raises(SystemExit):
+        solve(stage, stage / "one.c3d")
+    assert not (stage / "weights.csv").exists()
+    assert "found 1 of the attachment's 30 markers" in " ".join(capsys.readouterr().err.split())
+    solve(stage, stage / "one.c3d", "--insist")
+    assert "too few for 4 shapes" in " ".join(capsys.readouterr().err.split())
+
+
+def test_frames_that_show_too_few_markers_are_counted(stage: Path) -> None:
+    take = load_take(stage / "take.c3d")
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    values[10:17, 1:] = torch.nan
+    values[10:17, 0] = 0
+    poor = Take(60.0, markers=Track(take.markers.names, values))
+    assert check_coverage(Attachment.load(stage / "attachment.json"), poor, 4).poor == 7
+
+
+@pytest.mark.parametrize("more", [(), ("--frame-by-frame",), ("--frame-by-frame", "--slip", "--clean")])
+def test_frames_without_a_marker_are_bridged_and_named(
+    stage: Path, more: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = [40, 41, 42, 90]
+
+    def without(markers: Tensor) -> Tensor:
+        markers = markers.clone()
+        markers[empty] = torch.nan
+        return markers
+
+    written = load_take(solve(stage, changed(stage, "empty.c3d", without), *more)).weights
+    assert "4 frames (40–42, 90) show no marker" in " ".join(capsys.readouterr().err.split())
+    whole = load_take(solve(stage, stage / "take.c3d", *more)).weights
+    assert written is not None
+    assert whole is not None
+    assert torch.isfinite(written.values).all()
+    assert float((written.values - whole.values)[empty].abs().max()) < 0.1
+
+
+def test_solvers_put_empty_frames_between_their_neighbours(stage: Path, dome_rig: BlendshapeRig) -> None:
+    solver = MarkerSolver(dome_rig, Attachment.load(stage / "attachment.json"))
+    take = load_take(stage / "take.c3d")
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    values[[0, 50, 51, 52]] = torch.nan
+    gapped = Take(60.0, markers=Track(take.markers.names, values))
+    full, bridged = solver.solve_take(take).weights, solver.solve_take(gapped).weights
+    assert full is not None
+    assert bridged is not None
+    kept = [i for i in range(FRAMES) if i not in (0, 50, 51, 52)]
+    torch.testing.assert_close(bridged.values[kept], full.values[kept], atol=1e-4, rtol=0)
+    torch.testing.assert_close(bridged.values[0], bridged.values[1])
+    torch.testing.assert_close(bridged.values[51], (bridged.values[49] + bridged.values[53]) / 2)
+    _, motion = HelmetSolver(dome_rig, Attachment.load(stage / "attachment.json")).solve_take(gapped)
+    assert torch.equal(motion.translation[50], motion.translation[49])
+    assert torch.equal(motion.rotation[0], motion.rotation[1])
+    with pytest.raises(ValueRangeError, match="none in any of 120 frames"):
+        solver.solve_take(Take(60.0, markers=Track(take.markers.names, torch.full_like(values, torch.nan))))

@@ -1,0 +1,41 @@
+"""A posed rig is the rig at those weights, from whatever file it lies in."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.io import save_mesh, save_rig, save_take
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.workflows.posed_mesh import load_posed, pose_weights
+
+
+def test_pose_by_words_and_by_take_is_the_rig_at_those_weights(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    save_rig(dome_rig, tmp_path / "rig.glb")
+    by_words = load_posed(tmp_path / "rig.glb", pose_weights(["jawOpen=0.5", "MouthSmileLeft=1"]))
+    expected = dome_rig(torch.tensor([[0.5, 0, 1, 0]]))[0]
+    torch.testing.assert_close(by_words.mesh.vertices, expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(by_words.neutral.vertices, dome_rig.vertices, atol=1e-3, rtol=0)
+    weights = torch.rand(5, 4, 1, generator=torch.Generator().manual_seed(0))
+    save_take(Take(60.0, weights=Track(dome_rig.names, weights)), tmp_path / "take.csv")
+    by_take = load_posed(tmp_path / "rig.glb", {}, tmp_path / "take.csv", 3)
+    torch.testing.assert_close(by_take.mesh.vertices, dome_rig(weights[3:4, :, 0])[0], atol=1e-3, rtol=0)
+
+
+def test_what_cannot_be_posed_is_said(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    save_rig(dome_rig, tmp_path / "rig.glb")
+    save_mesh(dome_rig.neutral, tmp_path / "mesh.obj")
+    with pytest.raises(NameMismatchError, match=r"mesh.obj: found a mesh without shapes"):
+        load_posed(tmp_path / "mesh.obj", {"jawOpen": 1.0})
+    with pytest.raises(NameMismatchError, match="found tongueOut; expected shapes of the rig: jawOpen"):
+        load_posed(tmp_path / "rig.glb", {"tongueOut": 1.0})
+    with pytest.raises(NameMismatchError, match=r"found jawOpn; expected shapes of the rig: did you mean jawOpen\?"):
+        load_posed(tmp_path / "rig.glb", {"jawOpn": 1.0})
+    save_mesh(dome_rig.neutral, tmp_path / "plain.glb")
+    at_rest = load_posed(tmp_path / "plain.glb", {}).mesh.vertices
+    torch.testing.assert_close(at_rest, dome_rig.vertices, atol=1e-3, rtol=0)
+    for word in ("jawOpen", "=1", "jawOpen=wide", "jawOpen=nan", "jawOpen=1e9"):
+        with pytest.raises(ValueRangeError, match="expected NAME=NUMBER"):
+            pose_weights([word])

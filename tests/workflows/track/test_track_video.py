@@ -1,0 +1,370 @@
+"""A filmed performer comes back as weights, whatever happens on the way; what cannot be tracked is told."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
+from torchface.capture.priors import ShapePrior
+from torchface.cli import main
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.rotations import rotation_matrix
+from torchface.io.camera_files import save_calibration
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.video import open_video, write_video
+from torchface.io.weights.live_link_stream import decode_frame
+from torchface.landmarks.images.tracking import LandmarkTracker, TrackedFace
+from torchface.rendering.point_light import PointLight
+from torchface.shape_names import ARKIT
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.workflows.live.live_track import track_live
+from torchface.workflows.track import track_video as workflow
+from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.track.track_models import TrackModels, load_track_models
+from torchface.workflows.track.track_overlay import mesh_drawer, paint_drawer, undistorted
+from torchface.workflows.track.track_page import write_track_page
+from torchface.workflows.track.track_state import FOLDER, TrackedFrames, TrackState
+from torchface.workflows.track.track_video import Tracked, TrackSettings, check_length, track_video
+
+FRAMES = 11
+PIECE = 4
+QUICK = TrackSettings(overlay=False)
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """A film, its rig's file, and what was performed."""
+
+    video: Path
+    rig: Path
+    camera: Path
+    actor: BlendshapeRig
+    weights: torch.Tensor
+    landmarks: torch.Tensor
+    rotation: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Done:
+    """What tracking gave; what lay in its folder when it was killed, and how many frames were tracked after that."""
+
+    tracked: Tracked
+    out: Path
+    left: tuple[str, ...]
+    steps: int
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    """The mean performer opens the jaw, smiles and raises the brows while the head turns."""
+    folder = tmp_path_factory.mktemp("film")
+    actor = performer(texture=True)
+    weights = torch.zeros(FRAMES, len(actor.names))
+    ramp = torch.linspace(0, 1, FRAMES)
+    for name, size in {"jawOpen": 0.8, "browInnerUp": 0.9, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.7}.items():
+        weights[:, actor.names.index(name)] = size * (ramp if name == "jawOpen" else (math.pi * ramp).sin())
+    light = PointLight(torch.full((3,), 0.35), torch.full((3,), 0.7), torch.tensor([-500.0, -700.0, 100.0]))
+    settings = LightStageSettings(width=160, height=120, samples=1, turn=12.0)
+    film = film_under_light(
+        folder / "film.avi", actor, weights, light, 30.0, torch.Generator().manual_seed(0), settings
+    )
+    save_rig(actor, folder / "rig.glb")
+    intrinsics = film.cameras[0].intrinsics
+    save_calibration(CameraCalibration(intrinsics, torch.zeros(5), 160, 120, 0.1), folder / "camera.toml")
+    marks = actor.neutral.landmarks
+    landmarks = torch.stack([
+        camera.project(actor(weights[t : t + 1])[0, marks].double()) for t, camera in enumerate(film.cameras)
+    ])  # fmt: skip
+    rotation = torch.stack([camera.rotation for camera in film.cameras])
+    return Filmed(
+        folder / "film.avi", folder / "rig.glb", folder / "camera.toml", actor, weights, landmarks.float(), rotation
+    )
+
+
+@pytest.fixture(scope="module")
+def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """The film tracked with everything, in pieces of a few frames; killed in the third piece and started again."""
+    out = tmp_path_factory.mktemp("tracked") / "out"
+    settings = TrackSettings(camera=filmed.camera)
+
+    def killed(what: str, frames: int, total: int) -> None:
+        if what == "landmarks" and frames == 2 * PIECE + 2:
+            raise KeyboardInterrupt
+
+    steps = 0
+    step = LandmarkTracker.step
+
+    def counted(self: LandmarkTracker, frame: torch.Tensor) -> TrackedFace:
+        nonlocal steps
+        steps += 1
+        return step(self, frame)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workflow, "PIECE", PIECE)
+        with pytest.raises(KeyboardInterrupt):
+            track_video(filmed.video, filmed.rig, out, settings, killed)
+        left = tuple(path.name for path in out.iterdir())
+        patch.setattr(LandmarkTracker, "step", counted)
+        tracked = track_video(filmed.video, filmed.rig, out, settings)
+    return Done(tracked, out, left, steps)
+
+
+def test_a_filmed_performer_comes_back(done: Done, filmed: Filmed) -> None:
+    tracked = done.tracked
+    assert tracked.seen.all()
+    off = (tracked.frames.landmarks - filmed.landmarks).norm(dim=2)[:, 17:]
+    assert float(off.mean()) < 0.05 * float((filmed.landmarks[0, 36] - filmed.landmarks[0, 45]).norm())
+    turned = tracked.solution.rotation.double() @ filmed.rotation.transpose(1, 2)
+    angle = torch.rad2deg((((turned.diagonal(dim1=1, dim2=2).sum(1)) - 1) / 2).clamp(-1, 1).acos())
+    assert float(angle.mean()) < 7  # landmarks of so small a face are off by 4 % of the distance of the eyes
+    marks = filmed.actor.neutral.landmarks
+    true = filmed.actor(filmed.weights)[:, marks]
+    still = (true - filmed.actor.vertices[marks]).norm(dim=2).mean()
+    error = (filmed.actor(tracked.solution.weights)[:, marks] - true).norm(dim=2).mean()
+    assert float(error) < 0.6 * float(still)
+    jaw = filmed.actor.names.index("jawOpen")
+    assert float(torch.corrcoef(torch.stack([tracked.solution.weights[:, jaw], filmed.weights[:, jaw]]))[0, 1]) > 0.9
+
+
+def test_every_file_tells_the_same(done: Done) -> None:
+    tracked, out = done.tracked, done.out
+    own = load_take(out / "weights.csv")
+    assert own.fps == 30.0
+    assert own.weights is not None
+    torch.testing.assert_close(own.weights.values[..., 0], tracked.solution.weights.float())
+    played = read_gltf_weights(out / "animation.glb")
+    assert played is not None
+    assert played.weights is not None
+    torch.testing.assert_close(played.weights.values, own.weights.values)
+    unreal = load_take(out / "live_link.csv")
+    assert unreal.weights is not None
+    assert {name.lower() for name in unreal.weights.names} == {name.lower() for name in ARKIT}
+    angles = head_angles(tracked.solution.rotation.double())
+    for i, name in enumerate(("HeadYaw", "HeadPitch", "HeadRoll")):
+        torch.testing.assert_close(unreal.extras["columns"][name], angles[:, i], atol=1e-6, rtol=0)
+    marks = load_take(out / "landmarks.csv")
+    assert marks.landmarks is not None
+    torch.testing.assert_close(marks.landmarks.values, tracked.frames.landmarks)
+    depth = marks.extras["columns"]["pose_Tz"]
+    torch.testing.assert_close(depth, tracked.solution.translation[:, 2].double(), atol=1e-3, rtol=0)
+    drawn = open_video(out / "overlay.mp4")
+    assert (drawn.width, drawn.height) == (160, 120)
+    assert len(list(drawn.frames())) == FRAMES
+    told = json.loads((out / "summary.json").read_text())
+    assert told["found"] == FRAMES
+    assert told["camera_assumed"] is False
+    assert not list(out.rglob("*.part*"))
+
+
+def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
+    page = write_track_page(done.tracked, tmp_path).read_text()
+    for picture in ("frames.png", "error.png", "head.png", "weights1.png"):
+        assert picture in page
+        assert (tmp_path / picture).is_file()
+    assert "as given, 0.10 px from what it was fitted to" in page
+    assert "frames with a face" in page
+
+
+def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
+    assert done.left == (FOLDER,)
+    assert done.steps == FRAMES - 2 * PIECE
+    assert done.tracked.reused == 2 * PIECE
+    tracker = LandmarkTracker(zoo.get_model("face_landmarks"))
+    whole: list[torch.Tensor] = []
+    for number, frame in enumerate(open_video(filmed.video).frames()):
+        if number and number % PIECE == 0:  # as a run that is not killed does
+            tracker.resume(seen.landmarks, seen.confidence)  # noqa: F821
+        seen = tracker.step(frame)
+        whole.append(seen.landmarks)
+    assert torch.equal(done.tracked.frames.landmarks, torch.stack(whole))
+
+
+def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(done.out, out)
+    made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
+    again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    assert set(again.seconds) == {"pose"}
+    torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
+    smooth = track_video(
+        filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay=False, whole_take=True)
+    )
+    assert set(smooth.seconds) == {"pose", "weights"}  # landmarks stay
+    assert not torch.equal(smooth.solution.weights, again.solution.weights)
+
+
+def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:
+    piece = TrackedFrames(torch.rand(4, 68, 2), torch.rand(4, 68), torch.rand(4, 4))
+    state = TrackState(tmp_path, "a")
+    for _ in range(3):
+        state.append(piece)
+    assert TrackState(tmp_path, "a").done == 12
+    files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
+    files[1].write_bytes(files[1].read_bytes()[:-7])
+    assert TrackState(tmp_path, "a").done == 4
+    assert [path.exists() for path in files] == [True, False, False]
+    assert TrackState(tmp_path, "b").done == 0
+    product = tmp_path / "x.csv"
+    product.write_text("x")
+    state.made(product, "k")
+    assert state.is_current(product, "k")
+    assert not state.is_current(product, "l")
+    (tmp_path / FOLDER / "track.json").write_text("[[[")
+    assert not state.is_current(product, "k")
+
+
+def test_paint_stays_on_the_skin_and_landmarks_are_drawn_where_they_are(
+    done: Done, filmed: Filmed, tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    tracked = done.tracked
+    frame = next(open_video(filmed.video).color_frames())
+    Image.new("RGBA", (8, 8), (0, 0, 255, 255)).save(tmp_path / "blue.png")
+    light = PointLight(torch.full((3,), 0.5), torch.full((3,), 0.5), torch.tensor([-500.0, -700.0, 100.0]))
+    painted = paint_drawer(Tracked(**{**vars(tracked), "light": light}), tmp_path / "blue.png")(0, frame)
+    changed = (painted != frame).any(0)
+    x, y = tracked.frames.landmarks[0, [30, 8]].round().long().T.tolist()
+    assert changed[y[0], x[0]]
+    assert painted[2, y[0], x[0]] > painted[0, y[0], x[0]] + 60
+    assert not changed[:, :20].any()
+    assert not changed[:, -20:].any()
+    drawn = mesh_drawer(tracked)(0, frame)
+    assert drawn[1, y[0], x[0]] > 180  # a green dot
+    assert torch.equal(drawn[:, :, :10], frame[:, :, :10])
+    assert torch.equal(undistorted(frame, tracked.calibration), frame)
+
+
+def test_head_angles_are_yaw_pitch_and_roll() -> None:
+    facing = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    yaw, pitch, roll = 0.4, -0.3, 0.2
+
+    def about(*vector: float) -> torch.Tensor:
+        return rotation_matrix(torch.tensor(vector, dtype=torch.float64))
+
+    turned = facing @ about(0, yaw, 0) @ about(pitch, 0, 0) @ about(0, 0, roll)
+    torch.testing.assert_close(head_angles(turned), torch.tensor([yaw, pitch, roll], dtype=torch.float64))
+    assert torch.isnan(head_angles(turned * torch.nan)).all()
+
+
+def test_what_cannot_be_tracked_is_told_and_leaves_nothing(
+    filmed: Filmed, dome_rig: BlendshapeRig, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    save_rig(dome_rig, tmp_path / "dome.glb")
+    with pytest.raises(ValueRangeError, match=r"dome.glb: found no landmark vertices, expected the 68"):
+        track_video(filmed.video, tmp_path / "dome.glb", out, QUICK)
+    (tmp_path / "junk.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
+    with pytest.raises(FileFormatError, match=r"junk.mp4"):
+        track_video(tmp_path / "junk.mp4", filmed.rig, out, QUICK)
+    noise = (255 * torch.rand(6, 96, 128, generator=torch.Generator().manual_seed(0))).to(torch.uint8)
+    write_video([noise], tmp_path / "noise.avi", 30.0)
+    with pytest.raises(ValueRangeError, match=r"noise.avi: found no face in any of its 6 frames"):
+        track_video(tmp_path / "noise.avi", filmed.rig, out, QUICK)
+    (tmp_path / "camera.toml").write_text(
+        'format = "torchface.camera/1"\nwidth = 300\nheight = 100\nfocal = [300, 300]\ncenter = [150, 50]\n'
+    )
+    with pytest.raises(ValueRangeError, match=r"camera.toml.*made for 300 x 100 pixels"):
+        track_video(filmed.video, filmed.rig, out, TrackSettings(camera=tmp_path / "camera.toml"))
+    assert not out.exists()
+
+
+def test_models_that_do_not_fit_are_told(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    with pytest.raises(NameMismatchError, match="--landmarks: found head, a HeadModel, expected a LandmarkTrees"):
+        load_track_models(dome_rig, "head")
+    with pytest.raises(NameMismatchError, match="--dynamics: found face_landmarks, a LandmarkTrees"):
+        load_track_models(dome_rig, dynamics="face_landmarks")
+    takes = [torch.rand(60, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
+    prior = ShapePrior.fit(takes, ("jawLeft", "mouthLeft", "browDownLeft"))
+    zoo.save_model(prior, tmp_path / "other", licence="MIT", data="none", metrics={}, recipe="none")
+    with pytest.raises(NameMismatchError, match=r"other: .*jawLeft"):
+        load_track_models(dome_rig, prior=tmp_path / "other")
+
+
+def test_priors_of_arkits_names_serve_other_spellings_and_rates(dome_rig: BlendshapeRig) -> None:
+    names = [f"{name.removesuffix('Left')}_L" if name.endswith("Left") else name for name in dome_rig.names]
+    rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names)
+    models = load_track_models(rig, prior="shape_prior", dynamics="dynamics_prior", fps=30.0)
+    assert models.prior is not None
+    assert models.dynamics is not None
+    assert models.prior.names == models.dynamics.names == tuple(names)
+    assert models.dynamics.fps == 30.0
+    with pytest.raises(ValueRangeError, match=r"dynamics_prior: .*found 2 frames a second, expected from 7.5 to 480"):
+        load_track_models(rig, dynamics="dynamics_prior", fps=2.0)
+
+
+def test_a_take_shorter_than_the_window_is_told() -> None:
+    class Short:
+        window, fps = 8, 60.0
+
+    models = TrackModels(None, dynamics=Short())  # type: ignore[arg-type]
+    check_length(9, models, Path("take.mp4"))
+    with pytest.raises(ValueRangeError, match=r"take.mp4: found 8 frames, expected more than the 8"):
+        check_length(8, models, Path("take.mp4"))
+
+
+def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path: Path) -> None:
+    frame = next(open_video(filmed.video).color_frames()).float()[None]
+    small = torch.nn.functional.interpolate(frame, scale_factor=0.75, mode="bilinear", antialias=True)
+    wide = torch.full((2, 3, 120, 300), 110.0)
+    wide[..., :160] = frame
+    wide[..., 15:105, 170:290] = small
+    write_video([wide.round().to(torch.uint8)], tmp_path / "two.avi", 30.0)
+    tracked = track_video(tmp_path / "two.avi", filmed.rig, tmp_path / "out", TrackSettings(face=1, overlay=False))
+    assert float(tracked.frames.landmarks[..., 0].min()) > 170
+    assert tracked.faces == 2
+    told = " ".join(tracked.lines())
+    assert "2 faces in the first frame" in told
+    assert "camera: none given; assumed a field of view of 60 degrees" in told
+
+
+def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        address = f"udp://127.0.0.1:{receiver.getsockname()[1]}"
+        report = track_live(str(filmed.video), filmed.rig, address, tmp_path)
+        frames = [decode_frame(receiver.recv(2048)) for _ in range(len(report.weights))]
+    assert len(report.weights) + report.dropped == FRAMES
+    assert report.found.all()
+    jaw = torch.stack([frame.weights[ARKIT.index("jawOpen")] for frame in frames])
+    torch.testing.assert_close(jaw, report.weights[:, filmed.actor.names.index("jawOpen")])
+    assert frames[-1].rotations[:3].abs().max() > 0
+    kept = load_take(tmp_path / "weights.csv").weights
+    assert kept is not None
+    torch.testing.assert_close(kept.values[..., 0], report.weights)
+    with pytest.raises(ValueRangeError, match="expected an address"):
+        track_live(str(filmed.video), filmed.rig, "tcp://x")
+    with pytest.raises(FileFormatError, match="camera 97: cannot be opened"):
+        track_live("97", filmed.rig, address)
+
+
+def test_the_command_says_what_is_missing(filmed: Filmed, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, told in (
+        (("--rig", filmed.rig), "neither of VIDEO and --live"),
+        ((filmed.video, "--rig", filmed.rig, "--live", "0"), "both of VIDEO and --live"),
+        ((filmed.video, "--rig", filmed.rig), "no folder for the results"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["track", *map(str, words)])
+        assert told in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.real
+def test_a_real_face_is_tracked_in_every_frame(data: Path, filmed: Filmed, tmp_path: Path) -> None:
+    tracked = track_video(data / "video" / "single_face.mp4", filmed.rig, tmp_path, QUICK)
+    assert tracked.seen.all()
+    assert tracked.jitter < 1.0
+    assert float((tracked.solution.weights >= 1 - 1e-3).float().mean()) < 0.2
+    assert load_rig(tmp_path / "animation.glb").names == filmed.actor.names

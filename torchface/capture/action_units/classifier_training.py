@@ -1,0 +1,255 @@
+"""Learns an :class:`ActionUnitClassifier` from performed action units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.capture.action_units.classifier import (
+    ActionUnitClassifier,
+    GroupClassifier,
+    GroupSize,
+    check_groups,
+    group_regions,
+)
+from torchface.capture.action_units.intensity_labels import intensity_levels
+from torchface.capture.action_units.local_warps import local_warps
+from torchface.capture.action_units.region_video import RegionVideo
+from torchface.capture.action_units.regions import GROUPS, RegionGroup
+from torchface.capture.action_units.scikit import scikit
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.action_labels import ActionLabels
+
+_CHUNK = 256
+_REST_FRAMES = 2  # at either end of a repetition
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a classifier is trained.
+
+    Args:
+        levels: of intensity, the lowest of them rest.
+        variance: share of the features' variance that the principal components keep.
+        penalty: of the support vector machines.
+        warps: replicas of every frame, each warped at random.
+        warp_amplitude: of their control points, pixels.
+        seed: of k-means and the warps.
+    """
+
+    levels: int = 4
+    variance: float = 0.9
+    penalty: float = 10.0
+    warps: int = 0
+    warp_amplitude: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.levels < 2 or not 0 < self.variance <= 1 or not self.penalty > 0 or self.warps < 0:
+            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and shares in (0,1]")
+
+
+DEFAULTS = TrainingSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class GroupClasses:
+    """What a group's frames are labelled with.
+
+    Args:
+        table: intensities of the group's units in each class, (C,A); the first class is rest.
+        classes: of every frame, (T,) int64.
+    """
+
+    table: Tensor
+    classes: Tensor
+
+
+def fit_classifier(
+    videos: Sequence[RegionVideo],
+    labels: Sequence[ActionLabels],
+    groups: Sequence[RegionGroup] = GROUPS,
+    settings: TrainingSettings | None = None,
+    say: Callable[[str], None] | None = None,
+) -> ActionUnitClassifier:
+    """Learns from one or several performers.
+
+    Args:
+        videos: each performer's regions; all but the first laid on the first's ``neutral``.
+        labels: of each video, with what was performed.
+        groups: which regions tell which units.
+        settings: how.
+        say: is told what is being done.
+
+    Raises:
+        ShapeError: videos and labels differ in number or length.
+        NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
+        MissingExtraError: scikit-learn is not installed.
+    """
+    settings, say = settings or TrainingSettings(), say or (lambda line: None)
+    check_training(videos, labels, groups)
+    size = videos[0].patterns.shape[-1]
+    names = group_regions(groups)
+    patterns, rest = merged_videos(videos, names)
+    sizes, parts = [], []
+    for group in groups:
+        say(f"{group.name}: labelling {len(patterns)} frames")
+        own = patterns[:, [names.index(name) for name in group.regions]]
+        known = label_group(own, labels, group, settings)
+        still = rest[:, [names.index(name) for name in group.regions]]
+        part = _fit_group(group, own, still, known, size, settings, say)
+        sizes.append(GroupSize(len(part.components), len(part.intensities)))
+        parts.append(part)
+    model = ActionUnitClassifier(groups, sizes, size)
+    for target, part in zip(model.group_classifiers(), parts, strict=True):
+        target.load_state_dict(part.state_dict())
+    model.neutral.copy_(videos[0].neutral[[videos[0].names.index(name) for name in names]])
+    return model.eval()
+
+
+def merged_videos(videos: Sequence[RegionVideo], names: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Regions of all videos one after the other, and each frame's performer at rest, (T,R,h,w) twice.
+
+    The second is expanded, not copied, for a single video.
+    """
+    patterns, rest = [], []
+    for video in videos:
+        rows = [video.names.index(name) for name in names]
+        patterns.append(video.patterns[:, rows])
+        rest.append(video.rest[rows].expand(len(video.patterns), -1, -1, -1))
+    return torch.cat(patterns), rest[0] if len(rest) == 1 else torch.cat(rest)
+
+
+def label_group(
+    patterns: Tensor, labels: Sequence[ActionLabels], group: RegionGroup, settings: TrainingSettings
+) -> GroupClasses:
+    """The class of every frame: which of the group's units, and how strongly; 0 for rest.
+
+    Intensities are clustered for each performer and each set of units by itself, so that what a performer does with
+    all strength counts as the highest level.
+
+    Args:
+        patterns: the group's regions over all videos, one after the other, (T,G,h,w).
+        labels: of each video.
+        group: regions and units.
+        settings: levels and seed.
+    """
+    classes = torch.zeros(len(patterns), dtype=torch.int64)
+    rows: list[tuple[float, ...]] = [(0.0,) * len(group.units)]
+    known: dict[tuple[tuple[str, ...], int], int] = {}
+    start = 0
+    for own in labels:
+        for together in sorted({stretch.units for stretch in own.performed}):
+            units = tuple(unit for unit in (*group.units, *group.beside) if unit in together)
+            if not units:
+                continue
+            frames, at_rest = _frames(own, together, start)
+            found = intensity_levels(patterns[frames], at_rest, settings.levels, settings.seed)
+            for level in range(1, settings.levels):
+                if (units, level) not in known:
+                    known[units, level] = len(rows)
+                    strength = level / (settings.levels - 1)
+                    rows.append(tuple(strength if unit in units else 0.0 for unit in group.units))
+                classes[frames[found == level]] = known[units, level]
+        start += own.frames
+    return GroupClasses(torch.tensor(rows), classes)
+
+
+def _frames(labels: ActionLabels, together: tuple[str, ...], start: int) -> tuple[Tensor, Tensor]:
+    """Frames (n,) of all repetitions of units performed together, and which of them are at rest."""
+    frames, at_rest = [], []
+    for stretch in labels.performed:
+        if stretch.units == together:
+            own = torch.arange(stretch.first, stretch.last)
+            near = min(_REST_FRAMES, (len(own) - 1) // 2)
+            frames.append(start + own)
+            at_rest.append((own < stretch.first + max(near, 1)) | (own >= stretch.last - near))
+    return torch.cat(frames), torch.cat(at_rest)
+
+
+def _fit_group(
+    group: RegionGroup,
+    patterns: Tensor,
+    rest: Tensor,
+    known: GroupClasses,
+    size: int,
+    settings: TrainingSettings,
+    say: Callable[[str], None],
+) -> GroupClassifier:
+    probe = GroupClassifier(group, size, 1, 2)
+    generator = torch.Generator().manual_seed(settings.seed)
+    features, classes = [group_features(probe, patterns, rest)], [known.classes]
+    for _ in range(settings.warps):
+        features.append(group_features(probe, patterns, rest, settings.warp_amplitude, generator))
+        classes.append(known.classes)
+    samples, truth = torch.cat(features), torch.cat(classes)
+    say(f"{group.name}: principal components of {samples.shape[1]} features")
+    mean = samples.double().mean(0)
+    components, deviations = principal_components(samples, mean, settings.variance)
+    part = GroupClassifier(group, size, len(components), len(known.table))
+    part.mean.copy_(mean)
+    part.components.copy_(components)
+    part.deviations.copy_(deviations)
+    part.intensities.copy_(known.table)
+    reduced = (samples - part.mean) @ part.components.T / part.deviations
+    say(f"{group.name}: {len(known.table)} classes of {len(components)} components")
+    part.machine.fit(reduced, truth, settings.penalty)
+    return part
+
+
+def group_features(
+    part: GroupClassifier,
+    patterns: Tensor,
+    rest: Tensor,
+    amplitude: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Features (T,D) of a group's regions and those at rest, (T,G,h,w) twice, warped alike if a generator is given."""
+    found = []
+    for chunk, still in zip(patterns.split(_CHUNK), rest.split(_CHUNK), strict=True):
+        if generator is not None:
+            both = local_warps(torch.cat([chunk, still], dim=1), amplitude, generator, alike=2)
+            chunk, still = both.chunk(2, dim=1)
+        found.append(part.features(chunk, still))
+    return torch.cat(found)
+
+
+def principal_components(samples: Tensor, mean: Tensor, variance: float) -> tuple[Tensor, Tensor]:
+    """Components (K,D) that keep a share of the variance of samples (T,D), and the samples' deviation along each."""
+    reduction = scikit("decomposition").PCA(svd_solver="covariance_eigh")
+    # scikit-learn would also choose K, but then refuses a share of 1.
+    reduction.fit((samples.double() - mean).numpy())
+    share = torch.from_numpy(reduction.explained_variance_ratio_).cumsum(0)
+    kept = min(int((share < variance).sum()) + 1, len(share))
+    deviations = torch.from_numpy(reduction.explained_variance_[:kept]).clamp(min=1e-12).sqrt()
+    return torch.from_numpy(reduction.components_[:kept].copy()).float(), deviations.float()
+
+
+def check_training(
+    videos: Sequence[RegionVideo], labels: Sequence[ActionLabels], groups: Sequence[RegionGroup]
+) -> None:
+    """Refuses what nothing can be learned from."""
+    check_groups(groups)
+    if not videos or len(videos) != len(labels):
+        raise ShapeError(f"training: found {len(videos)} videos and {len(labels)} labels, expected one each")
+    for video, own in zip(videos, labels, strict=True):
+        if len(video.patterns) != own.frames:
+            raise ShapeError(f"training: found {len(video.patterns)} frames labelled as {own.frames}, expected as many")
+        lacking = [name for name in group_regions(groups) if name not in video.names]
+        if lacking:
+            raise NameMismatchError(f"training: found no region {', '.join(lacking)}, expected those of the groups")
+    wanted = [unit for group in groups for unit in group.units]
+    alone = {stretch.units[0] for own in labels for stretch in own.performed if len(stretch.units) == 1}
+    never = [unit for unit in wanted if unit not in alone]
+    if never:
+        raise NameMismatchError(
+            f"training: {', '.join(never)} is never performed alone; expected at least one repetition of every unit of "
+            f"the groups ({', '.join(wanted)}), or groups without it"
+        )
+    wanted += [unit for group in groups for unit in group.beside]
+    unknown = sorted({unit for own in labels for unit in own.units} - set(wanted))
+    if unknown:
+        raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group tells it from its regions")

@@ -1,0 +1,107 @@
+"""A classified video as weight curves of a rig, for the hybrid solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.action_units.classifier import ActionUnitClassifier
+from torchface.capture.action_units.intensity_smoothing import WINDOWS, smooth_intensities
+from torchface.capture.action_units.region_video import RegionVideo, read_regions
+from torchface.capture.action_units.shape_table import ShapeTable
+from torchface.errors import NameMismatchError
+from torchface.io.action_labels import ActionLabels
+from torchface.io.video import VideoFile
+
+_CHUNK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class ActionUnitCurves:
+    """What a classifier saw, in a rig's shapes.
+
+    Args:
+        names: of the shapes, N.
+        weights: what the classifier predicts, smooth, (T,N) in [0,1].
+        active: the frames in which it shall lead the solve, (T,N) bool; see ``action_unit_curves``.
+        units: of the classifier, A.
+        intensities: smooth, (T,A) in [0,1].
+        levels: as they were told frame by frame, (T,A).
+        fps: frames a second.
+    """
+
+    names: tuple[str, ...]
+    weights: Tensor
+    active: Tensor
+    units: tuple[str, ...]
+    intensities: Tensor
+    levels: Tensor
+    fps: float
+
+
+def action_unit_curves(
+    classifier: ActionUnitClassifier,
+    video: VideoFile | RegionVideo | str | Path,
+    labels: ActionLabels,
+    table: ShapeTable,
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    windows: Mapping[str, int] = WINDOWS,
+    at_rest: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> ActionUnitCurves:
+    r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
+
+    A shape that several units move follows the one that moves it most. The classifier leads a shape where it sees a
+    unit that moves it, and where it sees that none does: shapes that markers hardly see take up the markers' noise
+    there. Where it sees only a unit that shall not lead, the markers have the shape to themselves.
+
+    Args:
+        classifier: a trained one.
+        video: the file, or its regions where they have been read already.
+        labels: where helmet, markers and regions are in it.
+        table: units in the rig's shapes.
+        names: of the rig's shapes, N.
+        units: which of the classifier's may lead the solve; all if absent.
+        windows: frames at 60 a second over which each unit is smoothed.
+        at_rest: lead also where no unit is seen; otherwise the markers take over there, as in the source.
+        progress: is told how many frames are done, and of how many.
+
+    Raises:
+        NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.
+        FileFormatError, ShapeError, ValueRangeError, AlignmentError: the video cannot be used; see ``read_regions``.
+
+    Source: thesis 4.1.8 and 4.1.12.
+    """
+    unknown = sorted(set(units or ()) - set(classifier.units))
+    if unknown:
+        raise NameMismatchError(f"units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
+    whole = matrix = table.matrix(classifier.units, names)
+    if units is not None:
+        matrix = whole * torch.tensor([[float(unit in units)] for unit in classifier.units])
+    if not isinstance(video, RegionVideo):
+        video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
+    levels = classify(classifier, video)
+    intensities = smooth_intensities(levels, classifier.units, windows, fps=video.fps)
+    weights = (intensities[:, :, None] * matrix).amax(1)
+    active = _moved(levels, matrix)
+    if at_rest:
+        active |= (matrix > 0).any(0) & ~_moved(levels, whole)
+    return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
+
+
+def _moved(levels: Tensor, matrix: Tensor) -> Tensor:
+    """Shapes that some unit of levels (T,A) moves, by the weights (A,N): (T,N) bool."""
+    return (levels > 0).to(matrix) @ (matrix > 0).to(matrix) > 0
+
+
+@torch.no_grad()
+def classify(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
+    """Levels of intensity (T,A), every frame on its own."""
+    rows = [video.names.index(name) for name in classifier.regions]
+    rest = video.rest[rows]
+    return torch.cat([classifier(chunk[:, rows], rest) for chunk in video.patterns.split(_CHUNK)])

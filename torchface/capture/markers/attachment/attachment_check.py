@@ -1,0 +1,82 @@
+"""Whether sites that were fitted to a range of motion may be believed; if not, the figure and the likely cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
+from torchface.capture.markers.fit_check import DOUBTFUL_SHARE
+from torchface.errors import AlignmentError, ValueRangeError
+
+# Median over the markers. With a head's own rig it is 0.02 to 0.06 mm; with a rig whose neutral is 0.5 or 1 mm and
+# whose shapes are a fifth wrong 0.09 or 0.16; with markers 2 mm off the skin 0.13, since the scale takes most of that
+# up; with the rig of a similar head 0.3 to 0.4, of any other 0.7 to 0.9.
+MOST_OFF_SKIN = 0.3
+# A marker that is so many times farther from its site than usual, and at least so many millimetres, is not on the skin.
+OUTLYING, FAR = 3.0, 4.0
+_SHOWN = 6
+
+
+def tells_weights(error: Tensor) -> Tensor:
+    """Which markers (M,) sit on the skin, by their root mean square distance to their sites (M,), millimetres."""
+    return error <= max(OUTLYING * float(error.median()), FAR)
+
+
+def check_sites(
+    labels: Sequence[str], error: Tensor, off_skin: Tensor, spread: float, uncertainty: SiteUncertainty
+) -> None:
+    """Raises where sites do not explain their markers, or where the take leaves most of them open.
+
+    ``fit_check.check_fit`` judges markers on sites that are given; here the sites could move to wherever they fit best,
+    and unit, pose and slip are solved for, so what is left has other causes and smaller limits.
+
+    Args:
+        labels: of the M markers.
+        error: root mean square distance of each marker to its site, (M,), millimetres.
+        off_skin: distance of each marker from its site that lasts over the take, (M,), millimetres.
+        spread: of the sites at rest, mean distance from their centre, millimetres.
+        uncertainty: of sites and shapes.
+
+    Raises:
+        AlignmentError: markers stay far from the skin: all or most of them, or some.
+        ValueRangeError: most sites, or most shapes that the markers see, are uncertain.
+    """
+    typical, lasting, most = float(error.median()), float(off_skin.median()), DOUBTFUL_SHARE * spread
+    if not typical <= most:
+        raise AlignmentError(
+            f"markers: wherever they sit on the rig, they stay {typical:.2g} mm from their sites (median), expected at "
+            f"most {most:.2g} mm: labels are mixed up, or it is the rig of another head"
+        )
+    if lasting > MOST_OFF_SKIN:
+        raise AlignmentError(
+            f"markers: they stay {lasting:.2g} mm off the rig's skin all the time (median), expected at most "
+            f"{MOST_OFF_SKIN} mm: it is the rig of another head, or a rig that is not this exact"
+        )
+    far = (~tells_weights(error)).nonzero()[:, 0]
+    if len(far):
+        worst = far[error[far].argsort(descending=True)].tolist()
+        named = _listed([f"{labels[i]} ({float(error[i]):.0f} mm)" for i in worst])
+        raise AlignmentError(
+            f"markers: {named} stay far from the skin while most stay within {typical:.2g} mm: they sit on the "
+            "helmet, fell off, or carry another marker's label; leave them out of the take or correct their label"
+        )
+    if uncertainty.mostly_uncertain:
+        sites, shapes = uncertainty.markers, uncertainty.shapes
+        raise ValueRangeError(
+            f"range of motion: leaves {len(sites)} of {len(labels)} sites uncertain by more than a millimetre and "
+            f"{len(shapes)} of {len(uncertainty.names) - len(uncertainty.unseen)} shapes that the markers see "
+            f"({_listed(shapes)}), expected at most half: play every expression strongly, each by itself"
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def spread_of(points: Tensor) -> float:
+    """Mean distance of points (M,3) from their centre."""
+    return float(torch.linalg.vector_norm(points - points.mean(0), dim=1).mean())

@@ -1,0 +1,247 @@
+"""Where markers really sit on a rig: found from a range-of-motion take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture.markers.attachment.attachment_check import check_sites, spread_of, tells_weights
+from torchface.capture.markers.attachment.frame_poses import LEAST_SEEN, frame_poses, solve_frames
+from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteRounds
+from torchface.capture.markers.attachment.site_search import SiteSearch
+from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
+from torchface.capture.markers.helmet_solver import HelmetMotion
+from torchface.capture.markers.marker_solver import check_labels
+from torchface.capture.markers.rest_pose import check_spread
+from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
+from torchface.errors import ValueRangeError
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+
+_WHOLE_ROUNDS, _SETTLED = 6, 1e-3
+_COARSE_FRAMES, _CAREFUL_FRAMES, _JOINT_FRAMES = 240, 60, 120
+_FIRST_POSE_ROUNDS = 8
+_LEAST_MOTION = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class AttachmentFit:
+    """What a range-of-motion take told.
+
+    Args:
+        attachment: the sites, labels kept; ``residual`` is what was left at rest, the stand-off included.
+        alignment: the take's similarity, marker space to rig space, of a helmet that does not slip.
+        errors: root mean square distance of each marker to its site's path after each round, (R,M), millimetres.
+        weights: what the rig did in the take, (T,N); 0 in frames that show no marker (or too few to tell a slip).
+        standoff: how far markers stand off the skin, millimetres; 0 where it was not asked for.
+        off_skin: distance of each marker from its site, stand-off considered, that lasts over the take, (M,), mm.
+        uncertainty: which sites and shapes the take leaves uncertain.
+        motion: the helmet's against the head, where it slips: what :attr:`alignment` delivers is moved by it.
+    """
+
+    attachment: Attachment
+    alignment: Similarity
+    errors: Tensor
+    weights: Tensor
+    standoff: float
+    off_skin: Tensor
+    uncertainty: SiteUncertainty
+    motion: HelmetMotion | None = None
+
+
+def fit_attachment(
+    rig: BlendshapeRig,
+    rom: Take,
+    initial: Attachment,
+    standoff: bool = False,
+    progress: Callable[[float], None] | None = None,
+    insist: bool = False,
+) -> AttachmentFit:
+    r"""The marker sites that explain a range-of-motion take best.
+
+    .. math:: \min_{s,R,t,\,w,\,x} \sum_{t,m} \lVert s R y_{tm} + t - p(x_m, w_t) - h\, n(x_m, w_t) \rVert^2
+
+    over the take's similarity, the weights of every frame in [0,1], and every marker's point x on the surface. Solved
+    in turns at first: weights of all frames, the similarity (with the stand-off h), then for each marker the best point
+    of the nearest triangles over the whole take. Then Newton steps of sites, similarity and weights together, which
+    go where turns hardly move; meanwhile markers that do not fit tell no weights and may move to farther triangles.
+    Frames spread over the take serve for these; then all frames, in turns.
+
+    The first guess counts as one more observation, right to 4 mm, so that sites which the take does not tell stay near
+    it. A helmet that slips is found by what a rigid motion a frame would explain, and its motion is solved along.
+
+    Args:
+        rig: the performer's, N shapes.
+        rom: markers (T,M,3) of a range of motion, in any space and scale; NaN for not seen. No frame need be neutral.
+        initial: roughly where the markers sit; markers match by label.
+        standoff: estimate one distance h of all marker centres from the skin; otherwise it is 0.
+        progress: told the share that is done.
+        insist: also return sites that the take leaves mostly uncertain, or that do not explain the markers.
+
+    Returns:
+        An ``AttachmentFit``, markers in the order of ``initial``.
+
+    Raises:
+        NameMismatchError: a marker is not in ``initial``.
+        ValueRangeError: a marker is seen in no frame, markers do not move, or the take leaves most sites or shapes
+            uncertain, unless ``insist``.
+        AlignmentError: the markers lie on a line, or the rig does not explain them, unless ``insist``; the message says
+            how far they stay and what is the likely cause.
+        TopologyError: ``initial`` belongs to another mesh.
+
+    Source: thesis 4.1.2, algorithm 4, run to convergence; bundle adjustment for the joint steps (Triggs et al. 2000).
+    """
+    say = progress or (lambda share: None)
+    initial.check(rig.neutral)
+    paths = marker_paths(rom, initial)
+    motion = SurfaceMotion.of(rig, normals=standoff)
+    start = motion.at(motion.points, initial)[..., 0]
+    rounds = SiteRounds(motion, SiteSearch(motion, initial), start, standoff)
+    pose = _first_pose(paths, start)
+    _check_motion(pose.apply(paths))
+    shown = paths[~torch.isnan(paths).any(-1).all(1)]
+    few = _spread(shown, _COARSE_FRAMES)
+    errors: list[Tensor] = []
+    first = FitState(replace(initial, residual=None), pose, 0.0, None)
+    state = rounds.in_turns(few, first, errors, lambda share: say(0.3 * share))
+    if rounds.slips(few, state):
+        shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= LEAST_SEEN]
+        few = _spread(shown, _COARSE_FRAMES)
+        by_frame = replace(first, pose=frame_poses(few, start.expand_as(few), pose.scale[0]))
+        state = rounds.in_turns(few, by_frame, errors, lambda share: say(0.3 + 0.3 * share))
+    for count, careful in ((_CAREFUL_FRAMES, True), (_JOINT_FRAMES, False)):
+        some = _spread(shown, count)
+        state = rounds.together(some, rounds.resumed(some, state), errors, careful)
+    say(0.8)
+    uncertainty = rounds.uncertainty(some, state, len(paths) / rom.fps, rig.names)
+    state = rounds.resumed(shown, state)
+    for number in range(_WHOLE_ROUNDS):
+        state = rounds.round(shown, state, LAST_RIDGE)
+        assert state.error is not None
+        settled = float((state.error - errors[-1]).abs().max()) < _SETTLED
+        errors.append(state.error)
+        say(0.8 + 0.2 * (number + 1) / _WHOLE_ROUNDS)
+        if settled and number:
+            break
+    say(1.0)
+    found = _result(rounds, paths, state, errors, rig.neutral.fingerprint(), uncertainty)
+    if not insist:
+        check_attachment(found, rig)
+    return found
+
+
+def check_attachment(fit: AttachmentFit, rig: BlendshapeRig) -> None:
+    """Raises where a fit should not be believed.
+
+    Raises:
+        AlignmentError: the rig does not explain the markers, or not some of them.
+        ValueRangeError: the take leaves most sites or shapes uncertain.
+    """
+    sites = fit.attachment
+    spread = spread_of(sites.on(rig.neutral.faces, rig.vertices))
+    check_sites(sites.labels or (), fit.errors[-1], fit.off_skin, spread, fit.uncertainty)
+
+
+def marker_paths(take: Take, attachment: Attachment) -> Tensor:
+    """A take's markers in the order of an attachment, (T,M,3), float64.
+
+    Raises:
+        NameMismatchError: the take has no markers, or one that the attachment does not know.
+        ValueRangeError: a marker of the attachment is seen in no frame, or a coordinate is infinite.
+        AlignmentError: the markers lie on a line, so no pose can be told.
+    """
+    track = take.markers
+    labels = tuple(attachment.labels or ())
+    check_labels(() if track is None else track.names, labels)
+    assert track is not None
+    row = {name: i for i, name in enumerate(track.names)}
+    paths = torch.full((len(track), len(labels), 3), torch.nan, dtype=torch.float64)
+    known = [i for i, label in enumerate(labels) if label in row]
+    paths[:, known] = track.values[:, [row[labels[i]] for i in known]].double()
+    if torch.isinf(paths).any():
+        raise ValueRangeError("markers: found infinite coordinates, expected millimetres, or NaN for not seen")
+    paths[torch.isnan(paths).any(-1)] = torch.nan
+    unseen = torch.isnan(paths[..., 0]).all(0).nonzero()[:, 0].tolist()
+    if unseen:
+        names = ", ".join(labels[i] for i in unseen[:5]) + (", ..." if len(unseen) > 5 else "")
+        raise ValueRangeError(
+            f"markers: {len(unseen)} of {len(labels)} are seen in no frame ({names}), expected each at least once; "
+            "leave them out of the attachment (Attachment.select)"
+        )
+    check_spread(paths.nanmean(0))
+    return paths
+
+
+def _result(
+    rounds: SiteRounds,
+    paths: Tensor,
+    state: FitState,
+    errors: list[Tensor],
+    fingerprint: str,
+    uncertainty: SiteUncertainty,
+) -> AttachmentFit:
+    """What was left at rest is told over all frames, with the weights of the sites that were found."""
+    here = rounds.at(state)
+    rows = state.trusted()
+    slips = len(state.pose.scale) > 1
+    shown = (~torch.isnan(paths).any(-1)).sum(1) >= (LEAST_SEEN if slips else 1)
+    solved, pose = solve_frames(here[rows], paths[shown][:, rows], state.pose, LAST_RIDGE, state.weights)
+    weights = here.new_zeros(len(paths), here.shape[-1] - 1)
+    weights[shown] = solved
+    moved = pose.apply(paths[shown])
+    left = (moved - torch.einsum("mcn,tn->tmc", here, with_one(solved))).nanmean(0).nan_to_num(0.0)
+    at_rest = rounds.motion.at(rounds.motion.points[..., :1], state.sites)[..., 0]
+    sites = Attachment(
+        state.sites.triangles,
+        state.sites.barycentric.float(),
+        state.sites.labels,
+        (here[..., 0] - at_rest + left).float(),
+        fingerprint,
+    )
+    helmet = None
+    if slips:
+        # The scale is known; a fit of it would shrink what turns to and fro.
+        steady = frame_poses(paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3), pose.scale[0])
+        helmet, pose = _helmet_motion(steady, pose, shown, here[..., 0].mean(0)), steady
+    off_skin = left.norm(dim=1)
+    return AttachmentFit(sites, pose, torch.stack(errors), weights, state.height, off_skin, uncertainty, helmet)
+
+
+def _spread(paths: Tensor, count: int) -> Tensor:
+    return paths[:: max(1, len(paths) // count)]
+
+
+def _first_pose(paths: Tensor, start: Tensor) -> Similarity:
+    """The take's mean laid on the first guess, by the markers that agree."""
+    mean, near = paths.nanmean(0), torch.ones(len(start), dtype=torch.bool)
+    for _ in range(_FIRST_POSE_ROUNDS):
+        pose = similarity_transform(mean[None], start[None], near[None].double())
+        apart = (pose.apply(mean)[0] - start).norm(dim=1)
+        near = tells_weights(apart)
+    return pose
+
+
+def _helmet_motion(steady: Similarity, pose: Similarity, shown: Tensor, pivot: Tensor) -> HelmetMotion:
+    """What a pose a frame does otherwise than one for all: points were seen at R (p - c) + c + t."""
+    rotation = torch.eye(3, dtype=pivot.dtype).repeat(len(shown), 1, 1)
+    translation = pivot.new_zeros(len(shown), 3)
+    rotation[shown] = steady.rotation @ pose.rotation.transpose(1, 2)
+    in_take = pose.inverse().apply(pivot[None].expand(int(shown.sum()), 1, 3))
+    translation[shown] = (steady.apply(in_take[:, 0])[0]) - pivot
+    return HelmetMotion(rotation, translation, pivot)
+
+
+def _check_motion(moved: Tensor) -> None:
+    """Raises where most markers stand still: then nothing tells where they sit."""
+    spread = (moved - moved.nanmean(0)).square().sum(-1).nanmean(0).sqrt()
+    typical = float(spread.median())
+    if not typical >= _LEAST_MOTION:
+        raise ValueRangeError(
+            f"range of motion: half of the markers move less than {typical:.2f} mm (root mean square), expected at "
+            f"least {_LEAST_MOTION} mm: play every expression strongly"
+        )

@@ -1,0 +1,115 @@
+r"""The best site of a marker on a moving surface: where the surface stays nearest to it over a whole take.
+
+A point fixed to triangle T with barycentric coordinates :math:`b` follows :math:`\sum_k b_k A_k \tilde w_t` with
+:math:`\tilde w_t = (1, w_t)`. Its squared distance to a marker's path :math:`y_t`, summed over the frames in which the
+marker was seen, needs the take only through moments:
+
+.. math:: C = \sum_t \tilde w_t \tilde w_t^\top, \qquad G = \sum_t y_t \tilde w_t^\top.
+
+With :math:`C = LL^\top` it is a squared distance in a space of :math:`3(N+1)` dimensions, between
+:math:`\sum_k b_k A_k L` and :math:`G L^{-\top}`, up to what no site can change. The best site of a triangle is
+the point of that triangle, in that space, nearest to the marker.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.proximity import triangle_coordinates
+
+# Where few weights move, C is singular; a ten-thousandth of a weight a frame changes no distance that counts.
+_LEAST_MOMENT = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class PathMoments:
+    """What site search needs of a take.
+
+    Args:
+        factor: :math:`L`, (N+1,N+1).
+        path: :math:`G L^{-T}`, (M,3,N+1).
+        left: squared distance that no site can change, (M,), mm².
+        frames: in how many frames each marker was seen, (M,).
+    """
+
+    factor: Tensor
+    path: Tensor
+    left: Tensor
+    frames: Tensor
+
+    @staticmethod
+    def of(
+        paths: Tensor,
+        weights: Tensor,
+        on_rig: Tensor | None = None,
+        start: Tensor | None = None,
+        trust: float = 0.0,
+    ) -> PathMoments:
+        """Of markers (T,M,3), NaN where not seen, and extended weights (T,N+1), float64.
+
+        Where the sites are believed to be at rest, ``start`` (M,3), counts as a ``trust``-th part of a frame at rest.
+
+        A marker that is not seen is put where its present site is (``on_rig``, (T,M,3)). That keeps one C for all
+        markers and moves no site that is the best already; others take a few more rounds to come to theirs.
+        """
+        seen = ~torch.isnan(paths[..., 0])
+        if on_rig is not None:
+            paths = torch.where(seen[..., None], paths, on_rig)
+        if start is not None:
+            paths = torch.cat([paths, trust**0.5 * start[None]])
+            rest = torch.zeros_like(weights[:1])
+            rest[:, 0] = trust**0.5
+            weights = torch.cat([weights, rest])
+        moments = weights.T @ weights
+        moments.diagonal().add_(_LEAST_MOMENT * len(paths))
+        factor = torch.linalg.cholesky(moments)
+        cross = paths.flatten(1).T @ weights
+        path = torch.linalg.solve_triangular(factor, cross.T, upper=False).T.unflatten(0, (-1, 3))
+        left = paths.square().sum((0, 2)) - path.square().sum((1, 2))
+        return PathMoments(factor, path, left.clamp(min=0), seen.sum(0).to(weights))
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """The best sites.
+
+    Args:
+        triangles: rows of the faces, (M,) int64.
+        barycentric: (M,3), float64.
+        error: root mean square distance to the marker's path, (M,), millimetres.
+    """
+
+    triangles: Tensor
+    barycentric: Tensor
+    error: Tensor
+
+
+def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathMoments) -> Sites:
+    """The best site of each marker among the points of its candidate triangles, exact and at once.
+
+    Args:
+        points: affine maps of the vertices, (V,3,N+1), float64.
+        faces: (F,3) int64.
+        candidates: rows of ``faces``, (M,Q) int64.
+        moments: of the take.
+
+    Source: thesis 4.1.2, algorithm 4, steps 4 and 5.
+    """
+    used, local = faces[candidates].unique(return_inverse=True)
+    corner = (points[used] @ moments.factor).flatten(1)[local]
+    a = corner[:, :, 0]
+    ab, ac, ap = corner[:, :, 1] - a, corner[:, :, 2] - a, moments.path.flatten(1)[:, None] - a
+    ab2, ac2, abac, d1, d2, ap2 = ((x * y).sum(-1) for x, y in _pairs(ab, ac, ap))
+    v, w = triangle_coordinates(ab2, ac2, abac, d1, d2)
+    squared = ap2 - 2 * (v * d1 + w * d2) + v * v * ab2 + w * w * ac2 + 2 * v * w * abac
+    best = squared.argmin(1, keepdim=True)
+    v, w, squared, triangles = (part.gather(1, best)[:, 0] for part in (v, w, squared, candidates))
+    error = ((squared.clamp(min=0) + moments.left) / moments.frames.clamp(min=1)).sqrt()
+    return Sites(triangles, torch.stack([1 - v - w, v, w], dim=1), error)
+
+
+def _pairs(ab: Tensor, ac: Tensor, ap: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
+    return (ab, ab), (ac, ac), (ab, ac), (ab, ap), (ac, ap), (ap, ap)

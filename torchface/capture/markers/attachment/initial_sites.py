@@ -1,0 +1,88 @@
+"""A first guess of marker sites without anybody's help: the markers' shape laid on the face."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture.markers.rest_pose import check_spread
+from torchface.capture.markers.surface_motion import SurfaceMotion
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+
+_NEIGHBOURS, _FEWEST = 9, 12
+_LEAST_MOTION = 0.5
+_SMALLEST, _LARGEST = 0.4, 2.0
+
+
+def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
+    """Sites for the markers of a range of motion, found by laying their mean positions on the skin that moves.
+
+    Rigid alignment from starts in all directions by iterated closest points, the scale within a quarter of 1: units
+    must be right. What it gives is off by millimetres, as a guess by eye; ``fit_attachment`` does the rest.
+
+    Args:
+        rig: the performer's.
+        rom: markers (T,M,3), spread over the face, at least twelve.
+
+    Returns:
+        An attachment with the take's labels, (M,).
+
+    Raises:
+        ValueRangeError: the take has fewer than twelve markers, or one is seen in no frame.
+        AlignmentError: the markers lie on a line, or fit nowhere.
+
+    Source: thesis 4.1.2, where the landmarks are picked by hand.
+    """
+    track = rom.markers
+    if track is None or len(track.names) < _FEWEST:
+        count = 0 if track is None else len(track.names)
+        raise ValueRangeError(f"markers: found {count}, expected at least {_FEWEST} to tell the pose by their shape")
+    points = track.values.double().nanmean(0)
+    unseen = [name for name, point in zip(track.names, points, strict=True) if not bool(torch.isfinite(point).all())]
+    if unseen:
+        raise ValueRangeError(f"markers: {', '.join(unseen[:5])} seen in no frame, expected each at least once")
+    check_spread(points)
+    motion = SurfaceMotion.of(rig)
+    vertices = motion.points[..., 0]
+    moves = motion.points[..., 1:].norm(dim=1).amax(1) > _LEAST_MOTION
+    faces = motion.faces[motion.skin & moves[motion.faces].all(1)]
+    if not len(faces):
+        raise ValueRangeError(f"rig: found no skin that moves by more than {_LEAST_MOTION} mm, expected a face")
+    normals = vertex_normals(vertices, motion.faces)
+    # What faces away from the viewer, such as the inside of lips and lids, carries no marker.
+    faces = faces[normals[faces].mean(1)[:, 2] > 0]
+    skin = vertices[faces.unique()]
+    size = float((points - points.mean(0)).norm(dim=1).mean() / (skin - skin.mean(0)).norm(dim=1).mean())
+    if not _SMALLEST < size < _LARGEST:
+        raise AlignmentError(
+            f"markers: found them spread {size:.2g} times as far as the skin that moves, expected {_SMALLEST} to "
+            f"{_LARGEST} times: is the take's unit right? Else give initial sites (torchface pick --mode markers)"
+        )
+    try:
+        pose = find_pose(Samples(points, _outward(points)), ScanPoints(vertices, faces)).pose
+    except AlignmentError as error:
+        raise AlignmentError(
+            f"markers: found no pose in which they lie on the face by their shape alone ({error}); "
+            "give initial sites (torchface pick --mode markers)"
+        ) from None
+    rows = (motion.skin & moves[motion.faces].all(1)).nonzero()[:, 0]
+    on_skin = SurfaceIndex(vertices, motion.faces[rows]).nearest(pose.apply(points)[0])
+    return Attachment(
+        rows[on_skin.triangle], on_skin.barycentric.float(), track.names, fingerprint=rig.neutral.fingerprint()
+    )
+
+
+def _outward(points: Tensor) -> Tensor:
+    """Unit normals (M,3) of the surface that markers lie on: planes through neighbours, away from the head's middle."""
+    near = points[torch.cdist(points, points).argsort(1)[:, :_NEIGHBOURS]]
+    normals = torch.linalg.svd(near - near.mean(1, keepdim=True)).Vh[:, 2]
+    # The sphere nearest to all markers: |x|² = 2 x·c + const.
+    rows = torch.cat([2 * points, points.new_ones(len(points), 1)], dim=1)
+    centre = torch.linalg.lstsq(rows, points.square().sum(1, keepdim=True)).solution[:3, 0]
+    return normals * torch.sign((normals * (points - centre)).sum(1, keepdim=True))

@@ -1,0 +1,1 @@
+"""Marker takes cleaned: outliers, exchanged labels, gaps."""

@@ -1,0 +1,230 @@
+"""What is wrong with a marker take, found, named, and repaired where that is safe; the raw take stays as it is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.capture.markers.cleaning.label_swaps import find_swaps, swapped_back
+from torchface.capture.markers.cleaning.robust_prediction import Prediction, predict_markers
+from torchface.capture.markers.marker_solver import MarkerSolver
+from torchface.capture.markers.take_smoothing import WholeTakeSolver
+from torchface.errors import NameMismatchError
+from torchface.take import Take, Track
+
+_SPIKE_SECONDS, _GAP_SECONDS = 0.1, 0.25
+_DISPLACED_SHARE = 0.7
+_LISTED_GAP = 2
+_GRAVEST_FIRST = ("swap", "displaced", "spike", "gap")
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One thing that is wrong.
+
+    Args:
+        kind: ``swap``, ``spike``, ``displaced`` (it drifts, has fallen off, or carries another's label) or ``gap``.
+        labels: the markers; two for a swap.
+        first, last: frames, ``last`` included.
+        size: largest distance from where the rig expects the marker, millimetres; 0 for a gap.
+        action: what was done: ``swapped back``, ``masked``, ``filled`` or ``left``.
+    """
+
+    kind: str
+    labels: tuple[str, ...]
+    first: int
+    last: int
+    size: float
+    action: str
+
+
+@dataclass(frozen=True, eq=False)
+class Cleanup:
+    """What was found and done.
+
+    Args:
+        take: the repaired take: labels swapped back, bad samples NaN, gaps left open.
+        filled: the same with short gaps closed by the rig's own prediction: for solving frame by frame.
+        defects: in order of their first frame.
+        masked: samples that were seen and are not used, (T,M) bool, in the order of the take's markers.
+    """
+
+    take: Take
+    filled: Take
+    defects: tuple[Defect, ...]
+    masked: Tensor
+
+    def table(self, gaps: bool = True) -> list[tuple[str, ...]]:
+        """Rows for people to read, gravest kind first: kind, markers, frames, size, action."""
+        return [
+            (
+                defect.kind,
+                " ↔ ".join(defect.labels),
+                f"{defect.first}–{defect.last}",
+                f"{defect.size:.1f} mm" if defect.size else "",
+                defect.action,
+            )
+            for defect in sorted(self.defects, key=lambda defect: _GRAVEST_FIRST.index(defect.kind))
+            if gaps or defect.kind != "gap"
+        ]
+
+    def summary(self) -> str:
+        """How many of each."""
+        counts = Counter(defect.kind for defect in self.defects)
+        found = ", ".join(f"{kind}: {counts[kind]}" for kind in _GRAVEST_FIRST if counts[kind])
+        share = 100 * float(self.masked.double().mean()) if self.masked.numel() else 0.0
+        return f"{found or 'nothing wrong'}; {share:.2f} % of the samples masked"
+
+
+def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
+    """Finds swapped labels, spikes, markers that drift or fell off, and gaps; repairs what is safe.
+
+    The rig predicts every marker from those that agree. Labels that stand at each other's place are swapped back;
+    samples that still do not fit are masked; short gaps are filled, in ``filled`` only, by where the rig has the marker
+    when the whole take is solved at once (with slip: its own frame).
+
+    Args:
+        solver: rig, attachment, and the take's alignment.
+        take: markers matched by label.
+        slip: the helmet moves on the head.
+
+    Raises:
+        NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
+    """
+    track = take.markers
+    if track is None:
+        raise NameMismatchError("take: has no markers, expected a track of them")
+    raw = solver.arrange(track).double()
+    raw[torch.isnan(raw).any(-1)] = torch.nan
+    alignment = solver.alignment
+    seen = raw if alignment is None else alignment.apply(raw)
+    first = predict_markers(solver, seen, slip)
+    swaps = find_swaps(seen, first, take.fps)
+    repaired = swapped_back(seen, swaps)
+    prediction = predict_markers(solver, repaired, slip) if swaps else first
+    labels = solver.labels
+    defects = [
+        Defect(
+            "swap",
+            (labels[swap.markers[0]], labels[swap.markers[1]]),
+            swap.first,
+            swap.last - 1,
+            _largest(first.distance[swap.first : swap.last, list(swap.markers)]),
+            "swapped back",
+        )
+        for swap in swaps
+    ]
+    bad, others = _displaced(prediction, labels, take.fps)
+    lost = torch.tensor([any(d.kind == "displaced" and label in d.labels for d in others) for label in labels])
+    if bool(lost.any()):
+        # A slow drift bends the weights with it at first: only the other markers tell when it began.
+        prediction = predict_markers(solver, repaired, slip, lost)
+        bad, others = _displaced(prediction, labels, take.fps)
+    defects += others
+    masked = repaired.clone()
+    masked[bad] = torch.nan
+    # A marker that the take lacks has no gaps.
+    present = [i for i, label in enumerate(labels) if label in track.names]
+    expected = _expected_alone(prediction, masked) if slip else _expected_over_time(solver, masked, take.fps)
+    filled, gaps = _fill(masked, bad, expected, labels, present, take.fps)
+    defects += gaps
+    back = alignment.inverse().apply if alignment is not None else (lambda points: points)
+    column = [labels.index(name) for name in track.names]
+
+    def delivered(points: Tensor, changed: Tensor) -> Take:
+        # Samples that nothing was done to come back bit for bit.
+        values = torch.where(changed[..., None], back(points), swapped_back(raw, swaps))[:, column]
+        values[torch.isnan(points).any(-1)[:, column]] = torch.nan
+        return replace(take, markers=Track(track.names, values.to(track.values.dtype), track.confidence))
+
+    closed = torch.isnan(masked).any(-1) & ~torch.isnan(filled).any(-1)
+    clean = delivered(masked, torch.zeros_like(bad))
+    order = sorted(defects, key=lambda defect: (defect.first, defect.kind, defect.labels))
+    return Cleanup(clean, delivered(filled, closed), tuple(order), bad[:, column])
+
+
+def _displaced(prediction: Prediction, labels: Sequence[str], fps: float) -> tuple[Tensor, list[Defect]]:
+    """Samples to mask (T,M), and their runs by name: short ones are spikes.
+
+    Runs of one marker between which it is hardly ever seen at its place are one: it drifts or fell off, and the frames
+    between are not to be trusted either.
+    """
+    off, seen = prediction.off, ~torch.isnan(prediction.distance)
+    bad = off.clone()
+    defects = []
+    longest = max(1, round(_SPIKE_SECONDS * fps))
+    for m in off.any(0).nonzero()[:, 0].tolist():
+        for first, last in _merged(_runs(off[:, m]), off[:, m], seen[:, m]):
+            short = last - first < longest
+            if not short:
+                bad[first : last + 1, m] = seen[first : last + 1, m]
+            size = _largest(prediction.distance[first : last + 1, m])
+            defects.append(Defect("spike" if short else "displaced", (labels[m],), first, last, size, "masked"))
+    return bad, defects
+
+
+def _merged(runs: list[tuple[int, int]], off: Tensor, seen: Tensor) -> list[tuple[int, int]]:
+    """Runs joined to the one before where, of the samples seen from its start to the end, most are off."""
+    merged: list[tuple[int, int]] = []
+    for first, last in runs:
+        if merged:
+            start, end = merged[-1]
+            share = float(off[start : last + 1].sum()) / max(int(seen[start : last + 1].sum()), 1)
+            if share >= _DISPLACED_SHARE or (first - end <= 2 and share >= 0.5):
+                merged[-1] = (start, last)
+                continue
+        merged.append((first, last))
+    return merged
+
+
+def _fill(
+    seen: Tensor, bad: Tensor, expected: Tensor, labels: Sequence[str], present: Sequence[int], fps: float
+) -> tuple[Tensor, list[Defect]]:
+    """Short gaps closed, between frames that show the marker; those of two frames or more named unless masked."""
+    filled, defects = seen.clone(), []
+    longest = max(1, round(_GAP_SECONDS * fps))
+    missing = torch.isnan(seen).any(-1)
+    for m in present:
+        for first, last in _runs(missing[:, m]):
+            inside = first > 0 and last + 1 < len(seen)
+            safe = inside and last - first < longest and bool(torch.isfinite(expected[first : last + 1, m]).all())
+            if safe:
+                filled[first : last + 1, m] = expected[first : last + 1, m]
+            if last - first + 1 >= _LISTED_GAP and not bool(bad[first : last + 1, m].all()):
+                defects.append(Defect("gap", (labels[m],), first, last, 0.0, "filled" if safe else "left"))
+    return filled, defects
+
+
+def _expected_alone(prediction: Prediction, seen: Tensor) -> Tensor:
+    """Where each frame's own markers have the others, (T,M,3); NaN in a frame that shows none."""
+    empty = torch.isnan(seen).any(-1).all(1)
+    return torch.where(empty[:, None, None], torch.nan, prediction.expected)
+
+
+def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tensor:
+    """Where the rig has each marker when the whole take is solved at once, (T,M,3), in rig space.
+
+    Frames before and after then tell of a gap what its own frame cannot.
+    """
+    if bool(torch.isnan(seen).any(-1).all()):
+        return solver.rest.double().expand_as(seen)
+    alignment = solver.alignment
+    weights = WholeTakeSolver(solver)(seen if alignment is None else alignment.inverse().apply(seen), fps)
+    on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), weights)
+    return on_rig + (seen - on_rig).nanmedian(0).values.nan_to_num(0.0)
+
+
+def _runs(mask: Tensor) -> list[tuple[int, int]]:
+    """First and last row of each run of True in (T,)."""
+    padded = torch.cat([mask.new_zeros(1), mask, mask.new_zeros(1)]).int()
+    change = padded[1:] - padded[:-1]
+    starts, ends = (change == 1).nonzero()[:, 0], (change == -1).nonzero()[:, 0] - 1
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
+
+
+def _largest(distance: Tensor) -> float:
+    return float(distance.nan_to_num(0.0).max())

@@ -1,0 +1,216 @@
+"""Blendshape weights from markers of a head-mounted stage whose helmet slips on the head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from torchface.attachment import Attachment
+from torchface.capture.energy import marker_term
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen
+from torchface.errors import NameMismatchError, ShapeError
+from torchface.geometry.similarity import Similarity
+from torchface.optim import BoxQP, box_qp
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.temporal import bridged, nearest_rows
+
+# A turn counts by how far it moves a point this far from the pivot, so that all six columns are of one size.
+_ARM = 30.0
+# mm² a marker for a squared millimetre of slip: decides only where markers are too few to tell a motion.
+_MOTION_RIDGE = 1e-4
+_EXACT_STEPS, _SETTLED = 6, 1e-4
+_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
+_CHUNK_NUMBERS = 2**23
+
+
+@dataclass(frozen=True, eq=False)
+class HelmetMotion:
+    r"""How the helmet moved against the head: a point p of the face was seen at :math:`R (p - c) + c + t`.
+
+    Args:
+        rotation: :math:`R`, (T,3,3).
+        translation: :math:`t`, (T,3), millimetres of rig space.
+        pivot: :math:`c`, (3,), the mean of the marker sites at rest.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    pivot: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Where points of the face (T,M,3) were seen."""
+        centred = points - self.pivot.to(points)
+        moved = centred @ self.rotation.transpose(1, 2).to(points)
+        return moved + (self.pivot + self.translation)[:, None].to(points)
+
+    def undo(self, markers: Tensor) -> Tensor:
+        """Seen markers (T,M,3) without the helmet's motion."""
+        return (markers - (self.pivot + self.translation)[:, None].to(markers)) @ self.rotation.to(
+            markers
+        ) + self.pivot.to(markers)
+
+    def degrees(self) -> Tensor:
+        """The rotation as turns about x, y and z (a rotation vector), (T,3), degrees."""
+        skew = 0.5 * (self.rotation - self.rotation.transpose(1, 2))
+        axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
+        sine = axis.norm(dim=1)
+        cosine = 0.5 * (self.rotation.diagonal(dim1=1, dim2=2).sum(1) - 1)
+        angle = torch.atan2(sine, cosine)
+        factor = torch.where(sine > 1e-8, angle / sine.clamp(min=1e-8), 1.0)
+        return torch.rad2deg(axis * factor[:, None])
+
+
+class HelmetSolver(nn.Module):
+    r"""Solves markers for blendshape weights and the helmet's motion, every frame on its own.
+
+    .. math::
+        \min_{0 \le w \le 1,\,R,\,t} \frac{1}{|S|} \sum_{m \in S}
+        \lVert R (b_m + B_m w - c) + c + t - y_m \rVert^2 + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
+
+    Six dummy shapes take up the motion: translations along the axes and, as the small turn :math:`d\omega \times
+    (b_m - c)`, rotations about them. They are unbounded, which takes the place of a positive and a negative one each,
+    and free of the sparsity. ``exact`` undoes the rigid motion that a solve found and solves again until none is left,
+    so that the motion is rigid however large it is; otherwise one solve with the linear shapes is all.
+
+    Args:
+        rig, attachment, alignment, sparsity, ridge: as in ``MarkerSolver``.
+        exact: a rigid motion; otherwise the linear dummy shapes.
+
+    Raises:
+        TopologyError, ShapeError, ValueRangeError: as in ``MarkerSolver``.
+
+    Source: thesis 4.1.6, equations 34 to 37, with the derivative of the rotation in place of the 90-degree shapes,
+        which also stretch the face.
+    """
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        attachment: Attachment,
+        alignment: Similarity | None = None,
+        sparsity: float = SPARSITY,
+        ridge: float = RIDGE,
+        exact: bool = True,
+    ) -> None:
+        super().__init__()
+        self.markers = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
+        self.exact = exact
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self.markers.names
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the markers."""
+        return self.markers.labels
+
+    def forward(self, markers: Tensor) -> tuple[Tensor, HelmetMotion]:
+        """Weights and motion for markers.
+
+        Args:
+            markers: (B,M,3), millimetres, in the order of ``labels``; a marker with a NaN coordinate is not seen.
+
+        Returns:
+            Weights in [0,1], (B,N), in the dtype of ``markers``, and ``HelmetMotion`` of B frames, in rig space.
+
+        Raises:
+            ShapeError: ``markers`` is not (B,M,3).
+            ValueRangeError: a coordinate is infinite, or frames show no marker at all.
+        """
+        if markers.ndim != 3 or markers.shape[1:] != self.markers.rest.shape:
+            raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.markers.rest)},3)")
+        alignment = self.markers.alignment
+        seen = markers.double() if alignment is None else alignment.apply(markers.double())
+        tolerance = _TOLERANCE.get(markers.dtype, 3e-6)
+        gaps = torch.isnan(seen).any(-1).any(-1)
+        if bool(torch.isnan(seen).any(-1).all(-1).any()):
+            self.markers(markers)  # says which frames are empty
+        weights = seen.new_zeros(len(seen), len(self.names))
+        rotation = torch.eye(3, dtype=seen.dtype, device=seen.device).repeat(len(seen), 1, 1)
+        translation = seen.new_zeros(len(seen), 3)
+        chunk = max(1, _CHUNK_NUMBERS // (len(self.names) + 6) ** 2)
+        # Frames without gaps share one H; each of the others has its own, a chunk of them in memory at once.
+        for rows in [(~gaps).nonzero()[:, 0], *gaps.nonzero()[:, 0].split(chunk)]:
+            if len(rows):
+                weights[rows], rotation[rows], translation[rows] = self._solve(seen[rows], tolerance)
+        motion = HelmetMotion(rotation, translation, self.markers.rest.double().mean(0))
+        return weights.to(markers.dtype), motion
+
+    def solve_take(self, take: Take) -> tuple[Take, HelmetMotion]:
+        """The take with weights solved from its markers, matched by label; and the motion that is not in them.
+
+        A frame without any marker gets weights between those of the frames before and after, and the nearest's motion.
+
+        Raises:
+            NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
+            ValueRangeError: no frame shows any marker.
+        """
+        if take.markers is None:
+            raise NameMismatchError("take: has no markers, expected a track of them")
+        markers = self.markers.arrange(take.markers)
+        rows = frames_seen(markers)
+        seen, steps = self(markers[rows])
+        weights = bridged(seen, rows, len(markers))
+        nearest = nearest_rows(rows, len(markers))
+        motion = HelmetMotion(steps.rotation[nearest], steps.translation[nearest], steps.pivot)
+        return replace(take, weights=Track(self.names, weights[..., None])), motion
+
+    def _solve(self, seen: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Weights (B,N), rotation (B,3,3), translation (B,3) for markers in rig space."""
+        rest = self.markers.rest.double()
+        pivot = rest.mean(0)
+        columns = torch.cat([self.markers.basis.double(), rigid_columns(rest, pivot)], dim=2)
+        shapes = len(self.names)
+        bound = rest.new_tensor([torch.inf]).expand(6)
+        lower = torch.cat([rest.new_zeros(shapes), -bound])
+        upper = torch.cat([rest.new_ones(shapes), bound])
+        price = rest.new_zeros(shapes + 6)
+        price[:shapes] = self.markers.sparsity
+        ridge = rest.new_full((shapes + 6,), 2 * _MOTION_RIDGE)
+        ridge[:shapes] = 2 * self.markers.ridge
+        rotation = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(seen), 3, 3)
+        translation = rest.new_zeros(len(seen), 3)
+        solution: Tensor | None = None
+        shared: BoxQP | None = None
+        for _ in range(_EXACT_STEPS if self.exact else 1):
+            here = HelmetMotion(rotation, translation, pivot).undo(seen)
+            energy = marker_term(columns, rest, here)
+            H, f = energy.H + torch.diag(ridge), energy.f + price
+            if H.ndim == 2:
+                shared = shared or BoxQP(H, lower, upper, tolerance)
+                solution = shared(f, solution)
+            else:
+                solution = box_qp(H, f, lower, upper, solution, tolerance)
+            slid, turned = solution[:, shapes : shapes + 3], rigid_turn(solution[:, shapes + 3 :])
+            translation = translation + (rotation @ slid[..., None])[..., 0]
+            rotation = rotation @ turned
+            moved = float(solution[:, shapes:].abs().max())
+            solution = torch.cat([solution[:, :shapes], torch.zeros_like(solution[:, shapes:])], dim=1)
+            if moved < _SETTLED:
+                break
+        assert solution is not None
+        return solution[:, :shapes], rotation, translation
+
+    def extra_repr(self) -> str:
+        return f"exact={self.exact}"
+
+
+def rigid_columns(rest: Tensor, pivot: Tensor) -> Tensor:
+    """Six columns of rigid motion (M,3,6) for sites at rest (M,3): along x, y, z, then about them, each of 1 mm."""
+    arm = (rest - pivot)[:, None, :].expand(-1, 3, -1)
+    axes = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3)
+    turns = torch.linalg.cross(axes, arm, dim=-1) / _ARM
+    return torch.cat([axes, turns.transpose(1, 2)], dim=2)
+
+
+def rigid_turn(turns: Tensor) -> Tensor:
+    """The rotations (B,3,3) of the last three of ``rigid_columns``'s weights (B,3)."""
+    x, y, z = (turns / _ARM).unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
+    return torch.linalg.matrix_exp(skew)

@@ -1,0 +1,156 @@
+"""Blendshape weights from markers and from what a classifier saw between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.energy import Quadratic, pull_term
+from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.optim import box_qp
+from torchface.take import Take, Track
+from torchface.temporal import bridged, savitzky_golay
+
+GAMMA = 4.0
+"""The classifier's greatest say, mm² over all markers for a squared weight of 1."""
+
+# Numbers in the matrices of frames that are in memory at once: 64 MB of float64.
+_CHUNK_NUMBERS = 2**23
+
+
+def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order: int = 2) -> Tensor:
+    r"""How much a classifier has to say in each frame, fading in and out.
+
+    Where it is asked :math:`\gamma` is ``maximum``, elsewhere 0; smoothed over time, and kept in [0, ``maximum``],
+    which the filter overshoots (a negative :math:`\gamma` would leave the energy without a minimum).
+
+    Args:
+        active: which shapes the classifier shall lead in which frames, (T,N) bool.
+        maximum: mm² over all markers for a squared weight of 1; of the order of the markers' squared error.
+        window, order: of :func:`torchface.temporal.savitzky_golay`.
+
+    Returns:
+        :math:`\gamma`, (T,N) float32; exactly 0 where the classifier leads in no frame of the window.
+
+    Raises:
+        ShapeError: ``active`` is not (T,N).
+        ValueRangeError: a negative ``maximum``.
+
+    Source: thesis 4.1.8.
+    """
+    if active.ndim != 2:
+        raise ShapeError(f"active: found {tuple(active.shape)}, expected (T,N)")
+    if not 0 <= maximum < float("inf"):
+        raise ValueRangeError(f"maximum: found {maximum}, expected a number that is not negative")
+    smooth = savitzky_golay(maximum * active.double(), window, order)
+    # Rounding must not leave a say where there is none.
+    return torch.where(smooth < 1e-9 * maximum, 0.0, smooth).clamp(0.0, maximum).float()
+
+
+class HybridSolver(nn.Module):
+    r"""Solves markers for blendshape weights, some of which a classifier knows better.
+
+    .. math::
+        \min_{0 \le w \le 1} E(w) + \frac{1}{M} \sum_i \gamma_i (w_i - \tilde w_i)^2
+
+    with the energy E of ``MarkerSolver``, which counts a marker; so :math:`\gamma` is in mm² over all M markers, as in
+    the source. A frame whose :math:`\gamma` is zero gets the marker solver's own weights, bit for bit.
+
+    Args:
+        markers: the solver for frames with markers alone.
+
+    Source: thesis 4.1.8, equation 38.
+    """
+
+    def __init__(self, markers: MarkerSolver) -> None:
+        super().__init__()
+        self.markers = markers
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self.markers.names
+
+    def energy(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Quadratic:
+        """What the solve minimises for markers (B,M,3), predicted weights and gamma (B,N), float64."""
+        energy = self.markers.energy(markers)
+        return energy + pull_term(predicted.to(energy.f), gamma.to(energy.f) / len(self.markers.labels))
+
+    def forward(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Tensor:
+        r"""Weights for markers and predictions.
+
+        Args:
+            markers: (B,M,3), millimetres, in the order of ``markers.labels``; NaN for not seen.
+            predicted: :math:`\tilde w`, what the classifier says, (B,N); only looked at where :math:`\gamma > 0`.
+            gamma: :math:`\gamma`, how much it counts, (B,N), mm² over all markers; see :func:`gamma_curves`.
+
+        Returns:
+            Weights in [0,1], (B,N), differentiable in markers and predictions.
+
+        Raises:
+            ShapeError: the shapes do not fit each other.
+            ValueRangeError: a prediction that counts is NaN or outside [0,1], or a gamma is negative or not finite.
+        """
+        self._check(markers, predicted, gamma)
+        alone: Tensor = self.markers(markers)
+        led = (gamma > 0).any(1).nonzero()[:, 0]
+        if not len(led):
+            return alone
+        parts = []
+        for chunk in led.split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
+            asked = gamma[chunk] > 0
+            energy = self.energy(markers[chunk], torch.where(asked, predicted[chunk], 0.0), gamma[chunk])
+            H = energy.H if energy.H.ndim == 3 else energy.H.expand(len(chunk), -1, -1)
+            parts.append(box_qp(H, energy.f, 0.0, 1.0, alone[chunk].detach().double()).to(alone.dtype))
+        return alone.index_copy(0, led, torch.cat(parts))
+
+    def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:
+        """The take with weights solved from its markers and from predicted curves, matched by name.
+
+        Shapes without a prediction are left to the markers. A frame without any marker gets weights between those of
+        the frames before and after.
+
+        Args:
+            take: markers.
+            predicted, gamma: (T,K,1) for any of the rig's shapes, both for the same ones.
+
+        Raises:
+            ShapeError: the curves have another number of frames than the take.
+            NameMismatchError: labels or names that are not the solver's, or the take has no markers.
+        """
+        if take.markers is None or len(take) != len(predicted) or len(take) != len(gamma):
+            raise ShapeError(
+                f"hybrid solve: found {len(take)} frames of markers, {len(predicted)} of predictions, {len(gamma)} of "
+                "gamma, expected the same number"
+            )
+        markers = self.markers.arrange(take.markers)
+        rows = frames_seen(markers)
+        seen = self(markers[rows], self._in_rig_order(predicted)[rows], self._in_rig_order(gamma)[rows])
+        weights = bridged(seen, rows, len(markers))
+        return replace(take, weights=Track(self.names, weights[..., None]))
+
+    def _in_rig_order(self, curves: Track) -> Tensor:
+        known = [name for name in self.names if name in curves.names]
+        unknown = [name for name in curves.names if name not in self.names]
+        if unknown:
+            raise NameMismatchError(
+                f"predicted curves: found {', '.join(unknown[:5])}, expected shapes of the rig: "
+                f"{', '.join(self.names[:5])}, ..."
+            )
+        rows = torch.tensor([self.names.index(name) for name in known], dtype=torch.int64)
+        values = curves.select(known).values[..., 0]
+        return values.new_zeros(len(curves), len(self.names)).index_copy(1, rows, values)
+
+    def _check(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> None:
+        wanted = (len(markers), len(self.names))
+        for name, found in (("predicted", predicted), ("gamma", gamma)):
+            if tuple(found.shape) != wanted:
+                raise ShapeError(f"{name}: found {tuple(found.shape)}, expected {wanted}")
+        if not bool(torch.isfinite(gamma).all()) or bool((gamma < 0).any()):
+            raise ValueRangeError("gamma: found negative, NaN or infinite numbers, expected finite ones from 0 up")
+        counts = predicted[gamma > 0]
+        if not bool(((counts >= 0) & (counts <= 1)).all()):
+            raise ValueRangeError("predicted: found weights outside [0,1] where gamma is positive")

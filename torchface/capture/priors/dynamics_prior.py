@@ -1,0 +1,258 @@
+"""How weights go on: Gaussian processes from the last frames to the next, as an energy for the solvers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.energy import Quadratic, gaussian_term
+from torchface.capture.priors.gaussian_process import GaussianProcesses
+from torchface.capture.priors.learned_names import require_same_names
+from torchface.capture.priors.motion_features import motion_basis, moving_parts, newest_frames
+from torchface.capture.priors.motion_noise import MotionNoise
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+
+_LARGEST = 2**26
+_LONGEST = 120
+
+
+@dataclass(frozen=True)
+class DynamicsSettings:
+    """How a dynamics prior learns.
+
+    Args:
+        inducing: M, how many windows stand for all others.
+        subset: how many windows the kernels' hyperparameters are learned from.
+        rounds: of gradient ascent on the bound of the marginal likelihood.
+        memory: seconds of a take that tell as much as a single independent frame: frames repeat each other, and a
+            process that counts each of them trusts what one take happened to show too much.
+        floor: the least standard deviation that is predicted, in weights.
+        seed: draws windows and noise.
+    """
+
+    inducing: int = 100
+    subset: int = 1500
+    rounds: int = 50
+    memory: float = 0.5
+    floor: float = 1e-3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts = min(self.inducing, self.subset, self.rounds)
+        if counts < 1 or not 0 < self.memory < math.inf or not 0 < self.floor < math.inf:
+            raise ValueRangeError(f"dynamics settings: found {self}, expected positive numbers")
+
+
+class DynamicsPrior(nn.Module):
+    r"""Where weights will be in the next frame, and how surely.
+
+    .. math:: w_{n+1} = w_n + A x + s \, f_g(x) + \varepsilon(x), \qquad f_g \sim GP(0, k_g)
+
+    for a window x of the last J frames. Each shape goes on by its own last steps (A is diagonal in the shapes, and a
+    window that rests goes on resting); the processes, one for each group of shapes, add what depends on the other
+    shapes of the group and on the pose; the noise grows with how much the window moves. The mean stays within the
+    range of weights.
+
+    ``prior(windows)`` gives mean and variance; :meth:`energy` the quadratic for a solver.
+
+    Args:
+        names: N shapes; solvers refuse others.
+        window: J, frames.
+        groups: rows of ``names``, one tuple a process; every shape in one group.
+        processes: of the G groups, over place, slope and curvature of all shapes.
+        noise: of the next frame.
+        center: the takes' mean, against which places count, (N,).
+        coefficients: A, (J,N).
+        feature_scale: usual sizes of place, slope and curvature, (O,N).
+        target_scale: s, (N,).
+        trust: by what the mean of each process is multiplied, (G,).
+        limits: least and largest weight, (2,).
+        fps: frames a second of the takes.
+        input_noise: standard deviation of the weights in the windows that it has learned from; 0 for true ones.
+
+    Raises:
+        ShapeError: the parts do not fit each other.
+
+    Source: thesis 4.2.10, equations 58 to 64.
+    """
+
+    fit: ClassVar[Callable[..., DynamicsPrior]]
+    """:func:`fit_dynamics_prior`, bound where this package begins."""
+
+    center: Tensor
+    coefficients: Tensor
+    feature_scale: Tensor
+    target_scale: Tensor
+    trust: Tensor
+    limits: Tensor
+    basis: Tensor
+    home: Tensor
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        window: int,
+        groups: Sequence[Sequence[int]],
+        processes: GaussianProcesses,
+        noise: MotionNoise,
+        *,
+        center: Tensor,
+        coefficients: Tensor,
+        feature_scale: Tensor,
+        target_scale: Tensor,
+        trust: Tensor,
+        limits: Tensor,
+        fps: float,
+        input_noise: float = 0.0,
+    ) -> None:
+        super().__init__()
+        count = len(names)
+        if sorted(i for group in groups for i in group) != list(range(count)):
+            raise ShapeError(f"dynamics prior: found groups {groups}, expected each of {count} shapes in one of them")
+        basis = motion_basis(window).to(center.dtype)
+        shapes = {
+            "center": (center, (count,)),
+            "coefficients": (coefficients, (window, count)),
+            "feature_scale": (feature_scale, (basis.shape[1], count)),
+            "target_scale": (target_scale, (count,)),
+            "trust": (trust, (len(groups),)),
+            "limits": (limits, (2,)),
+        }
+        for name, (value, shape) in shapes.items():
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"dynamics prior: found {name} {tuple(value.shape)}, expected {shape}")
+            self.register_buffer(name, value.detach())
+        self.names, self.window, self.fps = tuple(names), window, float(fps)
+        self.groups = tuple(tuple(group) for group in groups)
+        self.input_noise = float(input_noise)
+        self.processes, self.noise = processes, noise
+        places = {row: i for i, group in enumerate(self.groups) for row in group}
+        home = torch.tensor([places[row] for row in range(count)], dtype=torch.int64, device="cpu")
+        self.register_buffer("basis", basis, persistent=False)
+        self.register_buffer("home", home, persistent=False)
+
+    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the next frame.
+
+        Args:
+            windows: the last frames, the newest last, (B,J',N); of more than J the last J count.
+
+        Returns:
+            (B,N) and (B,N).
+
+        Raises:
+            ShapeError: fewer frames than the window, or another number of shapes.
+        """
+        windows = newest_frames(windows, self.window, len(self.names))
+        motion = torch.einsum("bjn,jo->bon", windows - self.center, self.basis)
+        told, own = self.processes((motion / self.feature_scale).flatten(1))
+        steps = (windows * self.coefficients).sum(1)
+        scale = self.target_scale * self.trust[self.home]
+        mean = windows[:, -1] + steps + scale * told
+        variance = scale.square() * own[:, self.home] + self.noise(moving_parts(windows, motion))
+        return mean.clamp(self.limits[0], self.limits[1]), variance
+
+    def energy(self, windows: Tensor) -> Quadratic:
+        r"""How unlikely the next weights are.
+
+        .. math:: E(w) = \tfrac12 \sum_i \frac{(w_i - m_i)^2}{V_i}
+
+        which is :math:`-\log p` without its constant, the unit of ``ShapePrior.energy`` at strength 1.
+
+        Args:
+            windows: as of :meth:`forward`.
+
+        Source: thesis 4.2.10, equation 65 with its weight 1/V for each shape.
+        """
+        return gaussian_term(*self(windows))
+
+    def require(self, names: Sequence[str]) -> None:
+        """Checks that a rig's shapes are the prior's.
+
+        Raises:
+            NameMismatchError: they are others, or in another order.
+        """
+        require_same_names(self.names, names)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """From which :meth:`from_config` makes a prior for the state to be loaded into."""
+        return {
+            "names": list(self.names),
+            "groups": [list(group) for group in self.groups],
+            "window": self.window,
+            "inducing": self.processes.inducing.shape[1],
+            "fps": self.fps,
+            "input_noise": self.input_noise,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> DynamicsPrior:
+        """A prior that has learned nothing, with the sizes of a ``config``.
+
+        Raises:
+            FileFormatError: a part of it is not what it should be.
+        """
+        try:
+            names, groups = [str(name) for name in config["names"]], [list(group) for group in config["groups"]]
+            window, points = (_whole(config, name) for name in ("window", "inducing"))
+            fps, input_noise = float(config["fps"]), float(config.get("input_noise", 0.0))
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"dynamics prior: found a config without a usable {error}, expected one") from error
+        n, orders, g = len(names), min(window, 3), len(groups)
+        if not 0 < fps < math.inf or window > _LONGEST or g * points * max(orders * n, points, n) > _LARGEST:
+            raise FileFormatError(
+                f"dynamics prior: found {n} shapes in {g} groups, a window of {window} frames at {fps} a second and "
+                f"{points} inducing points, expected a window of {_LONGEST} and {_LARGEST} numbers at most"
+            )
+        inputs = orders * n
+        processes = GaussianProcesses(
+            torch.zeros(g, inputs),
+            torch.zeros(g, points, inputs),
+            torch.zeros(g),
+            torch.zeros(g, points, points),
+            torch.zeros(g, points, points),
+            torch.zeros(g, points, n),
+        )
+        shares = torch.ones(0 if window == 1 else min(window, 3), n)
+        noise = MotionNoise(torch.ones(n), shares, shares.clone(), shares.clone(), torch.zeros(n, n))
+        return cls(
+            names,
+            window,
+            groups,
+            processes,
+            noise,
+            center=torch.zeros(n),
+            coefficients=torch.zeros(window, n),
+            feature_scale=torch.ones(orders, n),
+            target_scale=torch.ones(n),
+            trust=torch.ones(g),
+            limits=torch.zeros(2),
+            fps=fps,
+            input_noise=input_noise,
+        )
+
+    def check_state(self) -> None:
+        """Refuses a state that no fit gives.
+
+        Raises:
+            ValueRangeError: a scale or variance that must be positive is not.
+        """
+        positive = {"feature_scale": self.feature_scale, "noise.rest": self.noise.rest, "noise.scale": self.noise.scale}
+        for name, value in positive.items():
+            if not bool((value > 0).all()):
+                raise ValueRangeError(f"dynamics prior: found {name} that is not positive, expected all to be")
+        if bool((self.noise.own < 0).any()) or bool((self.noise.shared < 0).any()):
+            raise ValueRangeError("dynamics prior: found negative shares of noise, expected none")
+
+
+def _whole(config: Mapping[str, Any], name: str) -> int:
+    value = config[name]
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 2**20:
+        raise ValueError(name)
+    return value

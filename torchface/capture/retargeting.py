@@ -1,0 +1,249 @@
+"""One rig's weights on another: parallel parameterisation, by names and by a mapping table."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.whole_files import read_file
+from torchface.shape_names import mapping
+from torchface.take import Take, Track
+
+_LARGEST_TABLE = 2**20
+_MOST_FACTORS = 8
+
+
+@dataclass(frozen=True)
+class ShapeRule:
+    r"""What drives one shape of the target rig.
+
+    .. math:: w = \mathrm{clip}\Big(g \, \big(\textstyle\sum_i c_i w_i\big) \textstyle\prod_j w_j, \; l, \; u\Big)
+
+    A sum alone splits, merges, or renames shapes; a product alone drives a combination shape (a corrective that
+    comes in where others are active together).
+
+    Args:
+        sum: source shapes and their factors :math:`c`; without any the sum counts as 1.
+        product: source shapes that are multiplied.
+        gain: g.
+        lower, upper: what the target takes.
+    """
+
+    sum: Mapping[str, float] = field(default_factory=dict)
+    product: tuple[str, ...] = ()
+    gain: float = 1.0
+    lower: float = 0.0
+    upper: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMap:
+    """How the weights of one rig become those of another.
+
+    Args:
+        from_names, to_names: of the two rigs.
+        matrix: the sums, (N_to,N_from); all zero for a shape that is driven by products alone or by nothing.
+        products: for each target shape the source shapes that are multiplied, as rows of ``from_names``.
+        gain, lower, upper: one a target shape, (N_to,).
+    """
+
+    from_names: tuple[str, ...]
+    to_names: tuple[str, ...]
+    matrix: Tensor
+    products: tuple[tuple[int, ...], ...]
+    gain: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Source shapes that drive nothing."""
+        used = self.matrix.any(0)
+        for row in self.products:
+            used[list(row)] = True
+        return tuple(name for name, is_used in zip(self.from_names, used.tolist(), strict=True) if not is_used)
+
+    @property
+    def still(self) -> tuple[str, ...]:
+        """Target shapes that nothing drives."""
+        driven = self.matrix.any(1).tolist()
+        rows = zip(self.to_names, driven, self.products, strict=True)
+        return tuple(name for name, summed, product in rows if not summed and not product)
+
+    def __call__(self, weights: Tensor) -> Tensor:
+        """Weights (T,N_from) to weights (T,N_to), differentiable; a NaN stays in what it drives.
+
+        Raises:
+            ShapeError: another number of weights than ``from_names``.
+        """
+        if weights.ndim != 2 or weights.shape[1] != len(self.from_names):
+            raise ShapeError(f"retarget: found weights {tuple(weights.shape)}, expected (T,{len(self.from_names)})")
+        matrix = self.matrix.to(weights)
+        # A NaN times a zero of the matrix is no NaN of the target.
+        lost = weights.isnan().to(weights) @ (matrix != 0).to(weights).T > 0
+        moved = torch.where(lost, torch.nan, weights.nan_to_num(0.0) @ matrix.T)
+        columns = []
+        for row, factors in enumerate(self.products):  # a loop over shapes, not frames: each has factors of its own
+            column = moved[:, row]
+            if factors:
+                product = weights[:, list(factors)].prod(1)
+                column = column * product if bool(self.matrix[row].any()) else product
+            columns.append(column)
+        driven = torch.stack(columns, 1) * self.gain.to(weights)
+        return torch.minimum(torch.maximum(driven, self.lower.to(weights)), self.upper.to(weights))
+
+
+def shape_map(
+    from_names: Sequence[str], to_names: Sequence[str], rules: Mapping[str, ShapeRule] | None = None
+) -> ShapeMap:
+    """The map from one rig's shapes to another's: by rules where there are any, else by what the names mean.
+
+    Names that mean the same shape match (``eyeBlinkLeft``, ``eyeBlink_L``), a whole shape drives both of its halves,
+    two halves give the whole their mean; see :func:`torchface.shape_names.mapping`. A name of several shapes joined
+    by ``_`` or ``+`` (``jawOpen_mouthSmileLeft``), none of them its own in the source, is a combination shape: their
+    product.
+
+    Args:
+        from_names: of the weights that are there.
+        to_names: of the rig that shall move.
+        rules: for shapes of the target rig, in place of what their names say.
+
+    Raises:
+        NameMismatchError: a rule is for a shape that the target lacks, names one that the source lacks, or nothing
+            drives anything.
+        ValueRangeError: a gain, limit or factor is not finite, or a lower limit above the upper.
+    """
+    rules = rules or {}
+    _check_rules(rules, from_names, to_names)
+    matrix = mapping(from_names, to_names)
+    column = {name: i for i, name in enumerate(from_names)}
+    products: list[tuple[int, ...]] = []
+    for row, name in enumerate(to_names):
+        rule = rules.get(name)
+        if rule is None:
+            products.append(() if matrix[row].any() else _combination(name, from_names))
+            continue
+        matrix[row] = 0
+        for source, factor in rule.sum.items():
+            matrix[row, column[source]] = factor
+        products.append(tuple(column[source] for source in rule.product))
+    found = [rules.get(name, ShapeRule()) for name in to_names]
+    made = ShapeMap(
+        tuple(from_names),
+        tuple(to_names),
+        matrix,
+        tuple(products),
+        *(torch.tensor([getattr(rule, limit) for rule in found]) for limit in ("gain", "lower", "upper")),
+    )
+    if len(made.still) == len(made.to_names):
+        raise NameMismatchError(
+            f"retarget: found {', '.join(from_names[:5])}, ..., none of which is a shape of {', '.join(to_names[:5])}, "
+            "...; expected common names, or a table that maps them"
+        )
+    return made
+
+
+def retarget_take(take: Take, shapes: ShapeMap) -> Take:
+    """The take with its weights by another rig's names.
+
+    Raises:
+        ShapeError: the take has no weights by the names that the map comes from.
+    """
+    if take.weights is None or take.weights.names != shapes.from_names:
+        raise ShapeError("retarget: found a take without weights of the map's shapes, expected them")
+    weights = shapes(take.weights.values[..., 0])
+    return replace(take, weights=Track(shapes.to_names, weights[..., None]))
+
+
+def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
+    """Reads a mapping table, TOML::
+
+        [browInnerUp]                       # a shape of the target rig
+        sum = {browInnerUp_L = 0.5, browInnerUp_R = 0.5}
+        gain = 1.2                          # all but a sum or a product may be left out
+        lower = 0.0
+        upper = 0.8
+
+        [smileJawOpen]
+        product = ["mouthSmileLeft", "jawOpen"]
+
+    Raises:
+        FileFormatError: the file is no such table.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(read_file(path, _LARGEST_TABLE).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: found no TOML ({error}), expected a mapping table") from error
+    return {name: _rule(path, name, entry) for name, entry in table.items()}
+
+
+def _rule(path: Path, name: str, entry: Any) -> ShapeRule:
+    def fail(found: str, expected: str) -> FileFormatError:
+        return FileFormatError(f"{path}: [{name}]: found {found:.80}, expected {expected}")
+
+    if not isinstance(entry, dict):
+        raise fail(repr(entry), "a table with sum or product")
+    unknown = sorted(set(entry) - {"sum", "product", "gain", "lower", "upper"})
+    if unknown:
+        raise fail(f"{', '.join(unknown)}", "only sum, product, gain, lower, upper")
+    factors, product = entry.get("sum", {}), entry.get("product", [])
+    if not isinstance(factors, dict) or not all(map(_is_number, factors.values())):
+        raise fail(f"sum = {factors!r}", "source shapes with a factor each")
+    if not isinstance(product, list) or not all(isinstance(source, str) for source in product):
+        raise fail(f"product = {product!r}", "a list of source shapes")
+    if len(product) > _MOST_FACTORS:
+        raise fail(f"a product of {len(product)} shapes", f"at most {_MOST_FACTORS}")
+    if not factors and not product:
+        raise fail("neither sum nor product", "at least one of them")
+    limits = {limit: entry[limit] for limit in ("gain", "lower", "upper") if limit in entry}
+    for limit, value in limits.items():
+        if not _is_number(value):
+            raise fail(f"{limit} = {value!r}", "a number")
+    return ShapeRule({source: float(factor) for source, factor in factors.items()}, tuple(product), **limits)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_rules(rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_names: Sequence[str]) -> None:
+    lacking = sorted(set(rules) - set(to_names))
+    if lacking:
+        raise NameMismatchError(
+            f"retarget: found rules for {', '.join(lacking[:5])}, expected shapes of the target rig: "
+            f"{', '.join(to_names[:5])}, ..."
+        )
+    for name, rule in rules.items():
+        unknown = sorted({*rule.sum, *rule.product} - set(from_names))
+        if unknown:
+            raise NameMismatchError(
+                f"retarget: the rule of {name} names {', '.join(unknown[:5])}, expected shapes of the source: "
+                f"{', '.join(from_names[:5])}, ..."
+            )
+        numbers = (rule.gain, rule.lower, rule.upper, *rule.sum.values())
+        if not all(map(math.isfinite, numbers)) or rule.lower > rule.upper:
+            raise ValueRangeError(
+                f"retarget: the rule of {name} has gain {rule.gain}, limits {rule.lower} to {rule.upper}, expected "
+                "finite numbers and lower <= upper"
+            )
+
+
+def _combination(name: str, from_names: Sequence[str]) -> tuple[int, ...]:
+    """The source shapes whose names a combination shape's name joins; none if it joins no others."""
+    for joint in ("+", "_"):
+        parts = name.split(joint)
+        if not 2 <= len(parts) <= _MOST_FACTORS or not all(parts):
+            continue
+        told = mapping(from_names, parts)
+        if bool((told == 1).any(1).all()) and bool((told.sum(1) == 1).all()):
+            return tuple(int(row.argmax()) for row in told)
+    return ()

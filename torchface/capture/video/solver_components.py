@@ -1,0 +1,251 @@
+"""What a video solver is made of: the rig's points, the camera, priors and settings; and how they are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
+from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.video_settings import VideoSettings
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.rig import BlendshapeRig
+
+CONTOUR_WEIGHT = 0.5
+TURN, SHIFT = 0.02, 4.0
+"""How far a head moves from frame to frame: standard deviations in radians and millimetres."""
+LOOSE_TURN, LOOSE_PLACE = 0.5, 500.0
+"""What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre."""
+LOOSE_WEIGHT, LOOSE_STEP = 1.0, 0.1
+"""Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full."""
+
+_POINTS = ("rest", "basis", "rows", "valid", "side")
+_PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
+_DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
+    "dynamics_prior": DynamicsPrior,
+    "adapted_dynamics_prior": AdaptedDynamicsPrior,
+}
+_MOST_SHAPES, _MOST_POINTS = 2**12, 2**20
+
+
+class VideoSolverParts(nn.Module):
+    """All that a video solve computes with, as buffers and submodules; see ``VideoSolver`` for the arguments."""
+
+    rest: Tensor
+    basis: Tensor
+    rows: Tensor
+    valid: Tensor
+    side: Tensor
+    intrinsics: Tensor
+    landmark_weights: Tensor
+    lower: Tensor
+    upper: Tensor
+    motion_variance: Tensor
+    loose: Tensor
+    price: Tensor
+    ridge: Tensor
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        landmark_vertices: Tensor | None,
+        intrinsics: Tensor,
+        prior: ShapePrior | None = None,
+        dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None,
+        settings: VideoSettings | None = None,
+        landmark_weights: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        settings = settings or VideoSettings()
+        marks = rig.neutral.landmarks if landmark_vertices is None else landmark_vertices
+        if intrinsics.shape != (3, 3):
+            raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
+        weights = _default_weights() if landmark_weights is None else landmark_weights.detach()
+        if weights.shape != (LANDMARKS,):
+            raise ShapeError(f"landmark_weights: found {tuple(weights.shape)}, expected ({LANDMARKS},)")
+        check_not_negative("landmark_weights", weights)
+        for learned in (prior, dynamics):
+            if learned is not None:
+                learned.require(rig.names)
+        points = FacePoints.of(rig, marks, slides=settings.contour_slide < 1)
+        self._hold(rig.names, points, intrinsics.detach(), weights, prior, dynamics, settings)
+
+    def _hold(
+        self,
+        names: Sequence[str],
+        points: FacePoints,
+        intrinsics: Tensor,
+        landmark_weights: Tensor,
+        prior: ShapePrior | None,
+        dynamics: DynamicsPrior | AdaptedDynamicsPrior | None,
+        settings: VideoSettings,
+    ) -> None:
+        self.names: tuple[str, ...] = tuple(names)
+        self.prior, self.dynamics = prior, dynamics
+        self._settings = settings
+        like = points.rest
+        for name in _POINTS:
+            self.register_buffer(name, getattr(points, name).detach())
+        self.register_buffer("intrinsics", intrinsics.to(like, copy=True))
+        self.register_buffer("landmark_weights", landmark_weights.to(like, copy=True))
+        # What follows from settings alone is on the CPU also where a solver is being rebuilt without memory.
+        device = torch.device("cpu") if like.is_meta else like.device
+        count = len(names)
+        # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
+        weight = 0.0 if dynamics is None else LOOSE_WEIGHT**-2
+        constants = {
+            "lower": [0.0] * count + [-torch.inf] * 6,
+            "upper": [1.0] * count + [torch.inf] * 6,
+            "motion_variance": [TURN**2] * 3 + [SHIFT**2] * 3,
+            "loose": [weight] * count + [LOOSE_TURN**-2] * 3 + [LOOSE_PLACE**-2] * 3,
+            "price": [settings.sparsity] * count + [0.0] * 6,
+            "ridge": [2 * settings.ridge] * count + [0.0] * 6,
+        }
+        for name, numbers in constants.items():
+            made = torch.tensor(numbers, dtype=torch.float64, device=device)
+            self.register_buffer(name, made, persistent=False)
+
+    @property
+    def settings(self) -> VideoSettings:
+        """What the terms weigh; fixed."""
+        return self._settings
+
+    @property
+    def points(self) -> FacePoints:
+        """Of the rig, float64."""
+        return FacePoints(self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double())
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What :meth:`from_config` needs beside the state: plain values only.
+
+        Raises:
+            NameMismatchError: a prior is of a class that cannot be saved.
+        """
+        return {
+            "names": list(self.names),
+            "points": len(self.rest),
+            "curve": self.rows.shape[1],
+            "settings": asdict(self.settings),
+            "prior": _described(self.prior, _PRIORS),
+            "dynamics": _described(self.dynamics, _DYNAMICS),
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> VideoSolverParts:
+        """A solver of zeros for the state to be loaded into, without the rig it came from.
+
+        Raises:
+            NameMismatchError: a name is no text or there twice, or a prior is for other shapes.
+            FileFormatError: a size or a prior is not what it should be.
+            ValueRangeError: a setting is not.
+        """
+        names = config["names"]
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
+            raise NameMismatchError(f"names: found {names!r:.80}, expected a list of distinct names")
+        count, curve = _whole(config, "points"), _whole(config, "curve")
+        if not 0 < len(names) <= _MOST_SHAPES or not LANDMARKS <= count <= _MOST_POINTS or curve > count:
+            raise FileFormatError(
+                f"video solver: found {len(names)} shapes, {count} points and curves of {curve}, expected 1 to "
+                f"{_MOST_SHAPES} shapes, {LANDMARKS} to {_MOST_POINTS} points and no longer curves"
+            )
+        settings = config["settings"]
+        if not isinstance(settings, Mapping):
+            raise FileFormatError(f"video solver: found settings {settings!r:.80}, expected a table")
+        prior, dynamics = _made(config.get("prior"), _PRIORS), _made(config.get("dynamics"), _DYNAMICS)
+        for learned in (prior, dynamics):
+            if learned is not None:
+                learned.require(names)
+        self = cls.__new__(cls)
+        nn.Module.__init__(self)
+        points = FacePoints(
+            torch.zeros(count, 3, dtype=torch.float64),
+            torch.zeros(count, 3, len(names), dtype=torch.float64),
+            torch.zeros(JAW, curve, dtype=torch.int64),
+            torch.zeros(JAW, curve, dtype=torch.bool),
+            torch.zeros(JAW, dtype=torch.float64),
+        )
+        K, weights = torch.zeros(3, 3), torch.zeros(LANDMARKS)
+        self._hold(names, points, K, weights, prior, dynamics, VideoSettings(**settings))
+        return self
+
+    def check_state(self) -> None:
+        """Refuses a state that no rig and camera give.
+
+        Raises:
+            ValueRangeError: points that there are not, a camera without a focal length, or negative weights.
+        """
+        if bool(((self.rows < 0) | (self.rows >= len(self.rest))).any()):
+            raise ValueRangeError(f"video solver: found rows beyond its {len(self.rest)} points, expected rows of them")
+        K = self.intrinsics
+        if not bool((K.diagonal() > 0).all()) or K[2].tolist() != [0.0, 0.0, 1.0]:
+            raise ValueRangeError(f"video solver: found intrinsics {K.tolist()}, expected those of a camera")
+        check_not_negative("landmark_weights", self.landmark_weights)
+        for learned in (self.prior, self.dynamics):
+            if check := getattr(learned, "check_state", None):
+                check()
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
+        """As modules do; but another rig's contour may have more or fewer points than this one's."""
+        found = {name: state_dict.get(prefix + name) for name in _POINTS}
+        shapes = {name: tuple(value.shape) for name, value in found.items() if isinstance(value, Tensor)}
+        count, curve = (shapes.get(name, (0, 0))[axis] for name, axis in (("rest", 0), ("rows", -1)))
+        expected = {
+            "rest": (count, 3),
+            "basis": (count, 3, len(self.names)),
+            "rows": (JAW, curve),
+            "valid": (JAW, curve),
+            "side": (JAW,),
+        }
+        if shapes == expected and count >= LANDMARKS:
+            for name, shape in shapes.items():
+                own = getattr(self, name)
+                if own.shape != shape:
+                    setattr(self, name, own.new_zeros(shape))
+        super()._load_from_state_dict(state_dict, prefix, *rest)  # type: ignore[arg-type]
+
+    def extra_repr(self) -> str:
+        return f"{len(self.names)} shapes, {self.settings}"
+
+
+def check_not_negative(name: str, value: Tensor) -> None:
+    """Raises ``ValueRangeError`` for a negative or infinite number, or NaN."""
+    if not bool((torch.isfinite(value) & (value >= 0)).all()):
+        raise ValueRangeError(f"{name}: found {value.flatten()[:5].tolist()}, expected finite ones of at least 0")
+
+
+def _default_weights() -> Tensor:
+    weights = torch.ones(LANDMARKS)
+    weights[:JAW] = CONTOUR_WEIGHT
+    return weights
+
+
+def _described(learned: Any, kinds: Mapping[str, type]) -> dict[str, Any] | None:
+    if learned is None:
+        return None
+    kind = next((kind for kind, known in kinds.items() if type(learned) is known), None)
+    if kind is None:
+        known = " or ".join(one.__name__ for one in kinds.values())
+        raise NameMismatchError(f"video solver: found a prior of class {type(learned).__name__}, expected {known}")
+    return {"kind": kind, **learned.config}
+
+
+def _made(config: Any, kinds: Mapping[str, type]) -> Any:
+    """A prior that has learned nothing; a kind is looked up in the table and nowhere else."""
+    if config is None:
+        return None
+    kind = config.get("kind") if isinstance(config, Mapping) else None
+    if not isinstance(kind, str) or kind not in kinds:
+        raise FileFormatError(f"video solver: found a prior of kind {kind!r:.80}, expected {' or '.join(kinds)}")
+    return kinds[kind].from_config(config)  # type: ignore[attr-defined]
+
+
+def _whole(config: Mapping[str, Any], name: str) -> int:
+    value = config[name]
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise FileFormatError(f"video solver: found {name} = {value!r:.80}, expected a whole number from 1")
+    return value

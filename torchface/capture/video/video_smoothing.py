@@ -1,0 +1,121 @@
+"""Blendshape weights of a whole video at once: every frame leans on those before and after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.capture.video.face_points import LANDMARKS
+from torchface.capture.video.frame_states import FrameTerms, VideoSolution, VideoState
+from torchface.capture.video.reprojection import HeadState
+from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.capture.video.video_solver import VideoSolver
+from torchface.errors import ValueRangeError
+
+# Added to variances before they are inverted: what rounding leaves of a direction that is known exactly.
+_ROUNDING = 1e-9
+
+
+def solve_whole_take(
+    solver: VideoSolver,
+    landmarks: Tensor,
+    rotation: Tensor | None = None,
+    translation: Tensor | None = None,
+    confidence: Tensor | None = None,
+) -> VideoSolution:
+    r"""Weights and poses of consecutive frames, each from all of them.
+
+    The solver runs forward; then what later frames tell goes back,
+
+    .. math:: x_t \leftarrow x_t + G_t (x_{t+1} - x^-_{t+1}), \quad G_t = P_t (P^-_{t+1})^{-1}
+
+    with :math:`x^-` what frame t led to; and each frame is solved anew for what all frames' landmarks together expect
+    of it, under the prior and the bounds.
+
+    Args:
+        solver: with a dynamics prior; without one no frame tells of another.
+        landmarks, rotation, translation, confidence: as of ``VideoSolver.forward``.
+
+    Raises:
+        ShapeError: the shapes do not fit each other.
+        ValueRangeError: the solver has no dynamics prior, or as ``VideoSolver.forward``.
+
+    Source: Rauch, Tung and Striebel 1965.
+    """
+    if solver.dynamics is None:
+        raise ValueRangeError("whole take: found a solver without a dynamics prior, expected one that has it")
+    with torch.no_grad():
+        states, enough = solver.states(landmarks, rotation, translation, confidence)
+        first = int(enough.nonzero()[0, 0])
+        smoothed = _smoothed(solver, states[first:])
+        head = _solved(solver, states[first:], smoothed)
+    frames = torch.arange(len(landmarks), device=landmarks.device)
+    rows = (frames - first).clamp(min=0)  # frames before the first face have its state
+    weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
+    weights = interpolated(weights, enough)
+    return VideoSolution(weights, turned, moved, solver.reprojection_errors(landmarks, weights, turned, moved), enough)
+
+
+def interpolated(weights: Tensor, solved: Tensor) -> Tensor:
+    """Weights (T,N) with straight lines where ``solved`` (T,) is false; at both ends they stay."""
+    known = solved.nonzero()[:, 0]
+    at = torch.arange(len(weights), device=weights.device)
+    after = torch.searchsorted(known, at).clamp(max=len(known) - 1)
+    before = (torch.searchsorted(known, at, right=True) - 1).clamp(min=0)
+    left, right = known[before], known[after]
+    share = ((at - left) / (right - left).clamp(min=1)).clamp(0, 1).to(weights)[:, None]
+    return torch.lerp(weights[left], weights[right], share)
+
+
+@dataclass(frozen=True, eq=False)
+class _Later:
+    """What all frames tell of one: how far from its own belief, (1,N+6), and how surely, (1,N+6,N+6)."""
+
+    away: Tensor
+    covariance: Tensor
+
+
+def _smoothed(solver: VideoSolver, states: list[VideoState]) -> Belief:
+    """What all T frames tell of each, as one belief over T faces."""
+    beliefs = [state.belief for state in states if state.belief is not None]
+    later = [_Later(torch.zeros_like(beliefs[-1].covariance[..., 0]), beliefs[-1].covariance)]
+    # Each frame needs what was found of the next.
+    for state, belief, following in zip(
+        reversed(states[:-1]), reversed(beliefs[:-1]), reversed(beliefs[1:]), strict=True
+    ):
+        led_to = solver.predicted(state, belief)
+        gain = torch.linalg.solve(led_to.covariance, belief.covariance).transpose(1, 2)
+        ahead = later[-1]
+        lifted = following.mean.moved(following.mean.weights + ahead.away[:, :-6], ahead.away[:, -6:])
+        surprise = Expectation(led_to.mean, led_to.covariance).away(lifted)
+        away = (gain @ surprise[..., None])[..., 0]
+        covariance = belief.covariance + gain @ (ahead.covariance - led_to.covariance) @ gain.transpose(1, 2)
+        later.append(_Later(away, 0.5 * (covariance + covariance.transpose(1, 2))))
+    later.reverse()
+    away, covariance = (torch.cat([getattr(x, name) for x in later]) for name in ("away", "covariance"))
+    weights, rotation, translation = (
+        torch.cat([getattr(belief.mean, name) for belief in beliefs]) for name in ("weights", "rotation", "translation")
+    )
+    mean = HeadState(weights, rotation, translation)
+    return Belief(mean.moved(weights + away[:, :-6], away[:, -6:]), covariance)
+
+
+def _solved(solver: VideoSolver, states: list[VideoState], smoothed: Belief) -> HeadState:
+    """The frames' weights and poses under the prior; their landmarks are in what is expected already."""
+    spread = smoothed.covariance
+    identity = torch.eye(spread.shape[1], dtype=spread.dtype, device=spread.device)
+    expected = Belief(smoothed.mean, spread + _ROUNDING * identity).expectation()
+    count = len(states)
+    like = smoothed.mean.weights
+    none = like.new_zeros(count, LANDMARKS)
+    begin = torch.cat([state.weights[None] for state in states])
+    terms = FrameTerms(
+        none[..., None].expand(-1, -1, 2),
+        none,
+        smoothed.mean.rotation,
+        smoothed.mean.translation,
+        expected,
+    )
+    return solver.solve(terms, HeadState(begin, smoothed.mean.rotation, smoothed.mean.translation)).head

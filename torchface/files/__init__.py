@@ -1,0 +1,1 @@
+"""Files of every kind: whole files within a budget, small documents, module states, learned models."""

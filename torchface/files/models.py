@@ -1,0 +1,214 @@
+"""A learned model as a folder: ``model.toml``, ``state.safetensors`` and ``CARD.md``."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, Self, TypeVar
+
+import tomli_w
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
+from torchface.files.states import pack_state, read_state
+from torchface.files.whole_files import read_file, write_file
+
+FORMAT = 1
+DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
+_LARGEST_TEXT = 2**20
+_TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
+
+
+class Learned(Protocol):
+    """What a class needs so that it can be saved: its own description, and the way back from it."""
+
+    @property
+    def config(self) -> dict[str, Any]: ...
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Self:
+        """A model that has learned nothing yet; may be asked for on the meta device."""
+        ...
+
+
+@dataclass(frozen=True)
+class ModelRecord:
+    """What is known of a saved model without loading it.
+
+    Args:
+        kind: which class it is of.
+        licence: under which it may be used, such as ``MIT``.
+        data: what it has learned from.
+        metrics: what was measured on data held out.
+        recipe: the command that makes it again.
+        url: where it comes from.
+        settings: of the recipe, the effective ones.
+        sha256: of the state.
+        size: of the state, bytes.
+        config: what its class is built from.
+    """
+
+    kind: str
+    licence: str
+    data: str
+    metrics: dict[str, float] = field(default_factory=dict)
+    recipe: str = ""
+    url: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+    sha256: str = ""
+    size: int = 0
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+def write_model(
+    model: nn.Module, folder: str | Path, record: ModelRecord, card: str = "", half: Collection[str] = ()
+) -> ModelRecord:
+    """Writes a model into a folder; each file appears only when it is complete, ``model.toml`` last.
+
+    Args:
+        model: a module with ``config`` and ``from_config``.
+        folder: made where it is missing.
+        record: kind, licence, data, metrics, recipe; size, hash and config are filled in.
+        card: Markdown for ``CARD.md``: what the model is good for, measured how, its limits.
+        half: names in the state that are stored in half precision.
+
+    Returns:
+        The record as written.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+        ValueRangeError: the state or a metric is not finite.
+    """
+    odd = [name for name, value in record.metrics.items() if not math.isfinite(value)]
+    if odd:
+        raise ValueRangeError(f"metrics: found {odd[0]} = {record.metrics[odd[0]]}, expected finite numbers")
+    folder = Path(folder)
+    state = pack_state(model.state_dict(), half)
+    record = replace(record, sha256=hashlib.sha256(state).hexdigest(), size=len(state), config=dict(model.config))  # type: ignore[arg-type]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
+    document = {"format": FORMAT, **_without_none(dict(vars(record)))}
+    write_file(folder / STATE, state)
+    write_file(folder / CARD, card_text(folder.name, record, card).encode())
+    write_file(folder / DESCRIPTION, tomli_w.dumps(document).encode())
+    return record
+
+
+def read_record(folder: str | Path) -> ModelRecord:
+    """What ``model.toml`` says.
+
+    Raises:
+        FileFormatError: the file is missing, too large, no TOML, of a newer format, or lacks a field.
+    """
+    path = _inside(Path(folder), DESCRIPTION)
+    try:
+        document = tomllib.loads(read_file(path, _LARGEST_TEXT).decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise FileFormatError(f"{path}: not TOML ({error})") from error
+    found = document.get("format")
+    if not isinstance(found, int) or isinstance(found, bool) or found < 1:
+        raise FileFormatError(f"{path}: found format = {found!r}, expected {FORMAT}")
+    if found > FORMAT:
+        raise FileFormatError(f"{path}: found format {found}, made by a newer torchface; expected {FORMAT} at most")
+    for name in _TEXTS:
+        if not isinstance(document.get(name, ""), str):
+            raise FileFormatError(f"{path}: found {name} = {document[name]!r}, expected text")
+    size, metrics = document.get("size"), document.get("metrics", {})
+    if not isinstance(size, int) or isinstance(size, bool) or not 0 < size < 2**48:
+        raise FileFormatError(f"{path}: found size = {size!r}, expected the bytes of {STATE}")
+    if not isinstance(metrics, dict) or not all(
+        isinstance(v, int | float) and abs(v) < 1e300 for v in metrics.values()
+    ):
+        raise FileFormatError(f"{path}: found metrics = {metrics!r}, expected a table of numbers")
+    tables = {name: document.get(name, {}) for name in ("settings", "config")}
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise FileFormatError(f"{path}: found {name} = {table!r}, expected a table")
+    texts = {name: document.get(name, "") for name in _TEXTS}
+    return ModelRecord(**texts, metrics={key: float(v) for key, v in metrics.items()}, size=size, **tables)
+
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
+    """The model of a folder, of one of these kinds.
+
+    The kind is looked up in ``kinds``; no file names code. The module is built without memory first, and its state
+    held against the file's size, header and hash, in this order, before anything is read into it.
+
+    Raises:
+        FileFormatError: a file is missing, cut off, damaged, of a newer format or another kind, or does not fit.
+    """
+    folder = Path(folder)
+    record = read_record(folder)
+    path, state_path = folder / DESCRIPTION, _inside(folder, STATE)
+    if record.kind not in kinds:
+        raise FileFormatError(f"{path}: found kind {record.kind!r}, expected {' or '.join(map(repr, sorted(kinds)))}")
+    try:
+        with torch.device("meta"):
+            model = kinds[record.kind].from_config(record.config)  # type: ignore[attr-defined]
+        expected: dict[str, Tensor] = model.state_dict()
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
+    except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({error})") from error
+    if not state_path.is_file():
+        raise FileFormatError(f"{state_path}: found no such file, expected the state of {path}")
+    state, data = read_state(state_path, expected, record.size)
+    found = hashlib.sha256(data).hexdigest()
+    if found != record.sha256:
+        raise FileFormatError(
+            f"{state_path}: found sha256 {found}, expected {record.sha256 or 'one'} as in {DESCRIPTION}: "
+            "the file is damaged or of another model"
+        )
+    try:
+        model.load_state_dict(state, assign=True)
+        if check := getattr(model, "check_state", None):
+            check()
+    except (RuntimeError, TorchfaceError) as error:
+        raise FileFormatError(f"{path}: config and state do not fit ({error})") from error
+    return model.eval()
+
+
+def card_text(name: str, record: ModelRecord, text: str) -> str:
+    """The card: what the author says of the model, then data, licence, figures and the command that makes it."""
+    parts = [f"# {name}", text.strip()] if text.strip() else [f"# {name}"]
+    parts += [f"**Data.** {record.data}", f"**Licence.** {record.licence}"]
+    if record.metrics:
+        rows = "\n".join(f"| {key} | {value:.4g} |" for key, value in record.metrics.items())
+        parts.append(f"| measured | value |\n| --- | --- |\n{rows}")
+    if record.recipe:
+        parts.append(f"Made again by\n\n```sh\n{record.recipe}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the folder; a link that leads out of it is refused."""
+    path = folder / name
+    try:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise FileFormatError(f"{path}: found a link that leads out of the folder, expected a file in it")
+    except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL
+        raise FileFormatError(f"{path}: cannot be followed ({error})") from error
+    return path
+
+
+def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
+    """TOML has no null: what is absent is None."""
+    return {
+        key: _without_none(value) if isinstance(value, Mapping) else value
+        for key, value in table.items()
+        if value is not None
+    }

@@ -1,0 +1,109 @@
+"""Many shapes in correspondence laid on each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.sample_batches import MovedSamples, Samples, blocks
+from torchface.geometry.similarity import Similarity, similarity_transform
+
+_TOLERANCE = 1e-3
+_MOST_ROUNDS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Procrustes:
+    """Shapes on their mean.
+
+    Args:
+        poses: what moves each shape, a batch of M, float64.
+        mean: of the moved shapes, (V,3) float64.
+        rounds: how many it took.
+    """
+
+    poses: Similarity
+    mean: Tensor
+    rounds: int
+
+
+def generalised_procrustes(
+    shapes: Samples,
+    scale: bool = False,
+    weights: Tensor | None = None,
+    start: Tensor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Procrustes:
+    r"""The rigid motions that lay shapes on their common mean.
+
+    .. math:: \min_{R_m, t_m, \bar x} \sum_m \sum_v w_v \lVert s_m R_m x_{mv} + t_m - \bar x_v \rVert^2
+
+    In turn each shape is laid on the mean and the mean taken again, until it moves by less than a micrometre. With
+    scales, the mean keeps the shapes' mean size, or all would shrink to nothing.
+
+    Args:
+        shapes: (M,V,3), millimetres; read in blocks.
+        scale: estimate :math:`s`; otherwise sizes stay, and differ.
+        weights: of the vertices, (V,); equal if absent.
+        start: where the mean is to lie, (V,3); where the first shape lies if absent.
+        progress: called with (rounds done, rounds at most).
+
+    Raises:
+        ShapeError: no (M,V,3), or a start or weights that do not fit.
+        ValueRangeError: a shape holds NaN or infinity.
+
+    Source: Gower 1975; thesis 3.2.4.
+    """
+    count, vertices, channels = shapes.shape
+    if channels != 3 or count < 1:
+        raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected (M,V,3)")
+    for name, tensor, expected in (("start", start, (vertices, 3)), ("weights", weights, (vertices,))):
+        if tensor is not None and tensor.shape != expected:
+            raise ShapeError(f"{name}: found {tuple(tensor.shape)}, expected {expected}")
+    parts = list(blocks(shapes))
+    mean = shapes.read(0, 1)[0].double() if start is None else start.double()
+    size = 0.0
+    rounds, moved = 0, float("inf")
+    while rounds < _MOST_ROUNDS and moved > _TOLERANCE:
+        poses, total, sizes = [], torch.zeros_like(mean), 0.0
+        for begin, end in parts:
+            read = shapes.read(begin, end).double()
+            if not bool(torch.isfinite(read).all()):
+                bad = int((~torch.isfinite(read)).flatten(1).any(1).nonzero()[0, 0]) + begin
+                raise ValueRangeError(f"shapes: number {bad} holds NaN or infinity; expected none")
+            target, weight = mean.expand_as(read), None if weights is None else weights.expand(read.shape[:2])
+            poses.append(similarity_transform(read, target, weight, scale))
+            total += poses[-1].apply(read).sum(0)
+            sizes += float(_size(read, weights).sum())
+        found = total / count
+        if scale:
+            size = size or sizes / count
+            found = found * (size / float(_size(found[None], weights)))
+        # What the mean as a whole has drifted by is taken back: the frame is the start's.
+        found = similarity_transform(found[None], mean[None], _one(weights), scale=False).apply(found)[0]
+        moved, mean, rounds = float((found - mean).norm(dim=1).mean()), found, rounds + 1
+        if progress is not None:
+            progress(rounds, _MOST_ROUNDS)
+    pose = Similarity(*(torch.cat(t) for t in zip(*((p.scale, p.rotation, p.translation) for p in poses), strict=True)))
+    return Procrustes(pose, mean, rounds)
+
+
+def aligned(shapes: Samples, found: Procrustes) -> MovedSamples:
+    """The shapes as the motions lay them."""
+    return MovedSamples(shapes, found.poses)
+
+
+def _one(weights: Tensor | None) -> Tensor | None:
+    return None if weights is None else weights[None]
+
+
+def _size(shapes: Tensor, weights: Tensor | None) -> Tensor:
+    """Root mean square distance from the centre, (M,)."""
+    weight = torch.ones(shapes.shape[1]) if weights is None else weights
+    weight = (weight / weight.sum()).to(shapes)[None, :, None]
+    centre = (weight * shapes).sum(1, keepdim=True)
+    return (weight * (shapes - centre).square()).sum((1, 2)).sqrt()

@@ -1,0 +1,1 @@
+"""Triangle meshes: operators, nearest points, deformation gradients, contact, texture space."""

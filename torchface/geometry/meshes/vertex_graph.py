@@ -1,0 +1,43 @@
+"""A mesh's vertices as a graph along its edges."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import edges
+
+
+class VertexGraph:
+    """Which vertices are neighbours: values fade, blur and fill over the mesh rather than over its layout.
+
+    Args:
+        faces: triangles (F,3).
+        count: of vertices, V.
+    """
+
+    def __init__(self, faces: Tensor, count: int) -> None:
+        self.first, self.second = edges(faces).T
+        degree = torch.zeros(count, dtype=torch.float64)
+        one = torch.ones(len(self.first), dtype=torch.float64)
+        self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Of each vertex's neighbours, (V,C)."""
+        total = torch.zeros_like(values).index_add_(0, self.first, values[self.second])
+        return total.index_add_(0, self.second, values[self.first])
+
+    def smoothed(self, values: Tensor, weights: Tensor, rounds: int) -> Tensor:
+        """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""
+        top, bottom = values * weights[:, None], weights[:, None]
+        for _ in range(rounds):
+            both = torch.cat([top, bottom], dim=1)
+            both = 0.5 * (both + self.sum(both) / self.degree[:, None])
+            top, bottom = both[:, :-1], both[:, -1:]
+        return top / bottom.clamp(min=1e-12)
+
+    def least(self, values: Tensor) -> Tensor:
+        """Of each vertex and its neighbours, (V,)."""
+        least = values.clone()
+        least.scatter_reduce_(0, self.first, values[self.second], "amin")
+        return least.scatter_reduce_(0, self.second, values[self.first], "amin")

@@ -1,0 +1,94 @@
+"""The animation of a rig's shapes in a glTF file, as a take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchface.io.gltf.accessors import read_floats
+from torchface.io.gltf.container import Document, read_document, shown
+from torchface.io.gltf.primitives import read_target_names
+from torchface.io.tables.frame_rates import FASTEST, SLOWEST, simplest_rate
+from torchface.io.tables.numbered_csv import DEFAULT_RATE
+from torchface.take import Take, Track
+
+_UNEVEN = 0.01
+_CUBIC = "CUBICSPLINE"
+
+
+def read_gltf_weights(path: str | Path) -> Take | None:
+    """The weights that a file's first animation gives its shapes, one frame a key; none where nothing moves shapes.
+
+    Args:
+        path: a ``.glb`` or ``.gltf`` whose keys are evenly spaced, as :func:`torchface.save_animation` writes them.
+
+    Returns:
+        weights (T,N,1), by the names of the morph targets. Of several meshes with a shape of one name the first's
+        weights count.
+
+    Raises:
+        FileFormatError: not glTF 2, broken, or keys that are no frames at one rate.
+    """
+    document = read_document(path)
+    animations = document.objects("animations")
+    place = "animations[0]"
+    channels = document.array(animations[0], "channels", place) if animations else []
+    weights: dict[str, np.ndarray] = {}
+    times: np.ndarray | None = None
+    for number, row in enumerate(channels):
+        channel = document.record(row, f"{place}.channels[{number}]")
+        target = document.record(channel.get("target"), f"{place}.channels[{number}].target")
+        if target.get("path") != "weights":
+            continue
+        here, names, values = _channel(document, animations[0], channel, target, f"{place}.channels[{number}]")
+        if times is not None and (len(here) != len(times) or not np.allclose(here, times)):
+            raise document.error(f"{place}.channels[{number}]", "keys at other times", "those of the first channel")
+        times = here
+        for name, column in zip(names, values.T, strict=True):
+            weights.setdefault(name, column)
+    if times is None:
+        return None
+    stacked = np.stack(list(weights.values()), axis=1)
+    return Take(_rate(document, times), weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]))
+
+
+def _channel(
+    document: Document, animation: dict[str, Any], channel: dict[str, Any], target: dict[str, Any], place: str
+) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """Times (T,), names and values (T,N) of one channel."""
+    samplers = document.array(animation, "samplers", "animations[0]")
+    index = document.integer(channel, "sampler", place)
+    if index >= len(samplers):
+        raise document.error(f"{place}.sampler", index, f"less than {len(samplers)}")
+    sampler = document.record(samplers[index], f"{place}.sampler")
+    node = document.item("nodes", target.get("node"), f"{place}.target.node")
+    names = read_target_names(document, document.integer(node, "mesh", f"{place}.target.node"))
+    if not names:
+        raise document.error(f"{place}.target.node", "a mesh without morph targets", "one with them")
+    times = read_floats(document, sampler.get("input"), f"{place}.input", ("SCALAR",))[:, 0]
+    each = 3 if sampler.get("interpolation") == _CUBIC else 1  # a cubic key is tangent, value, tangent
+    count = len(times) * len(names) * each
+    values = read_floats(document, sampler.get("output"), f"{place}.output", ("SCALAR",), count)[:, 0]
+    values = values.reshape(len(times), each, len(names))[:, each // 2]
+    if len(times) == 0:
+        raise document.error(f"{place}.input", "no key", "at least one")
+    return times, names, values
+
+
+def _rate(document: Document, times: np.ndarray) -> float:
+    """Frames a second; keys are rounded to single precision."""
+    if len(times) == 1:
+        return DEFAULT_RATE
+    steps = np.diff(times.astype(np.float64))
+    step = (float(times[-1]) - float(times[0])) / (len(times) - 1)
+    if step <= 0 or np.abs(steps - step).max() > _UNEVEN * step:
+        worst = shown(float(steps[np.abs(steps - step).argmax()]))
+        raise document.error("animations[0]", f"keys {worst} s apart, the mean being {step:.6f}", "even frames")
+    slack = 2 * float(np.spacing(np.float32(times[-1])))
+    rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
+    if not SLOWEST <= rate <= FASTEST:
+        raise document.error("animations[0]", f"{rate:.4g} frames a second", f"{SLOWEST} to {FASTEST:.0f}")
+    return rate

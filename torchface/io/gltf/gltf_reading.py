@@ -1,0 +1,193 @@
+"""A glTF scene as one rig: all its meshes put together, shapes of the same name joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchface.errors import FileFormatError
+from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
+from torchface.io.gltf.primitives import Part, read_part
+from torchface.io.gltf.rejoining import rejoined
+from torchface.io.gltf.scene import Instance, instances
+from torchface.io.gltf.welding import weld
+from torchface.io.images.image_files import decode_image
+from torchface.io.length_units import millimetres_per
+from torchface.mesh import Annotations, Mesh
+from torchface.rig import BlendshapeRig
+
+
+def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
+    """The rig in a glTF file: every mesh of the scene, moved by its node, morph targets joined by name.
+
+    Names come from ``mesh.extras.targetNames``, where Blender and three.js write and look for them; without they are
+    ``target_0`` and so on. A scene of several meshes gets a region a node. Vertices split at seams become one again.
+
+    Args:
+        path: a ``.glb`` or ``.gltf``.
+        unit: what the file's numbers are; glTF says metres.
+
+    Raises:
+        FileFormatError: not glTF 2, truncated, broken, or without morph targets.
+    """
+    document = read_document(path)
+    neutral, deltas, names = _read(document, millimetres_per(unit))
+    if not names:
+        count = len(document.objects("meshes"))
+        meshes = f"its {count} meshes" if count != 1 else "its one mesh"
+        raise FileFormatError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
+    return BlendshapeRig(neutral, deltas, names)
+
+
+def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
+    """The scene of a glTF file as one mesh, morph targets at rest; see ``read_gltf_rig``.
+
+    Raises:
+        FileFormatError: not glTF 2, truncated, broken, or without triangles.
+    """
+    return _read(read_document(path), millimetres_per(unit))[0]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """An instance in millimetres, with its vertices welded."""
+
+    name: str
+    vertices: Tensor
+    faces: Tensor
+    uvs: Tensor | None
+    uv_faces: Tensor | None
+    colors: Tensor | None
+    polygons: Tensor | None
+    annotations: Annotations | None
+    deltas: Tensor
+    names: tuple[str, ...]
+
+
+def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ...]]:
+    parts: dict[int, Part | None] = {}
+    found: list[tuple[Instance, Part]] = []
+    for instance in instances(document):
+        if instance.mesh not in parts:
+            parts[instance.mesh] = read_part(document, instance.mesh)
+        part = parts[instance.mesh]
+        if part is not None and len(part.triangles):
+            document.reserve(part.deltas.nbytes + part.positions.nbytes, f"nodes: {instance.name[:40]}")
+            found.append((instance, part))
+    if not found:
+        raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
+    whole = rejoined(document, found)
+    pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
+    picture = next((part.picture for _, part in found if part.picture is not None), None)
+    names = tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
+    total = sum(len(piece.vertices) for piece in pieces)
+    document.reserve((12 * len(names) + len(pieces)) * total, "the scene's morph targets")
+    deltas = torch.zeros(len(names), total, 3)
+    row = {name: i for i, name in enumerate(names)}
+    first = 0
+    for piece in pieces:
+        deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
+        first += len(piece.vertices)
+    return _join(pieces, None if picture is None else read_texture(document, picture)), deltas, names
+
+
+def _piece(document: Document, instance: Instance, part: Part, scale: float) -> _Piece:
+    place = f"meshes[{instance.mesh}].extras.torchface"
+    joined = weld(part)
+    linear, shift = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
+    vertices = _moved(part.positions[joined.row_of], linear, shift)
+    deltas = np.stack([_moved(delta[joined.row_of], linear) for delta in part.deltas]) if len(part.deltas) else None
+    if not np.isfinite(vertices).all() or (deltas is not None and not np.isfinite(deltas).all()):
+        raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
+    extras, triangles = part.extras.get("torchface"), part.triangles
+    rows = read_order(document, extras, place, len(triangles)) if joined.authored else None
+    if rows is not None:
+        triangles = np.empty_like(triangles)
+        triangles[rows] = part.triangles
+    faces = joined.vertex_of[triangles]
+    uvs = uv_faces = None
+    if part.uvs is not None:
+        uvs, uv_faces = _texture_coordinates(part.uvs, joined.vertex_of, triangles)
+    return _Piece(
+        instance.name,
+        torch.from_numpy(vertices),
+        torch.from_numpy(np.ascontiguousarray(faces)),
+        uvs,
+        uv_faces,
+        None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
+        read_polygons(document, extras, place, faces),
+        read_annotations(document, extras, place, len(vertices)) if joined.authored else None,
+        torch.zeros(0, len(vertices), 3) if deltas is None else torch.from_numpy(deltas),
+        part.names,
+    )
+
+
+def _texture_coordinates(
+    uvs: NDArray[np.float32], vertex_of: NDArray[np.int64], triangles: NDArray[np.int64]
+) -> tuple[Tensor, Tensor]:
+    """Each pair of vertex and coordinate once: what was split at the border of two primitives is no seam."""
+    used = np.unique(triangles)
+    keys = np.column_stack([vertex_of[used], (uvs[used] + np.float32(0)).view(np.int32)])
+    _, row_of, pair_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(row_of)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    row = np.zeros(len(uvs), np.int64)
+    row[used] = rank[pair_of.reshape(-1)]
+    return torch.from_numpy(uvs[used][row_of[order]]), torch.from_numpy(row[triangles])
+
+
+def _moved(
+    points: NDArray[np.float32], linear: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
+) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (points @ linear.T + shift).astype(np.float32)
+
+
+def _join(pieces: list[_Piece], texture: Tensor | None) -> Mesh:
+    """One mesh of all; of several, polygons stay only for a single piece, and each piece becomes a region."""
+    if len(pieces) == 1:
+        one = pieces[0]
+        return Mesh(one.vertices, one.faces, one.uvs, one.uv_faces, one.colors, texture, one.polygons, one.annotations)
+    counts = [len(piece.vertices) for piece in pieces]
+    faces = torch.cat([piece.faces + first for piece, first in zip(pieces, _starts(counts), strict=True)])
+    uvs = uv_faces = colors = None
+    if any(piece.uvs is not None for piece in pieces):
+        sets = [torch.zeros(1, 2) if piece.uvs is None else piece.uvs for piece in pieces]
+        rows = [torch.zeros_like(piece.faces) if piece.uv_faces is None else piece.uv_faces for piece in pieces]
+        uvs = torch.cat(sets)
+        uv_faces = torch.cat([row + first for row, first in zip(rows, _starts(list(map(len, sets))), strict=True)])
+    if any(piece.colors is not None for piece in pieces):
+        colors = torch.cat([torch.ones_like(p.vertices) if p.colors is None else p.colors for p in pieces])
+    regions: dict[str, Tensor] = {}
+    owner = torch.repeat_interleave(torch.arange(len(pieces)), torch.tensor(counts))
+    for i, piece in enumerate(pieces):
+        regions[piece.name] = regions.get(piece.name, torch.zeros(len(owner), dtype=torch.bool)) | (owner == i)
+    vertices = torch.cat([piece.vertices for piece in pieces])
+    return Mesh(vertices, faces, uvs, uv_faces, colors, texture, annotations=Annotations(regions=regions))
+
+
+def _starts(counts: list[int]) -> list[int]:
+    return [0, *accumulate(counts[:-1])]
+
+
+def read_texture(document: Document, index: int) -> Tensor | None:
+    """The picture of a texture; none where only an extension has it."""
+    place = f"textures[{index}]"
+    texture = document.item("textures", index, place)
+    if texture.get("source") is None:
+        return None
+    image = document.item("images", texture["source"], f"{place}.source")
+    place = f"images[{texture['source']}]"
+    if image.get("uri") is not None:
+        data = document.bytes_at(image["uri"], f"{place}.uri")
+    else:
+        data, _ = document.view(image.get("bufferView"), f"{place}.bufferView")
+    return decode_image(bytes(data), f"{document.path}: {place}")

@@ -1,0 +1,1 @@
+"""Colours of eyes, lashes and other parts of a head that bring none."""

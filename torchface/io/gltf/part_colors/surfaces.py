@@ -1,0 +1,137 @@
+"""A head cut into the primitives that engines draw: skin, eyes, teeth, shells, each of one material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.io.gltf.part_colors.eyes import painted_eye, stands_alone
+from torchface.io.gltf.part_colors.lashes import painted_lashes
+from torchface.io.gltf.part_colors.painting import Paint
+from torchface.io.gltf.region_materials import EYEBALL, EYELASHES, PARTS, SKIN, PartMaterial, part_material
+from torchface.mesh import Mesh
+
+_RASTER = 512
+_OWNED = 0.5
+
+Worn = Literal["texture", "colors", "material"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The triangles of one primitive.
+
+    Args:
+        triangles: rows of the mesh's faces, ascending, (K,).
+        material: what they are made of.
+        worn: where their colour is: in the mesh's texture, in its vertex colours, or in the material.
+        part: the region of an eyeball that turns about a node of its own.
+        paint: of an eyeball or lashes whose colour is in the material.
+    """
+
+    triangles: Tensor
+    material: PartMaterial
+    worn: Worn
+    part: str | None = None
+    paint: Paint | None = None
+
+
+def surfaces(mesh: Mesh, pictured: bool) -> list[Surface]:
+    """The primitives of a mesh, skin first; one where no region names a part.
+
+    A part wears the mesh's texture where texels are its own. Texture coordinates beyond the unit square name other
+    pictures (UDIM), which a mesh does not have, and charts that lie on those of another part's have lost theirs.
+
+    Args:
+        mesh: V vertices.
+        pictured: there is a picture in its layout: a texture, or normal maps.
+    """
+    groups = _groups(mesh)
+    if len(groups) == 1 and groups[0][0] is SKIN:
+        everything = torch.arange(len(mesh.faces))
+        return [Surface(everything, SKIN, _worn(mesh, mesh.texture is not None and mesh.uvs is not None))]
+    own = _own_texels(mesh, groups) if pictured else torch.zeros(len(mesh.faces), dtype=torch.bool)
+    found: list[Surface] = []
+    for material, part, triangles in groups:
+        if material is SKIN:
+            pieces = [(triangles[own[triangles]], True), (triangles[~own[triangles]], False)]
+            found += [
+                Surface(rows, SKIN, _worn(mesh, owns and mesh.texture is not None))
+                for rows, owns in pieces
+                if len(rows)
+            ]
+        elif mesh.texture is not None and bool(own[triangles].all()):
+            found.append(Surface(triangles, material, "texture", part))
+        elif material is EYEBALL:
+            layers = painted_eye(mesh, triangles)
+            found += [Surface(rows, made, "material", part, paint) for rows, made, paint in layers]
+        else:
+            paint = painted_lashes(mesh, triangles, material) if material is EYELASHES else None
+            found.append(Surface(triangles, material, "material", part, paint))
+    return found
+
+
+def parts_without_texels(mesh: Mesh) -> Tensor:
+    """Triangles (F,) of parts other than skin that a texture in the mesh's layout does not show; see `surfaces`."""
+    groups = _groups(mesh)
+    own = _own_texels(mesh, groups)
+    bare = torch.zeros(len(mesh.faces), dtype=torch.bool)
+    for material, _, triangles in groups:
+        if material is not SKIN and not bool(own[triangles].all()):
+            bare[triangles] = True
+    return bare
+
+
+def _worn(mesh: Mesh, textured: bool) -> Worn:
+    if textured:
+        return "texture"
+    return "material" if mesh.colors is None else "colors"
+
+
+def _groups(mesh: Mesh) -> list[tuple[PartMaterial, str | None, Tensor]]:
+    """Material, eyeball's region and triangles of each part, skin first; none is empty."""
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    free = torch.ones(len(mesh.faces), dtype=torch.bool)
+    parts: list[tuple[PartMaterial, str | None, Tensor]] = []
+    for material in PARTS:  # a triangle takes the first that it may be
+        together = torch.zeros_like(free)
+        for name, mask in regions.items():
+            if part_material(name) is not material:
+                continue
+            inside = mask.cpu()[mesh.faces].all(1) & free
+            if material is EYEBALL and inside.any() and stands_alone(mesh.faces, inside):
+                parts.append((material, name, inside.nonzero()[:, 0]))
+                free &= ~inside
+            else:
+                together |= inside
+        if together.any():
+            parts.append((material, None, together.nonzero()[:, 0]))
+            free &= ~together
+    return [(SKIN, None, free.nonzero()[:, 0]), *parts] if free.any() else parts
+
+
+def _own_texels(mesh: Mesh, groups: list[tuple[PartMaterial, str | None, Tensor]]) -> Tensor:
+    """Triangles (F,) in the unit square whose part is the one that a texture baked in this layout shows there."""
+    if mesh.uvs is None or mesh.uv_faces is None:
+        return torch.zeros(len(mesh.faces), dtype=torch.bool)
+    middle = mesh.uvs[mesh.uv_faces].double().mean(1)
+    inside = ((middle >= 0) & (middle <= 1)).all(1)
+    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, _RASTER, _RASTER)
+    owner = torch.full((_RASTER * _RASTER,), -1)
+    owner[texels.texels] = texels.triangles
+    column = (middle[:, 0] * _RASTER).long().clamp(0, _RASTER - 1)
+    row = ((1 - middle[:, 1]) * _RASTER).long().clamp(0, _RASTER - 1)
+    above = owner[row * _RASTER + column]
+    group = torch.full((len(mesh.faces) + 1,), -1)  # the last answers for texels that no triangle covers
+    for number, (_, _, triangles) in enumerate(groups):
+        group[triangles] = number
+    own = torch.zeros(len(mesh.faces), dtype=torch.bool)
+    for number, (_, _, triangles) in enumerate(groups):
+        here = triangles[inside[triangles] & (above[triangles] >= 0)]
+        if len(here) and float((group[above[here]] == number).double().mean()) > _OWNED:
+            own[triangles] = inside[triangles]
+    return own

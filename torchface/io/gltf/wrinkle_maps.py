@@ -1,0 +1,151 @@
+"""Wrinkle maps in a ``.glb``: the neutral's as the material's normal texture, where every viewer shows it; the shapes'
+as further textures, which ``mesh.extras.torchface.wrinkleMaps`` lists as ``{"shape": name, "texture": index}``.
+
+With the neutral's map come the tangents of ``torchface.geometry.meshes.tangent_space``, which are MikkTSpace's; the
+file's normals are the ones that maps are baked about. Images have 8 bits a channel, as viewers show them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, TopologyError
+from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals, encode_normals
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.tangent_space import tangent_space
+from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.gltf_reading import read_texture
+from torchface.io.images.image_files import encode_png
+from torchface.mesh import Mesh
+
+_LIST = "wrinkleMaps"
+_UNPACKED_ALWAYS = 2**28
+_UNPACKED_PER_BYTE = 1024
+"""Wrinkles on a flat ground pack well, but not a thousand times."""
+
+
+def write_detail(
+    detail: DetailMaps, mesh: Mesh, names: Sequence[str], root: dict[str, Any], buffers: BufferWriter
+) -> None:
+    """Adds maps to a document under construction whose first mesh and material are the face's.
+
+    Raises:
+        TopologyError: the mesh has no texture coordinates.
+        NameMismatchError: a map belongs to no shape.
+    """
+    if mesh.uvs is None:
+        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+    missing = [name for name in detail.names if name not in names]
+    if missing:
+        raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
+    if detail.neutral is not None:
+        texture = _add_texture(detail.neutral, "neutral_normals", root, buffers)
+        root["materials"][0]["normalTexture"] = {"index": texture}
+    listed = [
+        {"shape": name, "texture": _add_texture(one, f"{name}_normals", root, buffers)}
+        for name, one in zip(detail.names, detail.maps, strict=True)
+    ]
+    root["meshes"][0]["extras"]["torchface"][_LIST] = listed
+
+
+def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
+    """glTF's tangents at each triangle's corners, (F,3,4); the last number is the bitangent's sign.
+
+    Raises:
+        TopologyError: the mesh has no texture coordinates.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+    points, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    normals = vertex_normals(points, faces)
+    space = tangent_space(points, faces, mesh.uvs.detach().cpu().double(), mesh.uv_faces.cpu(), normals)
+    rows = torch.cat([space.tangents, space.signs[:, None]], dim=1)[space.tangent_faces]
+    return rows.float().numpy()
+
+
+def _add_texture(normals: Tensor, name: str, root: dict[str, Any], buffers: BufferWriter) -> int:
+    view = buffers.view(encode_png(encode_normals(normals)))
+    images, textures = root.setdefault("images", []), root.setdefault("textures", [])
+    root.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987}])
+    images.append({"bufferView": view, "mimeType": "image/png", "name": name})
+    textures.append({"source": len(images) - 1, "sampler": 0})
+    return len(textures) - 1
+
+
+def load_detail_maps(path: str | Path) -> DetailMaps | None:
+    """The wrinkle maps of a ``.glb``; none where it has neither such maps nor a normal texture.
+
+    Raises:
+        FileFormatError: not glTF 2, a broken list, pictures of different sizes, or more of them than the file can hold.
+    """
+    document = read_document(path)
+    listed, mesh = _listed(document)
+    names = [_name(document, entry, i) for i, entry in enumerate(listed)]
+    if len(set(names)) != len(names):
+        raise document.error(f"extras.torchface.{_LIST}", names, "each shape once")
+    unpacked, allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
+    found: list[Tensor] = []
+    neutral = _normal_texture(document, mesh)
+    for index in ([] if neutral is None else [neutral]) + [entry.get("texture") for entry in listed]:
+        picture = _picture(document, index)
+        unpacked += picture.numel() * 4
+        if unpacked > allowed:
+            raise document.error(_LIST, f"maps that unpack to {unpacked} bytes", f"at most {allowed}")
+        if found and picture.shape != found[0].shape:
+            raise document.error(
+                _LIST, f"maps of {tuple(picture.shape[1:])} and {tuple(found[0].shape[1:])}", "one size"
+            )
+        found.append(decode_normals(picture))
+    if not found:
+        return None
+    shapes = found if neutral is None else found[1:]
+    maps = torch.stack(shapes) if shapes else found[0].new_zeros(0, *found[0].shape)
+    return DetailMaps(tuple(names), maps, None if neutral is None else found[0])
+
+
+def _listed(document: Document) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The list of the first mesh that has one, and that mesh; else the first mesh."""
+    meshes = document.objects("meshes")
+    for i, mesh in enumerate(meshes):
+        extras = mesh.get("extras")
+        ours = extras.get("torchface") if isinstance(extras, dict) else None
+        if isinstance(ours, dict) and ours.get(_LIST):
+            place = f"meshes[{i}].extras.torchface"
+            rows = document.array(ours, _LIST, place)
+            return [document.record(row, f"{place}.{_LIST}[{k}]") for k, row in enumerate(rows)], mesh
+    return [], meshes[0] if meshes else {}
+
+
+def _name(document: Document, entry: dict[str, Any], index: int) -> str:
+    name = entry.get("shape")
+    if not isinstance(name, str) or not name:
+        raise document.error(f"{_LIST}[{index}].shape", name, "the name of a shape")
+    return name
+
+
+def _normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
+    for i, row in enumerate(document.array(mesh, "primitives", "mesh")):
+        primitive = document.record(row, f"primitives[{i}]")
+        if primitive.get("material") is not None:
+            material = document.item("materials", primitive["material"], f"primitives[{i}].material")
+            texture = document.record(material.get("normalTexture"), "normalTexture")
+            if texture:
+                return document.integer(texture, "index", "normalTexture")
+    return None
+
+
+def _picture(document: Document, index: object) -> Tensor:
+    document.item("textures", index, f"{_LIST}.texture")
+    assert isinstance(index, int)
+    picture = read_texture(document, index)
+    if picture is None:
+        raise document.error(f"textures[{index}]", "no source", "a PNG or JPEG")
+    return picture

@@ -1,0 +1,1 @@
+"""Image files as tensors, with their 16-bit and transparent kinds."""

@@ -1,0 +1,1 @@
+"""Landmark files: points by hand, iBUG, OpenFace, dlib."""

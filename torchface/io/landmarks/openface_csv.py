@@ -1,0 +1,125 @@
+"""Landmark takes as CSV in OpenFace's layout: ``frame,timestamp,confidence,success,x_0,...,y_0,...``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.markers.marker_checks import check_names
+from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
+from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering
+from torchface.io.tables.numbered_csv import rate_of
+from torchface.take import Take, Track
+
+_FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"
+
+
+def is_landmark_header(header: Sequence[str]) -> bool:
+    """Whether a header is OpenFace's: a timestamp, and columns ``x_`` and ``y_``."""
+    return _TIME in header and any(name.startswith("x_") for name in header)
+
+
+def load_landmarks_csv(path: str | Path) -> Take:
+    """Reads 2D landmarks as OpenFace writes them.
+
+    A landmark ``n`` is the columns ``x_n`` and ``y_n``; a frame of ``success`` 0 was not seen: NaN. Every other column
+    (gaze, pose, 3D points, action units) is in ``extras["columns"]`` by name, (T,) float64. Frame numbers other than
+    1, 2, ... are kept in ``extras["frame_numbers"]``, dropped frames in ``extras["gaps"]``.
+
+    Args:
+        path: the file, of one face.
+
+    Returns:
+        landmarks (T,L,2) in pixels, float32, with the frame's confidence for each.
+
+    Raises:
+        FileFormatError: a landmark lacks one of its columns, a row has another number of cells, or a cell is no number.
+
+    Source: OpenFace wiki, "Output Format".
+    """
+    path = Path(path)
+    reader = TableReader(path)
+    names = tuple(name[2:] for name in reader.header if name.startswith("x_"))
+    columns = [f"{axis}_{name}" for name in names for axis in "xy"]
+    stray = [name for name in reader.header if name.startswith("y_") and name[2:] not in set(names)]
+    if not names or stray:
+        raise FileFormatError(
+            f"{path}: found the columns {quoted(stray or reader.header)}, expected x_ and y_ of every landmark"
+        )
+    reader.require([_FRAME, _TIME, *columns])
+    table = reader.read()
+    fps = rate_of(table.column(_FRAME), table.column(_TIME), path)
+    extras = numbering(table.column(_FRAME), first=1, where=str(path))
+    positions = table.columns(columns).reshape(-1, len(names), 2).astype(np.float32)
+    unseen = np.isnan(positions).any(2)
+    if _SUCCESS in table.names:
+        unseen |= (table.column(_SUCCESS) == 0)[:, None]
+    positions[unseen] = np.nan
+    used = {_FRAME, _TIME, _SUCCESS, _CONFIDENCE, *columns}
+    others = {name: torch.from_numpy(table.column(name).copy()) for name in table.names if name not in used}
+    confidence = None
+    if _CONFIDENCE in table.names:
+        confidence = torch.from_numpy(table.column(_CONFIDENCE).astype(np.float32))[:, None].repeat(1, len(names))
+    track = Track(names, torch.from_numpy(positions), confidence)
+    return Take(fps, landmarks=track, extras={**extras, **({"columns": others} if others else {})})
+
+
+def save_landmarks_csv(take: Take, path: str | Path) -> None:
+    """Writes 2D landmarks as OpenFace would have; a landmark that is NaN becomes empty cells.
+
+    A frame's confidence is the mean over its landmarks, its success whether any was seen. The numbers in
+    ``extras["columns"]`` follow.
+
+    Args:
+        take: landmarks (T,L,2), pixels.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        ValueRangeError: the take has no landmarks, infinite positions, or an absurd rate.
+        NameMismatchError: a name is empty, or begins or ends in a blank.
+        ShapeError: a kept column has another length than the take.
+
+    Source: OpenFace wiki, "Output Format".
+    """
+    path = Path(path)
+    if take.landmarks is None or take.landmarks.values.shape[:2].numel() == 0:
+        raise ValueRangeError(f"{path}: found a take without landmarks, expected some to write")
+    names, values = take.landmarks.names, take.landmarks.values.detach().cpu().to(torch.float32).numpy().copy()
+    check_names(names, path, "landmark name")
+    if values.shape[2] != 2 or np.isinf(values).any():
+        raise ShapeError(
+            f"{path}: found landmarks {values.shape}, some perhaps infinite; expected finite (T,L,2) or NaN"
+        )
+    fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
+    unseen = np.isnan(values).any(2)
+    values[unseen] = np.nan
+    columns = {
+        name: column for name, column in take.extras.get("columns", {}).items() if isinstance(column, torch.Tensor)
+    }
+    wrong = [name for name, column in columns.items() if column.shape != (len(take),)]
+    if wrong:
+        raise ShapeError(
+            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
+        )
+    header = [_FRAME, _TIME, _CONFIDENCE, _SUCCESS, *(f"{axis}_{name}" for axis in "xy" for name in names), *columns]
+    if len(set(header)) < len(header):
+        raise NameMismatchError(f"{path}: found a kept column named like another one, expected every name once")
+    confidence = take.landmarks.confidence
+    level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().double().mean(1).float()
+    numbers = frame_numbers(take, first=1)
+    coordinates = [number_texts(values[:, :, axis].reshape(-1)) for axis in (0, 1)]
+    others = [number_texts(column.detach().cpu().to(torch.float64).numpy()) for column in columns.values()]
+    levels, width = number_texts(level.numpy()), len(names)
+    rows = (
+        [
+            *(str(number), repr((number - numbers[0]) / fps), levels[row], str(int(not unseen[row].all()))),
+            *(cell for cells in coordinates for cell in cells[row * width : (row + 1) * width]),
+            *(cells[row] for cells in others),
+        ]
+        for row, number in enumerate(numbers)
+    )
+    write_table(path, header, rows)

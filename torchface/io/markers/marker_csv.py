@@ -1,0 +1,70 @@
+"""Marker takes as plain CSV: ``frame,time,<label>_x,<label>_y,<label>_z,...``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchface.errors import FileFormatError
+from torchface.io.markers.marker_checks import marker_take, markers_to_write, millimetres
+from torchface.io.tables.csv_table import TableReader, quoted
+from torchface.io.tables.numbered_csv import is_numbered, read_numbered, write_numbered
+from torchface.take import Take
+
+_AXES = ("_x", "_y", "_z")
+
+
+def is_marker_header(header: Sequence[str]) -> bool:
+    """Whether a header looks like markers: most of its channels end in ``_x``, ``_y`` or ``_z``."""
+    channels = header[2:]
+    return is_numbered(header) and 2 * sum(name.endswith(_AXES) for name in channels) > len(channels)
+
+
+def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
+    """Reads markers from CSV with the header ``frame,time,<label>_x,<label>_y,<label>_z,...``.
+
+    One row a frame; times in seconds; an empty cell is a marker not seen. The rate is that of numbers and times;
+    numbers other than 0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``.
+
+    Args:
+        path: the file, y up.
+        unit: ``"mm"`` (if absent), ``"cm"``, ``"m"`` or ``"in"``.
+
+    Returns:
+        markers in millimetres, float32.
+
+    Raises:
+        FileFormatError: a marker lacks one of its columns, a row has another number of cells, or a cell is no number.
+        ValueRangeError: ``unit`` is unknown.
+    """
+    path = Path(path)
+    factor = millimetres("mm", path, "unit", unit)
+    reader = TableReader(path)
+    ends = {name[-2:] for name in reader.header[2:]} - set(_AXES)
+    if not is_numbered(reader.header) or ends:
+        raise FileFormatError(
+            f"{path}: found the columns {quoted(reader.header)}, expected frame,time,<label>_x,<label>_y,<label>_z,..."
+        )
+    labels = tuple(dict.fromkeys(name[:-2] for name in reader.header[2:]))
+    columns = [label + axis for label in labels for axis in _AXES]
+    reader.require(columns)
+    table, fps, extras = read_numbered(reader)
+    return marker_take(path, fps, labels, table.columns(columns).reshape(-1, len(labels), 3) * factor, extras)
+
+
+def save_markers_csv(take: Take, path: str | Path) -> None:
+    """Writes the markers of a take as CSV in millimetres; what is NaN becomes empty cells.
+
+    Args:
+        take: markers (T,M,3), millimetres. What else it holds is left out.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        ValueRangeError: the take has no markers, infinite positions, or an absurd rate.
+        NameMismatchError: a label is empty, or begins or ends in a blank.
+    """
+    path = Path(path)
+    labels, positions = markers_to_write(take, path)
+    write_numbered(
+        take, path, [label + axis for label in labels for axis in _AXES], positions.reshape(len(positions), -1)
+    )

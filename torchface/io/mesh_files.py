@@ -1,0 +1,55 @@
+"""Meshes by path: OBJ, PLY, STL, glTF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchface.errors import FileFormatError
+from torchface.io.gltf import read_gltf_mesh, save_gltf_mesh
+from torchface.io.meshes.obj import read_obj, write_obj
+from torchface.io.meshes.ply import read_ply, write_ply
+from torchface.io.meshes.stl import read_stl, write_stl
+from torchface.mesh import Mesh
+
+_READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl}
+_WRITERS = {".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".glb": save_gltf_mesh}
+_GLTF = (".glb", ".gltf")
+
+
+def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """A mesh in millimetres.
+
+    Args:
+        path: ``.obj`` (polygons, seams, vertex colours, the material's picture), ``.ply`` (polygons, vertex colours),
+            ``.stl`` (triangles, equal corners welded), ``.glb`` or ``.gltf`` (the whole scene, morph targets at rest).
+            Vertices keep the file's order.
+        unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, millimetres for the others.
+
+    Raises:
+        FileFormatError: the file is missing, broken, or of another kind.
+        TopologyError: a face names a vertex that is not there.
+        ValueRangeError: another unit.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in _GLTF:
+        return read_gltf_mesh(path, unit or "m")
+    if suffix not in _READERS:
+        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {', '.join([*_READERS, *_GLTF])}")
+    return _READERS[suffix](path, unit or "mm")
+
+
+def save_mesh(mesh: Mesh, path: str | Path) -> None:
+    """Writes a mesh: ``.obj``, ``.ply`` and ``.stl`` in millimetres, ``.glb`` in metres.
+
+    OBJ keeps polygons, seams and colours and puts the texture beside itself; ``.glb`` keeps all and the annotations;
+    PLY keeps polygons and colours, STL triangles. The file appears only when it is complete.
+
+    Raises:
+        FileFormatError: another suffix, or the folder cannot be written to.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in _WRITERS:
+        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {', '.join(_WRITERS)}")
+    _WRITERS[suffix](mesh, path)

@@ -1,0 +1,179 @@
+"""Many meshes of one topology in one file, read a few at a time: a safetensors file whose numbers stay on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from torchface.errors import FileFormatError, ShapeError, TopologyError
+from torchface.files.whole_files import read_file, write_file
+
+FORMAT = "torchface.mesh-sequence/1"
+_LARGEST_COUNT = 2**31
+
+
+class MeshSequence:
+    """Vertices (M,V,C) float32 on disk, mapped into memory as they are read; ``faces`` and the writer's ``key``.
+
+    Args:
+        path: what a :class:`MeshSequenceWriter` wrote; any safetensors file with ``vertices`` and ``faces`` will do.
+
+    Raises:
+        FileFormatError: the file is missing, cut off, or holds something else.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileFormatError(f"{self.path}: found no such file, expected a mesh sequence")
+        try:
+            with safe_open(self.path, framework="pt") as file:
+                names = set(file.keys())
+                self.key: str = (file.metadata() or {}).get("key", "")
+                if not {"vertices", "faces"} <= names:
+                    raise FileFormatError(f"{self.path}: found {sorted(names)[:5]}, expected vertices and faces")
+                vertices, faces = file.get_slice("vertices"), file.get_slice("faces")
+                self.shape = tuple(vertices.get_shape())
+                kinds, face_shape = (vertices.get_dtype(), faces.get_dtype()), faces.get_shape()
+                right = kinds == ("F32", "I64") and len(self.shape) == 3 and len(face_shape) == 2 and face_shape[1] == 3
+                if not right or 0 in self.shape:
+                    raise FileFormatError(
+                        f"{self.path}: found vertices {kinds[0]} {self.shape} and faces {kinds[1]} "
+                        f"{tuple(face_shape)}, expected F32 (M,V,C) and I64 (F,3)"
+                    )
+                self.faces: Tensor = file.get_tensor("faces")
+        except (SafetensorError, OSError, ValueError) as error:
+            raise FileFormatError(f"{self.path}: no mesh sequence ({error})") from error
+        if self.faces.numel() and not 0 <= int(self.faces.min()) <= int(self.faces.max()) < self.shape[1]:
+            raise FileFormatError(f"{self.path}: found faces of vertices beyond the {self.shape[1]} there are")
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, begin: int, end: int) -> Tensor:
+        """Meshes ``begin`` to ``end``, without the last, (N,V,C).
+
+        Raises:
+            FileFormatError: the file is gone or has changed.
+        """
+        try:
+            # Opened anew each time: pages of a mapping that is closed leave the memory.
+            with safe_open(self.path, framework="pt") as file:
+                part: Tensor = file.get_slice("vertices")[begin:end].clone()
+        except (SafetensorError, OSError, ValueError) as error:
+            raise FileFormatError(f"{self.path}: cannot be read ({error})") from error
+        if part.shape[1:] != self.shape[1:]:
+            raise FileFormatError(f"{self.path}: found meshes of {tuple(part.shape[1:])}, expected {self.shape[1:]}")
+        return part
+
+
+class MeshSequenceWriter:
+    """Writes a mesh sequence mesh by mesh; the file appears when it is complete, and a killed run continues.
+
+    What is unfinished lies beside as ``NAME.part`` with the count of its meshes in ``NAME.part.json``. A writer
+    with the same sizes and ``key`` goes on behind them: ``done`` says where.
+
+    Args:
+        path: of the file; its folder must be there.
+        count: how many meshes there will be.
+        vertices: of each.
+        faces: triangles (F,3) int64 that all share.
+        channels: numbers a vertex.
+        key: says what the meshes are made of; another key begins anew.
+
+    Raises:
+        FileFormatError: the file cannot be written.
+    """
+
+    def __init__(
+        self, path: str | Path, count: int, vertices: int, faces: Tensor, channels: int = 3, key: str = ""
+    ) -> None:
+        if not (0 < count < _LARGEST_COUNT and vertices > 0 and channels > 0):
+            raise ShapeError(f"mesh sequence: found {count} meshes of ({vertices},{channels}), expected at least one")
+        self.path, self.count, self.mesh_shape = Path(path), count, (vertices, channels)
+        self._part = self.path.with_name(f"{self.path.name}.part")
+        self._note = self.path.with_name(f"{self.path.name}.part.json")
+        numbers = faces.detach().cpu().contiguous().numpy().astype("<i8").tobytes()
+        size = 4 * count * vertices * channels
+        header = json.dumps(
+            {
+                "__metadata__": {"format": FORMAT, "key": key},
+                "faces": {"dtype": "I64", "shape": list(faces.shape), "data_offsets": [0, len(numbers)]},
+                "vertices": {
+                    "dtype": "F32",
+                    "shape": [count, vertices, channels],
+                    "data_offsets": [len(numbers), len(numbers) + size],
+                },
+            }
+        ).encode()
+        header += b" " * (-len(header) % 8)
+        self._begin = len(header).to_bytes(8, "little") + header + numbers
+        self.done = self._finished()
+        try:
+            if self.done == 0:
+                self._part.write_bytes(self._begin)
+            self._file = self._part.open("r+b")
+            self._file.seek(self._offset(self.done))
+        except OSError as error:
+            raise FileFormatError(f"{self.path}: cannot be written ({error.strerror})") from error
+
+    def append(self, vertices: Tensor) -> None:
+        """Adds one mesh (V,C) or several (N,V,C).
+
+        Raises:
+            TopologyError: they have other vertices than the rest.
+            ShapeError: there are more than were announced.
+            FileFormatError: the disk is full.
+        """
+        several = vertices if vertices.ndim == 3 else vertices[None]
+        if several.shape[1:] != self.mesh_shape:
+            raise TopologyError(f"mesh sequence: found {tuple(several.shape[1:])}, expected {self.mesh_shape}")
+        if self.done + len(several) > self.count:
+            raise ShapeError(f"mesh sequence: found more than the {self.count} meshes announced")
+        try:
+            self._file.write(several.detach().cpu().contiguous().numpy().astype("<f4", copy=False).tobytes())
+            self._file.flush()
+        except OSError as error:
+            raise FileFormatError(f"{self.path}: cannot be written ({error.strerror})") from error
+        self.done += len(several)
+        write_file(self._note, json.dumps({"done": self.done}).encode())
+
+    def close(self) -> None:
+        """Puts a complete file in its place; what is incomplete stays beside for another run."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        if self.done == self.count:
+            os.replace(self._part, self.path)
+            self._note.unlink(missing_ok=True)
+
+    def __enter__(self) -> MeshSequenceWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _offset(self, meshes: int) -> int:
+        return len(self._begin) + 4 * meshes * int(np.prod(self.mesh_shape))
+
+    def _finished(self) -> int:
+        """How many meshes an earlier run of the same kind has written."""
+        if not (self._part.is_file() and self._note.is_file()):
+            return 0
+        try:
+            done = json.loads(read_file(self._note, 2**16))["done"]
+            with self._part.open("rb") as file:
+                same = file.read(len(self._begin)) == self._begin
+            inside = isinstance(done, int) and 0 <= done <= self.count
+            whole = inside and self._part.stat().st_size >= self._offset(done)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, FileFormatError):
+            return 0  # a damaged note is as good as none
+        return done if same and whole else 0

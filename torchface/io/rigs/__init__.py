@@ -1,0 +1,1 @@
+"""Rigs as files: glTF, folders of OBJ files, ICT-FaceKit."""

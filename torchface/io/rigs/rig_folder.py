@@ -1,0 +1,138 @@
+"""A rig as a folder of OBJ files: the neutral, a file a shape, and what OBJ has no place for in ``rig.json``."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError
+from torchface.files.whole_files import read_file, write_file
+from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io.gltf.container import Document
+from torchface.io.gltf.mesh_extras import read_annotations, write_extras
+from torchface.io.images.normal_map_files import save_normal_map
+from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices, write_obj, write_obj_shapes
+from torchface.rig import BlendshapeRig
+
+NEUTRAL, NOTES = "neutral", "rig.json"
+_LARGEST_NOTES = 2**26
+
+
+def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = None) -> BlendshapeRig:
+    """A rig of OBJ files with the same faces.
+
+    Shapes come in the order of ``rig.json``, which ``save_obj_folder`` writes; others follow, sorted by name.
+
+    Args:
+        folder: one neutral, and a file for each shape.
+        unit: of all the files.
+        neutral: the neutral's file name without ``.obj``; if absent the one file with "neutral" in its name.
+
+    Raises:
+        FileFormatError: no neutral or several, no shape, or a broken file.
+        TopologyError: a shape has other vertices or faces than the neutral.
+    """
+    folder = Path(folder)
+    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".obj"}
+    notes = _read_notes(folder)
+    if neutral is None and notes is not None and NEUTRAL in files:
+        neutral = NEUTRAL
+    candidates = [name for name in files if "neutral" in name.lower()] if neutral is None else [neutral]
+    if len(candidates) != 1 or candidates[0] not in files:
+        raise FileFormatError(
+            f"{folder}: found {len(files)} OBJ files, of them neutral: {', '.join(candidates) or 'none'}; expected one "
+            "neutral (name it by neutral=) and a file for each shape"
+        )
+    rest = files.pop(candidates[0])
+    if not files:
+        raise FileFormatError(f"{folder}: found only the neutral {rest.name}, expected a file for each shape")
+    mesh, topology = read_obj(rest, unit), face_bytes(read_file(rest))
+    names = list(files)
+    if notes is not None:
+        listed = [name for name in notes.array(notes.root, "shapes", "document") if isinstance(name, str)]
+        names = list(dict.fromkeys([*(name for name in listed if name in files), *files]))
+        mesh = replace(mesh, annotations=read_annotations(notes, notes.root.get("mesh"), "mesh", len(mesh.vertices)))
+    deltas = [read_obj_vertices(files[name], mesh, topology, unit) - mesh.vertices for name in names]
+    return BlendshapeRig(mesh, torch.stack(deltas), tuple(names))
+
+
+def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps | None = None) -> None:
+    """Writes ``neutral.obj`` and an OBJ a shape, in millimetres, vertices and polygons in the rig's own order.
+
+    Landmarks, regions, the mirror map and the order of the shapes are in ``rig.json``; the texture lies beside the
+    neutral, wrinkle maps are called ``<shape>_normals.png``. ``load_obj_folder`` gives the same rig.
+
+    Args:
+        rig: the rig.
+        folder: made where it is missing; what it holds of the same rig is replaced when all is written.
+        detail: wrinkle maps of its shapes.
+
+    Raises:
+        NameMismatchError: a shape's name is no file's name, or a wrinkle map belongs to no shape.
+        FileFormatError: the folder holds another rig's OBJ files, or cannot be written to.
+    """
+    folder = Path(folder)
+    _check_names(rig, folder)
+    missing = [] if detail is None else [name for name in detail.names if name not in rig.names]
+    if missing:
+        raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
+    place = folder.resolve()  # "." has no name of its own
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        _write(rig, part, detail)
+        folder.mkdir(exist_ok=True)
+        for path in sorted(part.iterdir()):  # a file a turn
+            os.replace(path, folder / path.name)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be written ({error.strerror})") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
+    mesh = rig.neutral.to("cpu")
+    write_obj(mesh, folder / f"{NEUTRAL}.obj")
+    moved = ((name, mesh.vertices + delta.cpu()) for name, delta in zip(rig.names, rig.deltas, strict=True))
+    write_obj_shapes(mesh, moved, folder / f"{NEUTRAL}.obj")
+    notes = write_extras(mesh)
+    notes.pop("polygons", None)  # the OBJ files have them
+    write_file(folder / NOTES, json.dumps({"shapes": list(rig.names), "mesh": notes}).encode())
+    if detail is not None:
+        maps: list[tuple[str, Any]] = list(zip(detail.names, detail.maps, strict=True))
+        maps += [] if detail.neutral is None else [(NEUTRAL, detail.neutral)]
+        for name, normals in maps:
+            save_normal_map(normals, folder / f"{name}_normals.png")
+
+
+def _check_names(rig: BlendshapeRig, folder: Path) -> None:
+    """Refuses shapes whose names make no files, and a folder in which other shapes would mix with these."""
+    for name in rig.names:
+        if not name or Path(name).name != name or name.startswith(".") or "\0" in name or name.lower() == NEUTRAL:
+            raise NameMismatchError(f"{folder}: found a shape {name!r}, expected file names; write a .glb instead")
+    there = [path.name for path in folder.glob("*.obj")] if folder.is_dir() else []
+    strange = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *rig.names)]
+    if strange:
+        raise FileFormatError(
+            f"{folder}: found OBJ files of another rig ({', '.join(strange[:3])}), expected an empty or a new folder"
+        )
+
+
+def _read_notes(folder: Path) -> Document | None:
+    path = folder / NOTES
+    if not path.is_file():
+        return None
+    try:
+        root = json.loads(read_file(path, _LARGEST_NOTES))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: found broken JSON ({str(error)[:100]}), expected a rig's notes") from error
+    if not isinstance(root, dict):
+        raise FileFormatError(f"{path}: found JSON that is no object, expected a rig's notes")
+    return Document(path, root)

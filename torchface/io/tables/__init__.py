@@ -1,0 +1,1 @@
+"""Tables of numbers along frames as text: CSV, frame rates, timecodes."""

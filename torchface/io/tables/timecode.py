@@ -1,0 +1,106 @@
+"""Timecodes ``HH:MM:SS:FF.sss`` as Live Link Face writes them: the rate they run at, and the frames they skip."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchface.errors import FileFormatError
+from torchface.io.tables.csv_table import quoted
+from torchface.io.tables.frame_rates import USUAL, check_rate, jumps
+
+_PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
+_DAY = 24 * 3600
+_BASES = (24, 25, 30, 48, 50, 60, 72, 90, 96, 100, 120, 240)
+_TOLERANCE = 0.002  # 60 and 60000/1001 differ by 0.001
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What the timecodes of a take say.
+
+    Args:
+        fps: frames a second, a usual rate where the clock runs within 0.2 % of one.
+        measured: what the clock itself says.
+        gaps: dropped frames as (row, how many are missing before it); negative where the clock falls back.
+    """
+
+    fps: float
+    measured: float
+    gaps: tuple[tuple[int, int], ...]
+
+
+def read_timecodes(texts: Sequence[str], path: Path, first_row: int = 2) -> Timing:
+    """The timing of a take from its timecodes.
+
+    ``FF`` counts frames of the timecode's base (60 for a 59.94 fps take), which is where it falls back to 0 as the
+    seconds rise; a take without such a place has base 60 if it fits. ``;`` before ``FF`` marks drop-frame timecode.
+    The rate is the base over the mean step of the timecodes, gaps left out. Midnight is crossed.
+
+    Raises:
+        FileFormatError: a timecode is none, or they never rise.
+    """
+    seconds = np.empty(len(texts), np.int64)
+    frames = np.empty(len(texts))
+    drop = False
+    for row, text in enumerate(texts):
+        match = _PATTERN.fullmatch(text)
+        if match is None or int(match[1]) > 23 or int(match[2]) > 59 or int(match[3]) > 59:
+            raise FileFormatError(
+                f"{path}: frame {row + 1}: found the timecode {quoted([text])}, expected HH:MM:SS:FF.sss"
+            )
+        seconds[row] = 3600 * int(match[1]) + 60 * int(match[2]) + int(match[3])
+        frames[row] = float(match[5])
+        drop |= match[4] == ";"
+    base = _base(seconds, frames, drop)
+    clock = seconds * base + frames
+    rate_of_base, day = float(base), _DAY * base
+    if drop and base % 30 == 0:  # every minute but each tenth lacks its first numbers, and 1000/1001 makes up for it
+        minutes = seconds // 60
+        clock -= base // 15 * (minutes - minutes // 10)
+        rate_of_base, day = base * 1000 / 1001, day - base // 15 * 1296
+    if len(texts) == 1:
+        fps = check_rate(rate_of_base, str(path))
+        return Timing(fps, fps, ())
+    steps = np.diff(clock)
+    steps = np.where(steps < -day / 2, steps + day, steps)
+    if not np.any(steps > 0):
+        raise FileFormatError(
+            f"{path}: found {len(texts)} timecodes from {texts[0]} on that never rise, expected a clock"
+        )
+    typical = float(np.median(steps[steps > 0]))
+    step = float(steps[np.abs(steps - typical) < typical / 2].mean())
+    measured = rate_of_base / step
+    usual = min(USUAL, key=lambda rate: abs(rate - measured))
+    fps = usual if abs(measured / usual - 1) <= _TOLERANCE else measured
+    return Timing(check_rate(fps, f"{path}: timecodes"), measured, jumps(steps / step))
+
+
+def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
+    rise, within = np.diff(seconds) % _DAY, np.diff(frames)
+    steps = within[(rise == 0) & (within > 0)]
+    falls = (rise == 1) & (within < 0) & ~(drop & (seconds[1:] % 60 == 0))  # where numbers are dropped FF falls less
+    wraps = (frames[:-1] - frames[1:])[falls]
+    if len(steps) and len(wraps):
+        # Where frames were dropped FF falls by less: only the largest falls tell the base.
+        typical = float(np.median(steps))
+        base = round(float(np.median(wraps[wraps > wraps.max() - typical])) + typical)
+        if base > frames.max():
+            return base
+    first = 30 if drop else 60
+    return next((base for base in (first, *_BASES) if base > frames.max()), 1000)
+
+
+def write_timecodes(count: int, fps: float, first: int = 0) -> tuple[str, ...]:
+    """Timecodes of ``count`` frames from number ``first`` on, 0 at midnight, in thousandths of the base's frames."""
+    base = max(1, round(fps))
+    ticks = np.rint(np.arange(first, first + count) * (1000 * base / fps)).astype(np.int64)
+    seconds, parts = ticks // (1000 * base) % _DAY, ticks % (1000 * base)
+    return tuple(
+        f"{second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}:{part // 1000:02d}.{part % 1000:03d}"
+        for second, part in zip(seconds.tolist(), parts.tolist(), strict=True)
+    )

@@ -1,0 +1,100 @@
+"""Takes in and out, by the file's suffix and header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.landmarks.openface_csv import is_landmark_header, load_landmarks_csv, save_landmarks_csv
+from torchface.io.markers.c3d import load_c3d, save_c3d
+from torchface.io.markers.marker_csv import is_marker_header, load_markers_csv, save_markers_csv
+from torchface.io.markers.trc import load_trc, save_trc
+from torchface.io.tables.csv_table import TableReader, quoted
+from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
+from torchface.io.weights.weight_csv import load_weights_csv, save_weights_csv
+from torchface.take import Take
+
+_SUFFIXES = "'.c3d', '.trc' or '.csv'"
+
+
+def load_take(path: str | Path, unit: str | None = None) -> Take:
+    """Reads a performance; a ``.csv`` is told by its header.
+
+    ==================================== =====================================================
+    ``.c3d``                             markers, :func:`torchface.io.markers.c3d.load_c3d`
+    ``.trc``                             markers, :func:`torchface.io.markers.trc.load_trc`
+    ``Timecode,BlendshapeCount,...``     weights, :func:`torchface.io.weights.live_link_csv.load_live_link`
+    ``frame,time,<label>_x,...``         markers, :func:`torchface.io.markers.marker_csv.load_markers_csv`
+    ``frame,time,<shape>,...``           weights, :func:`torchface.io.weights.weight_csv.load_weights_csv`
+    ``frame,timestamp,...,x_0,...``      landmarks, :func:`torchface.io.landmarks.openface_csv.load_landmarks_csv`
+    ==================================== =====================================================
+
+    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it.
+
+    Args:
+        path: the file.
+        unit: of its markers, ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what the file says (CSV: millimetres).
+
+    Raises:
+        FileFormatError: the file is none of these, or is damaged.
+        ValueRangeError: ``unit`` is unknown.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".c3d":
+        return load_c3d(path, unit)
+    if suffix == ".trc":
+        return load_trc(path, unit)
+    if suffix != ".csv":
+        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
+    header = TableReader(path).header
+    if is_live_link(header):
+        return load_live_link(path)
+    if is_marker_header(header):
+        return load_markers_csv(path, unit)
+    if is_numbered(header):
+        return load_weights_csv(path)
+    if is_landmark_header(header):
+        return load_landmarks_csv(path)
+    raise FileFormatError(
+        f"{path}: found the columns {quoted(header)}; expected Timecode,BlendshapeCount,... or frame,time,... "
+        "or OpenFace's frame,timestamp,...,x_0,..."
+    )
+
+
+def save_take(take: Take, path: str | Path) -> None:
+    """Writes a performance in the format that ``path`` ends in.
+
+    ``.c3d`` and ``.trc`` hold the markers, a ``.csv`` the weights of a take that has some, else its markers or its
+    landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case,
+    become a Live Link Face file; others a plain table that keeps their names
+    (:func:`torchface.io.weights.live_link_csv.save_live_link` maps them to ARKit's instead).
+
+    Args:
+        take: markers in millimetres, landmarks in pixels, or weights.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        FileFormatError: the suffix is none of ``.c3d``, ``.trc``, ``.csv``.
+        ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
+            numbers.
+        NameMismatchError: a name would not come back as it is.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".c3d":
+        return save_c3d(take, path)
+    if suffix == ".trc":
+        return save_trc(take, path)
+    if suffix != ".csv":
+        raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
+    if take.weights is not None:
+        return save_live_link(take, path) if are_live_link_shapes(take.weights.names) else save_weights_csv(take, path)
+    held = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]
+    if len(held) != 1:
+        raise ValueRangeError(
+            f"{path}: found a take of {' and '.join(held) or 'no track'}, expected one of them for a .csv; "
+            "save_markers_csv and save_landmarks_csv each write theirs"
+        )
+    return save_markers_csv(take, path) if take.markers is not None else save_landmarks_csv(take, path)

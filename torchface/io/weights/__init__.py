@@ -1,0 +1,1 @@
+"""Blendshape weights as files and as packets: plain CSV, Live Link Face."""

@@ -1,0 +1,190 @@
+"""Live Link Face's CSV: timecode, ARKit's 52 weights, head and eye rotations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.tables.csv_table import TableReader, parse_number, quoted, write_table
+from torchface.io.tables.frame_rates import check_rate, frame_numbers
+from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.tables.timecode import read_timecodes, write_timecodes
+from torchface.io.weights.weight_csv import ROTATIONS, weights_to_write
+from torchface.shape_names import ARKIT, mapping
+from torchface.take import Take, Track
+
+_TIMECODE, _COUNT = "timecode", "blendshapecount"
+_SHAPES = {name.lower() for name in ARKIT}
+
+
+def is_live_link(header: Sequence[str]) -> bool:
+    """Whether a header is Live Link Face's."""
+    return not is_numbered(header) and bool({_TIMECODE, _COUNT} & {name.lower() for name in header})
+
+
+def are_live_link_shapes(names: Sequence[str]) -> bool:
+    """Whether names are ARKit's 52, all of them and no other, in whatever order and case."""
+    return len(names) == len(ARKIT) and {name.lower() for name in names} == _SHAPES
+
+
+def not_in_live_link(names: Sequence[str]) -> tuple[str, ...]:
+    """The names of shapes that Live Link Face's file would not give back: halves that it merges, and those it lacks.
+
+    Example:
+        >>> not_in_live_link(["jawOpen", "eyeBlink_L", "browInnerUp_L", "cheekRaiser_L"])
+        ('browInnerUp_L', 'cheekRaiser_L')
+    """
+    matrix = mapping(names, ARKIT)
+    return tuple(name for name, kept in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not kept)
+
+
+def load_live_link(path: str | Path) -> Take:
+    """Reads a take recorded with Live Link Face.
+
+    Names stay as the file spells and orders them (``EyeBlinkLeft``). The rate is deduced from the timecodes
+    (:func:`torchface.io.tables.timecode.read_timecodes`). A row of no face (count 0) is NaN. ``extras`` holds
+
+    - ``columns``: every other column by name: rotations in radians and numbers (T,) float64, text as a tuple;
+    - ``blendshape_count``: the column of that name, one whole number a frame;
+    - ``measured_fps``: what the clock says before it is rounded to a usual rate;
+    - ``gaps``: dropped frames as (row, how many are missing before it), if any. They are not filled.
+
+    Args:
+        path: the CSV file that the app wrote.
+
+    Returns:
+        weights (T,52,1), float32, which holds the app's ten decimals without loss; ``timecode``; ``extras``.
+
+    Raises:
+        FileFormatError: a column is missing, a row has another number of cells, a cell is no number, a timecode is
+            none.
+
+    Source: Epic Games, "Recording Face Animation on iOS Device", CSV of Live Link Face.
+    """
+    path = Path(path)
+    reader = TableReader(path)
+    spelled = {name.lower(): name for name in reader.header}
+    absent = [name for name in ("Timecode", "BlendshapeCount", *ARKIT) if name.lower() not in spelled]
+    if absent:
+        raise FileFormatError(
+            f"{path}: found no column {quoted(absent)}, expected Timecode, BlendshapeCount and ARKit's 52 shapes"
+        )
+    if len(spelled) < len(reader.header) or "" in spelled:
+        raise FileFormatError(
+            f"{path}: found columns without a name, or whose names differ in case only; expected one each"
+        )
+    rotations = {name.lower() for name in ROTATIONS}
+    texts = [name for key, name in spelled.items() if key not in _SHAPES and key not in rotations]
+    count_column = reader.header.index(spelled[_COUNT])
+    table = reader.read(texts, lambda cells: len(cells) > count_column and cells[count_column].strip() == "0")
+    timing = read_timecodes(table.texts[spelled[_TIMECODE]], path)
+    names = tuple(name for name in table.names if name.lower() in _SHAPES)
+    columns: dict[str, Any] = {}
+    for name in reader.header:
+        if name in table.texts and name.lower() not in (_TIMECODE, _COUNT):
+            columns[name] = _numbers_or_texts(table.texts[name])
+        elif name.lower() in rotations:
+            columns[name] = torch.from_numpy(table.column(name).copy())
+    extras = {
+        "columns": columns,
+        "blendshape_count": _counts(table.texts[spelled[_COUNT]], path),
+        "measured_fps": timing.measured,
+        **({"gaps": timing.gaps} if timing.gaps else {}),
+    }
+    weights = torch.from_numpy(table.columns(names).astype(np.float32))[..., None]
+    return Take(timing.fps, weights=Track(names, weights), timecode=table.texts[spelled[_TIMECODE]], extras=extras)
+
+
+def _numbers_or_texts(cells: tuple[str, ...]) -> torch.Tensor | tuple[str, ...]:
+    numbers = [parse_number(cell) for cell in cells]
+    if None in numbers or not any(cells):
+        return cells
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _counts(cells: tuple[str, ...], path: Path) -> tuple[int, ...]:
+    for row, cell in enumerate(cells):
+        if not (cell.isascii() and cell.isdigit() and len(cell) <= 6):
+            raise FileFormatError(
+                f"{path}: frame {row + 1}, column 'BlendshapeCount': found {quoted([cell])}, expected a whole number"
+            )
+    return tuple(map(int, cells))
+
+
+def save_live_link(take: Take, path: str | Path) -> None:
+    """Writes the weights of a take as Live Link Face would have.
+
+    A take that ``load_live_link`` read gives the same file again, byte by byte where it came from the app. Weights by
+    other names go to ARKit's by :func:`torchface.shape_names.mapping`: halves of a split shape give their mean, a
+    shape that the take lacks is 0, one that ARKit lacks is left out. Without timecodes of its own a take starts at
+    00:00:00:00.000, or later by the number of its first frame; those it has are written as they are. Without rotations
+    they are 0. ARKit's own spelling (``eyeBlinkLeft``) becomes the app's (``EyeBlinkLeft``).
+
+    Args:
+        take: weights (T,N,1); NaN becomes an empty cell.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        ValueRangeError: the take has no weights, infinite ones, an absurd rate, or text that is no timecode.
+        NameMismatchError: not one name is one of ARKit's.
+        ShapeError: a kept column has another length than the take.
+
+    Source: Epic Games, "Recording Face Animation on iOS Device", CSV of Live Link Face.
+    """
+    path = Path(path)
+    names, values = _as_arkit(*weights_to_write(take, path), path)
+    check_rate(take.fps, f"{path}: the take", ValueRangeError)
+    timecodes = take.timecode or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
+    try:
+        read_timecodes(timecodes, path)
+    except FileFormatError as error:
+        raise ValueRangeError(str(error)) from error
+    columns = take.extras.get("columns")
+    if columns is None:
+        columns = {name: torch.zeros(len(take), dtype=torch.float64) for name in ROTATIONS}
+    counts = take.extras.get("blendshape_count")
+    if counts is None:
+        counts = [len(names) + sum(isinstance(column, torch.Tensor) for column in columns.values())] * len(take)
+    wrong = [name for name, column in {**columns, "BlendshapeCount": counts}.items() if len(column) != len(take)]
+    if wrong:
+        raise ShapeError(
+            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
+        )
+    cells = _ten_decimals(values.reshape(-1))
+    width = len(names)
+    others = [
+        _ten_decimals(column.detach().cpu().to(torch.float64).numpy()) if isinstance(column, torch.Tensor) else column
+        for column in columns.values()
+    ]
+    rows = (
+        [timecode, str(count), *cells[row * width : (row + 1) * width], *(str(column[row]) for column in others)]
+        for row, (timecode, count) in enumerate(zip(timecodes, counts, strict=True))
+    )
+    header = [name[0].upper() + name[1:] if name in ARKIT else name for name in names]
+    write_table(path, ["Timecode", "BlendshapeCount", *header, *columns], rows)
+
+
+def _as_arkit(names: tuple[str, ...], values: np.ndarray, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    if are_live_link_shapes(names):
+        return names, values
+    matrix = mapping(names, ARKIT).numpy()
+    if not matrix.any():
+        raise NameMismatchError(f"{path}: found the shapes {quoted(names)}, expected at least one of ARKit's")
+    unseen = np.isnan(values)
+    mapped = np.where(unseen, 0, values).astype(np.float64) @ matrix.T.astype(np.float64)
+    mapped[(unseen.astype(np.float32) @ matrix.T) > 0] = np.nan
+    return ARKIT, mapped.astype(np.float32)
+
+
+def _ten_decimals(values: np.ndarray) -> list[str]:
+    """Ten decimals as the app writes them, more where these do not give the number back; empty for NaN."""
+    texts = [f"{value:.10f}" for value in values.tolist()]
+    back = np.array([float(text) for text in texts]).astype(values.dtype)
+    for i in np.flatnonzero(back != values):
+        texts[i] = "" if np.isnan(values[i]) else str(values[i])
+    return texts

@@ -1,0 +1,103 @@
+"""Blendshape weights as plain CSV: ``frame,time,<shape>,...``, with timecode and rotations where a take has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.io.markers.marker_checks import check_names
+from torchface.io.markers.marker_csv import is_marker_header
+from torchface.io.tables.csv_table import TableReader, number_texts, quoted
+from torchface.io.tables.numbered_csv import COLUMNS, read_numbered, write_numbered
+from torchface.take import Take, Track
+
+ROTATIONS = tuple(part + axis for part in ("Head", "LeftEye", "RightEye") for axis in ("Yaw", "Pitch", "Roll"))
+"""Live Link Face's nine columns behind the weights, radians."""
+
+_TIMECODE = "timecode"
+
+
+def load_weights_csv(path: str | Path) -> Take:
+    """Reads weights from CSV with the header ``frame,time,<shape>,...``.
+
+    One row a frame; times in seconds; an empty cell is NaN. The rate is that of numbers and times; numbers other than
+    0, 1, ... go to ``extras["frame_numbers"]``, dropped frames to ``extras["gaps"]``. A column ``timecode`` and head
+    and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
+    ``extras["columns"]``, where :func:`torchface.io.weights.live_link_csv.load_live_link` has them.
+
+    Args:
+        path: the file.
+
+    Returns:
+        weights (T,N,1), float32, names as the file spells them.
+
+    Raises:
+        FileFormatError: there is no shape, a row has another number of cells, or a cell is no number.
+    """
+    path = Path(path)
+    reader = TableReader(path)
+    if len(reader.header) < 3:
+        raise FileFormatError(f"{path}: found {len(reader.header)} columns, expected frame,time,<shape>,...")
+    if "" in reader.header:
+        raise FileFormatError(f"{path}: found a column without a name, expected every shape's name in the header")
+    table, fps, extras = read_numbered(reader, [_TIMECODE] if _TIMECODE in reader.header else [])
+    names = tuple(name for name in table.names[2:] if name not in ROTATIONS)
+    if not names:
+        raise FileFormatError(f"{path}: found no shape among the columns, expected frame,time,<shape>,...")
+    columns = {name: torch.from_numpy(table.column(name).copy()) for name in table.names if name in ROTATIONS}
+    values = torch.from_numpy(table.columns(names).astype(np.float32))[..., None]
+    return Take(
+        fps,
+        weights=Track(names, values),
+        timecode=table.texts.get(_TIMECODE),
+        extras=extras | ({"columns": columns} if columns else {}),
+    )
+
+
+def save_weights_csv(take: Take, path: str | Path) -> None:
+    """Writes the weights of a take as CSV, all digits that float32 has; NaN becomes an empty cell.
+
+    Timecode and head and eye rotations, where the take has them, come with them.
+
+    Args:
+        take: weights (T,N,1). What else it holds is left out.
+        path: the file; it appears only when it is complete.
+
+    Raises:
+        ValueRangeError: the take has no weights, infinite ones, or an absurd rate.
+        ShapeError: a kept rotation has another length than the take.
+        NameMismatchError: a name is empty, begins or ends in a blank, or would be taken for another column.
+    """
+    path = Path(path)
+    names, values = weights_to_write(take, path)
+    header = (*COLUMNS, *names)
+    if is_marker_header(header) or set(names) & {*COLUMNS, _TIMECODE, *ROTATIONS}:
+        raise NameMismatchError(f"{path}: found shapes named like other columns of the file, expected other names")
+    kept = {name: column for name, column in take.extras.get("columns", {}).items() if name in ROTATIONS}
+    wrong = [name for name, column in kept.items() if len(column) != len(take)]
+    if wrong:
+        raise ShapeError(
+            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
+        )
+    rotations = {
+        name: number_texts(column.detach().cpu().to(torch.float64).numpy())
+        for name, column in kept.items()
+        if isinstance(column, torch.Tensor)
+    }
+    write_numbered(take, path, names, values, {} if take.timecode is None else {_TIMECODE: take.timecode}, rotations)
+
+
+def weights_to_write(take: Take, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and weights (T,N) float32, checked."""
+    if take.weights is None or take.weights.values.shape[:2].numel() == 0:
+        raise ValueRangeError(f"{path}: found a take without weights, expected some to write")
+    if take.weights.values.shape[2] != 1:
+        raise ShapeError(f"{path}: found weights {tuple(take.weights.values.shape)}, expected (T,N,1)")
+    check_names(take.weights.names, path, "shape name")
+    values = take.weights.values.detach().cpu().to(torch.float32).numpy()[..., 0]
+    if np.isinf(values).any():
+        raise ValueRangeError(f"{path}: found an infinite weight, expected numbers")
+    return take.weights.names, values

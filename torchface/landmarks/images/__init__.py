@@ -1,0 +1,10 @@
+"""Landmarks of faces in images and videos: face box, regression trees, appearance model, tracking."""
+
+from torchface.landmarks.images.appearance_model import AppearanceModel
+from torchface.landmarks.images.appearance_training import learn_appearance
+from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.tree_training import fit_trees
+
+# Training knows its model; a model knows of its training only here.
+AppearanceModel.fit = staticmethod(learn_appearance)
+LandmarkTrees.fit = staticmethod(fit_trees)

@@ -1,0 +1,73 @@
+"""Annotated frames as a folder: a picture and iBUG's PTS of the same name for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError
+from torchface.io.images.image_files import load_image, save_image
+from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotatedFrame:
+    """A picture with landmarks.
+
+    Args:
+        name: of its files, without ending.
+        image: (3,H,W) in [0,1].
+        landmarks: iBUG's 68, (68,2) pixels.
+    """
+
+    name: str
+    image: Tensor
+    landmarks: Tensor
+
+
+def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
+    """Every picture of a folder that has a ``.pts`` beside it, by name.
+
+    Raises:
+        FileFormatError: no such folder, none in it, or a file that cannot be read.
+        ShapeError: other than 68 landmarks.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileFormatError(f"{folder}: found no such folder, expected one with pictures and .pts files")
+    frames = []
+    for path in sorted(folder.glob("*.pts")):
+        picture = next((found for end in PICTURES if (found := path.with_suffix(end)).is_file()), None)
+        if picture is None:
+            raise FileFormatError(f"{path}: found no picture beside it, expected {path.stem}.png or another")
+        points = load_landmark_points(path).ibug()
+        if points.shape[1] != 2:
+            raise FileFormatError(f"{path}: found points in space, expected pixels of the picture beside it")
+        frames.append(AnnotatedFrame(path.stem, load_image(picture), points.float()))
+    if not frames:
+        raise FileFormatError(f"{folder}: found no .pts file, expected pictures with one beside each")
+    return frames
+
+
+def save_annotated_frame(frame: AnnotatedFrame, folder: str | Path) -> Path:
+    """Writes ``name.png`` if there is none, then ``name.pts``; returns the latter's path.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+        ValueRangeError: a landmark is NaN.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
+    picture, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
+    if not picture.exists():
+        save_image(frame.image, picture)
+    save_pts(torch.as_tensor(frame.landmarks), points)
+    return points

@@ -1,0 +1,239 @@
+"""The line between two lips or two lids, traced through an image by iterated conditional modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.scans.gaussian_blur import gaussian_blur
+from torchface.landmarks.scans.line_shape import LineShape, unit_profiles
+
+_BRIGHT = 4.0  # standard deviations; were such rows forbidden, a column without others would jump to any dark spot
+
+
+@dataclass(frozen=True)
+class TraceSettings:
+    """How a line is traced; lengths in pixels.
+
+    Args:
+        border: the line stays this near to the box round the two corners, above and below.
+        similar: weight of neighbours having the same intensity, or being as like.
+        dark: weight of being dark, or like the learned look.
+        smooth: weight of neighbours lying level, a squared pixel.
+        near: weight of staying near the course that the line starts with, a squared standard deviation.
+        line_width: intensity is measured against that so many pixels above and below.
+        blurs: standard deviations of the blur under which the line is found first, and then finer.
+        sags: where no usual course is known, the line starts as an arc that sags by these shares of its length; the
+            best end wins.
+        spread: the standard deviation about such an arc, a share of its length.
+        displacements: where corners are known to be loose, either end of the usual course is tried moved by so many
+            standard deviations; the best line wins, and every column pays for its displacement as for leaving the
+            course.
+        sweeps: at most so many a blur; fewer when nothing moves any more.
+        loose_ends: a corner is only known to within so many pixels up or down.
+    """
+
+    border: int = 50
+    similar: float = 1.0
+    dark: float = 2.0
+    smooth: float = 0.1
+    near: float = 1.0
+    line_width: int = 5
+    blurs: tuple[float, ...] = (1.0,)
+    sags: tuple[float, ...] = (-0.06, 0.0, 0.06, 0.12)
+    spread: float = 0.07
+    displacements: tuple[float, ...] = (-2.0, -1.0, 0.0, 1.0, 2.0)
+    sweeps: int = 15
+    loose_ends: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """A traced line.
+
+    Args:
+        points: one a pixel column from the left corner to the right one, (N,2), x right and y down.
+        kept: whether a point is as dark as the line, or as like its look, within one standard deviation, (N,) bool.
+        energy: what was minimised, a column.
+    """
+
+    points: Tensor
+    kept: Tensor
+    energy: float
+
+    def resampled(self, count: int) -> Tensor:
+        """Points (count,2) evenly spaced along the line, both ends included."""
+        return evenly_spaced(self.points, count)
+
+
+def evenly_spaced(points: Tensor, count: int) -> Tensor:
+    """``count`` points at equal arc length along a polyline (N,D), both ends included."""
+    steps = (points[1:] - points[:-1]).norm(dim=-1)
+    along = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
+    wanted = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device) * along[-1]
+    after = torch.searchsorted(along, wanted).clamp(1, len(points) - 1)
+    share = (wanted - along[after - 1]) / (along[after] - along[after - 1]).clamp(min=1e-12)
+    return points[after - 1] + share[:, None] * (points[after] - points[after - 1])
+
+
+def trace_contour(
+    image: Tensor,
+    left: Tensor,
+    right: Tensor,
+    settings: TraceSettings | None = None,
+    shape: LineShape | None = None,
+) -> Contour:
+    r"""Traces the line between two corners: a dark one, or one that looks as it was learned to.
+
+    A line has one row :math:`y_c` a column c; with I how little a pixel is like the line, over its standard deviation
+    in the box,
+
+    .. math:: E = \sum_{c=1}^{N} a\,(I_c - I_{c+1})^2 + b\, I_c + s\,(y_c - y_{c+1})^2
+        + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
+
+    with :math:`y^0` the course that it starts with. In the thesis I is the intensity; here it is how much brighter a
+    pixel is than the darker of what lies above and below, or, where the line's look was learned from annotated lines,
+    1 less the correlation of what lies round the pixel with that look: the line between two lids need not be the
+    darkest of the furrows there. The thesis starts from the straight line and has no last term; here the start is the
+    mean of annotated lines where there were any, else the straight line and an arc. Learned lines are tried with
+    their ends moved up and down as far as corners are usually off; the least energy wins.
+
+    Iterated conditional modes goes from the left corner to the right one and gives every column the row that is best
+    for its two neighbours as they are, again and again until nothing moves. Rows brighter than the present line's
+    mean by more than one standard deviation cost extra; those that are left at the end are marked, not kept.
+
+    Args:
+        image: grey (1,S,S) or colours (3,S,S) in [0,1].
+        left, right: corners, (2,) pixels; the left one further left by two pixels at least.
+        settings: weights and limits.
+        shape: how the line usually runs and looks.
+
+    Raises:
+        ShapeError: not an image.
+        ValueRangeError: the corners are not finite, outside the image, or not left and right.
+
+    Source: thesis 3.2.2; Besag 1986.
+    """
+    settings = settings or TraceSettings()
+    box, rows, columns = _box(image, left, right, settings.border)
+    shapes = [LineShape.arc(sag, settings.spread) for sag in settings.sags] if shape is None else [shape]
+    starts, pulls, displaced = _starts(shapes, left, right, torch.from_numpy(columns), settings)
+    starts -= rows[0]
+    look = None if shape is None or shape.profile is None else shape.looks(left, right, torch.from_numpy(columns))
+    path = starts.round().clip(0, len(rows) - 1).astype(np.int64)
+    grey = np.zeros(0)
+    for blur in settings.blurs:  # each goes on from where the coarser one ended
+        smooth = gaussian_blur(box[None, None], blur)[0, 0].double()
+        grey = _valleys(smooth.numpy(), settings.line_width) if look is None else _unlike(smooth, look)
+        path = _sweep(grey, path, starts, pulls, settings)
+    energies = _energy(grey, path, starts, pulls, settings) + displaced
+    best = int(energies.argmin())
+    line = path[best]
+    shade = grey[line, np.arange(len(line))]
+    kept = shade <= shade.mean() + shade.std()
+    points = torch.stack([torch.from_numpy(columns).double(), torch.from_numpy(line + rows[0]).double()], dim=-1)
+    return Contour(points, torch.from_numpy(kept), float(energies[best]))
+
+
+def _starts(
+    shapes: list[LineShape], left: Tensor, right: Tensor, columns: Tensor, settings: TraceSettings
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Courses (S,N) in image rows, the pulls toward them (S,N), and what the displacement of each costs, (S,).
+
+    Where corners are known to be loose, every shape is tried with either end moved up and down.
+    """
+    share = torch.linspace(0, 1, len(columns), dtype=torch.float64)
+    starts, pulls, costs = [], [], []
+    for shape in shapes:
+        rows, spread = shape.rows(left, right, columns)
+        tried = settings.displacements if shape.looseness > 0 else (0.0,)
+        for at_left, at_right in product(tried, tried):
+            displaced = at_left * (1 - share) + at_right * share
+            starts.append(rows + shape.looseness * displaced)
+            pulls.append(settings.near / spread**2)
+            costs.append(settings.near * float(displaced.square().mean()))
+    return torch.stack(starts).numpy(), torch.stack(pulls).numpy(), np.array(costs)
+
+
+def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tensor, NDArray, NDArray]:
+    """Grey values round the corners, and the image rows and columns they come from."""
+    if image.ndim != 3:
+        raise ShapeError(f"image: found {tuple(image.shape)}, expected (C,S,S)")
+    height, width = image.shape[1:]
+    ends = torch.stack([left, right]).double()
+    if (
+        not torch.isfinite(ends).all()
+        or ends.min() < 0
+        or ends[:, 0].max() > width - 1
+        or ends[:, 1].max() > height - 1
+    ):
+        raise ValueRangeError(f"corners: found {ends.tolist()}, expected pixels of an image of {width} x {height}")
+    first, last = int(ends[0, 0].round()), int(ends[1, 0].round())
+    if last - first < 2:
+        raise ValueRangeError(f"corners: found columns {first} and {last}, expected the left one left of the right one")
+    top = max(0, int(ends[:, 1].min()) - border)
+    bottom = min(height - 1, int(ends[:, 1].max()) + border)
+    box = image[:, top : bottom + 1, first : last + 1].mean(0).float()
+    return box, np.arange(top, bottom + 1), np.arange(first, last + 1)
+
+
+def _valleys(grey: NDArray, width: int) -> NDArray:
+    """How much brighter a pixel is than the darker of those ``width`` above and below it, in standard deviations: low
+    on dark lines, not on dark patches, shadows and their edges."""
+    rows = np.arange(len(grey))
+    above, below = grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(grey) - 1)]
+    valley = grey - np.minimum(above, below)
+    return (valley - valley.min()) / max(float(valley.std()), 1e-6)
+
+
+def _unlike(grey: Tensor, look: Tensor) -> NDArray:
+    """How little what lies round a pixel resembles the look (N,P) of the line in its column, in standard deviations."""
+    reach = look.shape[1] // 2
+    padded = torch.nn.functional.pad(grey[None, None], (0, 0, reach, reach), mode="replicate")[0, 0]
+    around = padded.unfold(0, look.shape[1], 1)
+    unlike = 1 - (unit_profiles(around) * look).sum(-1).numpy()
+    return unlike / max(float(unlike.std()), 1e-6)
+
+
+def _sweep(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
+    """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
+    path = path.copy()
+    lines = np.arange(len(path))
+    count = path.shape[1]
+    row = np.arange(len(grey), dtype=np.float64)
+    outside = np.abs(row[:, None] - starts[:, None, [0, -1]]) > settings.loose_ends
+    # The order is the method: a column's choice is what the next column starts from. Hence a loop, and NumPy, whose
+    # small operations take a fifth of torch's time.
+    for _ in range(settings.sweeps):
+        before = path.copy()
+        shades = grey[path, np.arange(count)]
+        limit = shades.mean(1) + shades.std(1)
+        for c in range(count):
+            here = grey[:, c]
+            cost = settings.dark * here + pulls[:, c, None] * (row - starts[:, c, None]) ** 2
+            for n in (c - 1, c + 1):
+                if 0 <= n < count:
+                    there = grey[path[:, n], n]
+                    cost += settings.similar * (here - there[:, None]) ** 2
+                    cost += settings.smooth * (row - path[:, n, None]) ** 2
+            cost[here > limit[:, None]] += _BRIGHT
+            if c in (0, count - 1):
+                cost[outside[:, :, 0 if c == 0 else 1]] += 1e9
+            path[lines, c] = cost.argmin(1)
+        if (path == before).all():
+            break
+    return path
+
+
+def _energy(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
+    """Mean energy a column of lines (S,N)."""
+    shades = grey[path, np.arange(path.shape[1])]
+    total = settings.dark * shades.sum(1) + settings.similar * (np.diff(shades, axis=1) ** 2).sum(1)
+    total = total + (pulls * (path - starts) ** 2).sum(1)
+    return (total + settings.smooth * (np.diff(path, axis=1) ** 2).sum(1)) / path.shape[1]

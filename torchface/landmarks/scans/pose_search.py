@@ -1,0 +1,158 @@
+"""Rigid pose of a known surface in a scan of any pose: hypotheses from noses, judged and refined by nearest points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.similarity import Similarity
+from torchface.landmarks.scans.nose_search import NoseCandidates
+from torchface.landmarks.scans.surface_sample import SurfaceSample
+
+_REACH = 12.0  # millimetres; what is further away is as wrong as it gets
+_FACING = 0.5  # cosine of the angle between normals beyond which points do not match
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSearch:
+    """How a pose is looked for.
+
+    Args:
+        rolls: turns about the nose's direction that are tried.
+        tilt: the nose's direction is tried as it is, and tilted up, down, left and right by so many degrees.
+        survivors: how many hypotheses go on after a first look, and after a first refinement.
+        first_reaches: how far a point's match may lie in each round of the first refinement, millimetres.
+        reaches: the same for the last one.
+        largest_scale: the head may be this many times larger or smaller than the mean.
+    """
+
+    rolls: int = 24
+    tilt: float = 18.0
+    survivors: tuple[int, int] = (700, 30)
+    first_reaches: tuple[float, ...] = (25.0, 22.0, 19.0, 16.0, 14.0, 12.0)
+    reaches: tuple[float, ...] = (25.0, 20.0, 16.0, 12.0, 12.0, 9.0, 9.0, 7.0, 7.0, 6.0, 6.0, 5.0, 5.0, 5.0, 5.0)
+    largest_scale: float = 1.2
+
+
+def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates, search: PoseSearch) -> Similarity:
+    """Poses that bring a nose at ``nose`` (3,), looking along ``direction`` (3,), onto each candidate, every roll."""
+    rotations = []
+    base = _frame(direction[None])[0]
+    lean = math.radians(search.tilt)
+    across = _frame(found.directions)
+    for axis, angle in ((0, 0.0), (0, lean), (0, -lean), (1, lean), (1, -lean)):
+        for k in range(search.rolls):
+            turn = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(angle, axis)
+            rotations.append(across @ turn @ base.T)
+    rotation = torch.cat(rotations)
+    target = found.points.repeat(len(rotations), 1)
+    translation = target - (rotation @ nose)
+    return Similarity(torch.ones(len(rotation), dtype=torch.float64), rotation, translation)
+
+
+def misfit(poses: Similarity, points: Tensor, normals: Tensor, surface: SurfaceSample) -> Tensor:
+    """Mean distance (B,) of moved points from a surface, millimetres; one that is far or faces away counts 12."""
+    moved, turned = poses.apply(points), normals @ poses.rotation.transpose(-1, -2)
+    distance, row = surface.nearest(moved, _REACH)
+    facing = (surface.normals[row] * turned).sum(-1) > _FACING
+    return torch.where(facing, distance.clamp(max=_REACH), _REACH).mean(-1)
+
+
+def refine(
+    poses: Similarity,
+    points: Tensor,
+    normals: Tensor,
+    surface: SurfaceSample,
+    reaches: tuple[float, ...],
+    largest_scale: float = 1.2,
+) -> Similarity:
+    r"""Similarity ICP, point to plane, for a batch of poses.
+
+    .. math:: \min_{\omega, t, \sigma} \sum_i \rho_i
+        \big(n_i \cdot ((1+\sigma) x_i + \omega \times x_i + t - y_i)\big)^2
+
+    with y the nearest surface points, n their normals, :math:`\rho` Tukey's weight within the round's reach and 0
+    where normals disagree.
+    """
+    scale, rotation, translation = poses.scale, poses.rotation, poses.translation
+    eye = torch.eye(7, dtype=torch.float64)
+    for reach in reaches:  # each round starts where the last one ended
+        now = Similarity(scale, rotation, translation)
+        moved, turned = now.apply(points), normals @ rotation.transpose(-1, -2)
+        distance, row = surface.nearest(moved, reach)
+        n, y = surface.normals[row], surface.points[row]
+        centre = moved.mean(1, keepdim=True)
+        arm = moved - centre
+        weight = (1 - (distance / reach).clamp(max=1) ** 2) ** 2 * ((n * turned).sum(-1) > _FACING)
+        columns = torch.cat([torch.linalg.cross(arm, n), n, (arm * n).sum(-1, keepdim=True)], dim=-1)
+        residual = ((y - moved) * n).sum(-1)
+        weighted = columns * weight[..., None]
+        # A little ridge: a pose that no point supports stays where it is.
+        normal_matrix = weighted.transpose(-1, -2) @ columns + 1e-3 * eye
+        step = torch.linalg.solve(normal_matrix, (weighted * residual[..., None]).sum(1))
+        change = torch.linalg.matrix_exp(_skew(step[:, :3].clamp(-0.3, 0.3)))
+        grown = (scale * (1 + step[:, 6].clamp(-0.1, 0.1))).clamp(1 / largest_scale, largest_scale)
+        # Turn and grow about the moved points' centre, then shift.
+        ratio = (grown / scale)[:, None, None]
+        shift = centre + step[:, None, 3:6]
+        translation = (ratio * ((translation[:, None] - centre) @ change.transpose(-1, -2)) + shift)[:, 0]
+        rotation, scale = change @ rotation, grown
+    return Similarity(scale, rotation, translation)
+
+
+def find_pose(
+    points: Tensor,
+    normals: Tensor,
+    nose: Tensor,
+    direction: Tensor,
+    surface: SurfaceSample,
+    found: NoseCandidates,
+    search: PoseSearch,
+) -> tuple[Similarity, float]:
+    """The pose of points (N,3) with normals (N,3) in a scan, and its misfit in millimetres.
+
+    Args:
+        points, normals: a face.
+        nose, direction: the face's nose and where it looks, each (3,).
+        surface: the scan.
+        found: where noses may be on it.
+        search: how to look.
+    """
+    tried = hypotheses(nose, direction, found, search)
+    few = slice(None, None, max(1, len(points) // 60))
+    some = slice(None, None, max(1, len(points) // 400))
+    rough = misfit(tried, points[few], normals[few], surface)
+    tried = _rows(tried, rough.argsort()[: search.survivors[0]])
+    tried = refine(tried, points[few], normals[few], surface, search.first_reaches, search.largest_scale)
+    score = misfit(tried, points[few], normals[few], surface)
+    tried = _rows(tried, score.argsort()[: search.survivors[1]])
+    tried = refine(tried, points[some], normals[some], surface, search.reaches, search.largest_scale)
+    score = misfit(tried, points[some], normals[some], surface)
+    winner = score.argmin()[None]
+    return _rows(tried, winner), float(score[winner])
+
+
+def _rows(poses: Similarity, rows: Tensor) -> Similarity:
+    return Similarity(poses.scale[rows], poses.rotation[rows], poses.translation[rows])
+
+
+def _frame(direction: Tensor) -> Tensor:
+    """Rotations (K,3,3) whose third column is ``direction`` (K,3); the others lie anywhere across it."""
+    helper = torch.nn.functional.one_hot(direction.abs().argmin(-1), 3).to(direction)
+    side = torch.nn.functional.normalize(torch.linalg.cross(helper, direction), dim=-1)
+    return torch.stack([side, torch.linalg.cross(direction, side), direction], dim=-1)
+
+
+def _turn(angle: float, axis: int) -> Tensor:
+    vector = torch.zeros(1, 3, dtype=torch.float64)
+    vector[0, axis] = angle
+    return torch.linalg.matrix_exp(_skew(vector))[0]
+
+
+def _skew(vectors: Tensor) -> Tensor:
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)

@@ -1,0 +1,129 @@
+"""The twelve landmarks and the lip and lid lines of a raw scan, found in its unwrapped picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.geometry.similarity import Similarity
+from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
+from torchface.landmarks.scans.curvature_image import relief
+from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
+from torchface.landmarks.scans.line_shape import LineShape
+from torchface.landmarks.scans.twelve_landmarks import LINES
+from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
+from torchface.mesh import Mesh
+
+_BROAD_SCALE, _BROAD_CONTRAST = 3.0, 16.0  # millimetres; facets of coarse scans and their noise are smaller
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLandmarks:
+    """What was found on a scan.
+
+    Args:
+        names: of the landmarks.
+        points: (L,3) in the scan's space, millimetres.
+        confidence: (L,) in [0,1]; 0 where only the usual place is known.
+        pixels: (L,2) in the unwrapped picture.
+        contours: the traced lines by name, in pixels; a line whose corners lie the wrong way round is missing.
+        head: the unwrapped scan.
+        image: what the detector saw, (C,S,S).
+    """
+
+    names: tuple[str, ...]
+    points: Tensor
+    confidence: Tensor
+    pixels: Tensor
+    contours: dict[str, Contour]
+    head: UnwrappedHead
+    image: Tensor
+
+    def line_points(self, scan: Mesh, name: str, shares: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (N,3) on the scan at shares (N,) in [0,1] of a line's length in 3D, and whether each can be trusted:
+        it lies on the scan, not in a hole, and is as dark as the line."""
+        contour = self.contours[name]
+        points, seen = self.head.surface_points(scan, contour.points)
+        steps = (points[1:] - points[:-1]).norm(dim=-1)
+        along = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
+        wanted = shares.to(along) * along[-1]
+        after = torch.searchsorted(along, wanted).clamp(1, len(points) - 1)
+        part = (wanted - along[after - 1]) / (along[after] - along[after - 1]).clamp(min=1e-9)
+        good = seen & contour.kept
+        return points[after - 1] + part[:, None] * (points[after] - points[after - 1]), good[after - 1] & good[after]
+
+
+def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
+    """The picture (C,S,S) that a detector of this appearance looks at.
+
+    Raises:
+        ValueRangeError: a texture is wanted and the scan has no colours.
+    """
+    if appearance == "relief":
+        return relief(head, _BROAD_SCALE, _BROAD_CONTRAST)
+    if head.texture is None:
+        raise ValueRangeError(
+            "scan: found no texture and no vertex colours, expected some: this detector learned from textures; "
+            "use one that learned from relief"
+        )
+    return head.texture
+
+
+def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
+    """The picture (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
+    from its surroundings."""
+    return relief(head) if appearance == "relief" else appearance_image(head, appearance)
+
+
+def scan_landmarks(
+    detector: UVLandmarkDetector,
+    scan: Mesh,
+    pose: Similarity | None = None,
+    trace: TraceSettings | None = None,
+) -> ScanLandmarks:
+    """Finds the twelve landmarks and traces lips and lids on a scan.
+
+    Args:
+        detector: fitted with a frame.
+        scan: millimetres, in any pose.
+        pose: a rough one, from the scan's space to the detector's frame; searched for if absent.
+        trace: how to trace lines.
+
+    Raises:
+        ValueRangeError: the detector has no frame, no face is found, or the scan lacks the texture it needs.
+
+    Source: thesis 3.2.2.
+    """
+    if detector.frame is None:
+        raise ValueRangeError("detector: found one without a FaceFrame, expected one fitted with frame=")
+    pose = detector.frame.locate(scan) if pose is None else detector.frame.settle(scan, pose)
+    head = unwrap(scan, pose, CylinderLayout().resized(detector.size))
+    image = appearance_image(head, detector.appearance)
+    with torch.no_grad():
+        found = detector(image[None])
+    pixels = found.pixels[0]
+    points, _ = head.surface_points(scan, pixels)
+    contours = trace_lines(
+        line_image(head, detector.appearance),
+        dict(zip(detector.names, pixels, strict=True)),
+        trace,
+        detector.line_shapes(),
+    )
+    return ScanLandmarks(detector.names, points, found.confidence[0], pixels, contours, head, image)
+
+
+def trace_lines(
+    image: Tensor,
+    corners: dict[str, Tensor],
+    trace: TraceSettings | None = None,
+    shapes: dict[str, LineShape] | None = None,
+) -> dict[str, Contour]:
+    """Every line of ``LINES`` whose two corners (2,) are there, the one on the left further left."""
+    found, usual = {}, shapes or {}
+    for name, (left, right) in LINES.items():
+        if left in corners and right in corners and float(corners[right][0] - corners[left][0]) >= 3:
+            found[name] = trace_contour(image, corners[left], corners[right], trace, usual.get(name))
+    return found

@@ -1,0 +1,1 @@
+"""Fine detail of high-resolution scans as normal maps."""

@@ -1,0 +1,1 @@
+"""Morphable models: principal components of shapes and colours, their training and quality."""

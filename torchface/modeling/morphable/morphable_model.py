@@ -1,0 +1,285 @@
+"""The morphable model: a mean, the ways in which samples differ from it, and how much they do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.modeling.morphable.principal_components import principal_components
+
+_LARGEST = 2**31
+
+
+class MorphableModel(nn.Module):
+    r"""A linear Gaussian model of any quantity a vertex: positions, colours, others.
+
+    .. math:: x = \bar x + \sum_k a_k \sigma_k u_k, \qquad a \sim N(0, I)
+
+    Coefficients :math:`a` are in standard deviations. What is learned lies in float32 buffers.
+
+    Args:
+        mean: :math:`\bar x`, (V,C).
+        components: orthonormal :math:`u_k`, (K,V,C).
+        standard_deviations: :math:`\sigma_k`, (K,), positive, falling; in the unit of the samples, over all vertices.
+        total_variance: of the samples it was learned from, over all vertices and channels; that of the components
+            if absent.
+        samples: how many it was learned from; 0 where that is not known.
+
+    Raises:
+        ShapeError: the shapes do not fit.
+
+    Source: thesis 3.2.4, equations 8 and 9 (whose exponent means the squares of coefficients over variances).
+    """
+
+    mean: Tensor
+    components: Tensor
+    standard_deviations: Tensor
+    total_variance: Tensor
+
+    def __init__(
+        self,
+        mean: Tensor,
+        components: Tensor,
+        standard_deviations: Tensor,
+        total_variance: Tensor | float | None = None,
+        samples: int = 0,
+    ) -> None:
+        super().__init__()
+        if mean.ndim != 2 or components.ndim != 3 or components.shape[1:] != mean.shape:
+            raise ShapeError(
+                f"morphable model: found mean {tuple(mean.shape)} and components {tuple(components.shape)}, "
+                "expected (V,C) and (K,V,C)"
+            )
+        if standard_deviations.shape != components.shape[:1]:
+            raise ShapeError(
+                f"standard_deviations: found {tuple(standard_deviations.shape)}, expected ({len(components)},)"
+            )
+        if total_variance is None:
+            total_variance = standard_deviations.double().square().sum()
+        self.register_buffer("mean", mean.detach().float().contiguous())
+        self.register_buffer("components", components.detach().float().contiguous())
+        self.register_buffer("standard_deviations", standard_deviations.detach().float().contiguous())
+        self.register_buffer("total_variance", torch.as_tensor(total_variance).detach().to(mean.device).float())
+        self.samples = samples
+
+    @classmethod
+    def fit(cls, samples: Tensor, components: int | None = None) -> MorphableModel:
+        """Learns from samples in correspondence.
+
+        Args:
+            samples: (M,V,C), aligned.
+            components: how many; as many as the samples differ in if absent, at most M-1.
+
+        Raises:
+            ShapeError: no (M,V,C), or fewer than two samples.
+            ValueRangeError: NaN or infinity, samples that are all the same, or more components than they hold.
+        """
+        if samples.ndim != 3:
+            raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (M,V,C)")
+        learned = principal_components(samples.detach().flatten(1), components)
+        return cls(
+            learned.mean.reshape(samples.shape[1:]),
+            learned.components.reshape(-1, *samples.shape[1:]),
+            learned.standard_deviations,
+            learned.total_variance,
+            len(samples),
+        )
+
+    @property
+    def count(self) -> int:
+        """How many components, K."""
+        return len(self.standard_deviations)
+
+    @property
+    def modes(self) -> Tensor:
+        """What one standard deviation of each component adds to the mean, (K,V,C)."""
+        return self.components * self.standard_deviations[:, None, None]
+
+    @property
+    def explained(self) -> Tensor:
+        """The share of the total variance that the first components hold, (K,), rising."""
+        return self.standard_deviations.double().square().cumsum(0) / self.total_variance.double()
+
+    def forward(self, coefficients: Tensor) -> Tensor:
+        """Coefficients (B,K) to samples (B,V,C)."""
+        self._check(coefficients)
+        scaled = coefficients * self.standard_deviations.to(coefficients)
+        offset = scaled @ self.components.flatten(1).to(coefficients)
+        return self.mean.to(coefficients) + offset.reshape(-1, *self.mean.shape)
+
+    def project(self, samples: Tensor, vertices: Tensor | None = None, noise: float | Tensor | None = None) -> Tensor:
+        r"""The coefficients that explain samples.
+
+        .. math:: a = \arg\min_a \; \sum_i \lVert x_i - \bar x_i - (M a)_i \rVert^2 / \nu_i^2 \; + \lVert a \rVert^2
+
+        with modes :math:`M`: the posterior mean under noise of deviation :math:`\nu`. Without noise the second term
+        is left out: the orthogonal projection, or the shortest least-squares solution where the vertices do not
+        tell all coefficients.
+
+        Args:
+            samples: (B,V,C), or (B,N,C) of the ``vertices``; a vertex with a NaN counts as missing.
+            vertices: ids (N,) int64; all of them if absent.
+            noise: standard deviation in the unit of the samples, a number or one a vertex (N,).
+
+        Returns:
+            Coefficients (B,K).
+
+        Raises:
+            ShapeError: the shapes differ from the above.
+            ValueRangeError: noise that is not positive, or vertex ids outside the model.
+
+        Source: thesis 3.2.4; Albrecht, Luethi, Vetter 2008 (posterior shape models).
+        """
+        samples = samples.to(self.mean)
+        mean, components = self.mean, self.components
+        if vertices is not None:
+            if vertices.ndim != 1 or (
+                len(vertices) and not 0 <= int(vertices.min()) <= int(vertices.max()) < len(mean)
+            ):
+                raise ValueRangeError(f"vertices: found {_span(vertices)}, expected ids (N,) from 0 to {len(mean) - 1}")
+            mean, components = mean[vertices], components[:, vertices]
+        if samples.ndim != 3 or samples.shape[1:] != mean.shape:
+            raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (B,{mean.shape[0]},{mean.shape[1]})")
+        precision = _precision(noise, len(mean)).to(mean.device)
+        residual = (samples - mean).double()
+        seen = torch.isfinite(residual).all(-1)
+        deviations = self.standard_deviations.double()
+        if vertices is None and noise is None and bool(seen.all()):
+            return (residual.flatten(1).float() @ components.flatten(1).T) / self.standard_deviations
+        residual = torch.where(seen[..., None], residual, 0.0) * precision[:, None]
+        modes = components.double() * (deviations[:, None, None] * precision[:, None])
+        # Samples that miss the same vertices share one system.
+        groups, member = seen.unique(dim=0, return_inverse=True)
+        result = residual.new_empty((len(samples), self.count))
+        for number, group in enumerate(groups):
+            rows = (member == number).nonzero()[:, 0]
+            known = modes[:, group].flatten(1)
+            told = residual[rows][:, group].flatten(1)
+            result[rows] = _posterior(known, told) if noise is not None else _least_squares(known, told)
+        return result.float()
+
+    def log_prob(self, coefficients: Tensor) -> Tensor:
+        r""":math:`-\frac12 \lVert a \rVert^2` of coefficients (B,K), (B,); the constant
+        :math:`-\frac K2 \log 2\pi` is left out, so that the mean has 0."""
+        self._check(coefficients)
+        return -0.5 * coefficients.square().sum(-1)
+
+    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Coefficients (count,K) drawn from the model; ``model(model.sample(3))`` are three samples."""
+        return torch.randn(count, self.count, generator=generator).to(self.mean)
+
+    def interpolate(self, first: Tensor, second: Tensor, steps: int) -> Tensor:
+        """Coefficients (steps,K) on the straight way from one (K,) to another, both included."""
+        self._check(torch.stack([first, second]))
+        if steps < 2:
+            raise ValueRangeError(f"steps: found {steps}, expected at least 2")
+        return torch.lerp(first, second, torch.linspace(0, 1, steps, device=first.device, dtype=first.dtype)[:, None])
+
+    def truncate(self, count: int | None = None, variance: float | None = None) -> MorphableModel:
+        """The model of the first components.
+
+        Args:
+            count: how many to keep.
+            variance: keep as few as hold this share of the total variance, in (0,1].
+
+        Raises:
+            ValueRangeError: neither or both are given, or the model has not that many or that much.
+        """
+        if (count is None) == (variance is None):
+            raise ValueRangeError("truncate: expected either a count or a share of the variance")
+        if variance is not None:
+            held = float(self.explained[-1])
+            # What rounding to float32 leaves of a whole is still the whole.
+            if not 0 < variance <= 1 or variance > held + 1e-5:
+                raise ValueRangeError(f"variance: found {variance:g}, expected above 0 and at most {held:.4f}")
+            count = min(int((self.explained < variance - 1e-9).sum()) + 1, self.count)
+        if count is None or not 1 <= count <= self.count:
+            raise ValueRangeError(f"count: found {count}, expected 1 to {self.count}")
+        return MorphableModel(
+            self.mean, self.components[:count], self.standard_deviations[:count], self.total_variance, self.samples
+        )
+
+    def part(self, vertices: Tensor) -> MorphableModel:
+        """The same distribution seen at some vertices (N,) only; its components are orthonormal there."""
+        modes = self.modes[:, vertices].double().flatten(1)
+        _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
+        kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
+        return MorphableModel(
+            self.mean[vertices],
+            components[kept].reshape(-1, len(vertices), self.mean.shape[1]),
+            deviations[kept],
+            samples=self.samples,
+        )
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Sizes from which :meth:`from_config` makes a model for the state to be loaded into."""
+        vertices, channels = self.mean.shape
+        return {"vertices": vertices, "channels": channels, "components": self.count, "samples": self.samples}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> MorphableModel:
+        """A model of zeros with the sizes of a ``config``.
+
+        Raises:
+            FileFormatError: a size is missing, no whole number, or too large.
+        """
+        vertices, channels, components = (size(config, name) for name in ("vertices", "channels", "components"))
+        if 4 * vertices * channels * (components + 1) > _LARGEST:
+            raise FileFormatError(f"morphable model: found sizes of more than {_LARGEST} bytes, expected fewer")
+        return cls(
+            torch.zeros(vertices, channels),
+            torch.zeros(components, vertices, channels),
+            torch.zeros(components),
+            0.0,
+            size(config, "samples", smallest=0),
+        )
+
+    def _check(self, coefficients: Tensor) -> None:
+        if coefficients.ndim != 2 or coefficients.shape[1] != self.count:
+            raise ShapeError(f"coefficients: found {tuple(coefficients.shape)}, expected (B,{self.count})")
+
+
+def size(config: Mapping[str, Any], name: str, smallest: int = 1) -> int:
+    """A whole number from a config.
+
+    Raises:
+        FileFormatError: it is missing, no whole number, or out of range.
+    """
+    found = config.get(name)
+    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found < _LARGEST:
+        raise FileFormatError(f"config: found {name} = {found!r}, expected a whole number from {smallest}")
+    return found
+
+
+def _span(ids: Tensor) -> str:
+    return f"{tuple(ids.shape)}" + (f", {int(ids.min())} to {int(ids.max())}" if len(ids) else "")
+
+
+def _precision(noise: float | Tensor | None, count: int) -> Tensor:
+    """One over the deviation of each vertex, (N,) float64."""
+    deviation = torch.as_tensor(1.0 if noise is None else noise, dtype=torch.float64)
+    if deviation.ndim > 1 or (deviation.ndim == 1 and len(deviation) != count):
+        raise ShapeError(f"noise: found {tuple(deviation.shape)}, expected a number or ({count},)")
+    if not bool((deviation > 0).all()) or not math.isfinite(float(deviation.min())):
+        raise ValueRangeError(f"noise: found {float(deviation.min()):g}, expected a positive deviation")
+    return (1 / deviation).expand(count)
+
+
+def _posterior(modes: Tensor, residual: Tensor) -> Tensor:
+    matrix = modes @ modes.T
+    matrix.diagonal().add_(1.0)
+    factor = torch.linalg.cholesky(matrix)
+    return torch.cholesky_solve(modes @ residual.T, factor).T
+
+
+def _least_squares(modes: Tensor, residual: Tensor) -> Tensor:
+    """The shortest solution; directions that the vertices do not tell stay at the mean."""
+    values, vectors = torch.linalg.eigh(modes @ modes.T)
+    inverse = torch.where(values > 1e-10 * values[-1].clamp(min=1e-300), 1 / values, 0.0)
+    return (residual @ modes.T) @ (vectors * inverse) @ vectors.T

@@ -1,0 +1,183 @@
+"""A morphable model of more samples than memory holds."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.sparse.linalg import LinearOperator, eigsh
+from torch import Tensor
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.whole_files import read_file, write_file
+from torchface.geometry.sample_batches import Samples, blocks
+from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling.morphable.principal_components import check_count, check_rank, gram_spectrum, signs
+
+_BLOCK_BYTES = 2**27
+_WHOLE_SPECTRUM = 1500
+_MANY = 200
+
+
+def fit_sequence(
+    samples: Samples,
+    components: int | None = None,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> MorphableModel:
+    r"""What :meth:`MorphableModel.fit` learns, from samples that are read in blocks.
+
+    Three passes: the mean; the Gram matrix, block by block of rows, in float64; the components. Memory is taken by the
+    Gram matrix (8 M² bytes) and two blocks. Its leading eigenpairs come from Lanczos' iteration, to the precision
+    of float64.
+
+    Args:
+        samples: in correspondence, aligned.
+        components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
+        checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
+            samples and folder, the fit continues; in the end the files are removed.
+        progress: called with (blocks done, blocks).
+
+    Raises:
+        ShapeError: fewer than two samples.
+        ValueRangeError: NaN or infinity, samples that are all the same, or more components than they hold.
+        FileFormatError: the checkpoint cannot be written.
+
+    Source: thesis 3.2.4, equation 8; Lehoucq, Sorensen, Yang 1998 (Lanczos).
+    """
+    count, vertices, channels = samples.shape
+    check_count(count, components)
+    if components is None and count > _WHOLE_SPECTRUM:
+        components = _MANY
+    parts = list(blocks(samples, _BLOCK_BYTES))
+    work = 2 * len(parts) + len(parts) * (len(parts) + 1) // 2
+    steps = iter(range(1, work + 1))
+
+    def step() -> None:
+        if progress is not None:
+            progress(next(steps), work)
+
+    mean, floor = _mean(samples, parts, step)
+    gram = torch.zeros(count, count, dtype=torch.float64)
+    rows = _Rows(None if checkpoint is None else Path(checkpoint), mean, count)
+    for number, (begin, end) in enumerate(parts):
+        if (known := rows.read(number, end - begin, end)) is not None:
+            gram[begin:end, :end] = known
+            for _ in range(number + 1):
+                step()
+            continue
+        own = _centred(samples, begin, end, mean)
+        for first, last in parts[: number + 1]:
+            other = own if first == begin else _centred(samples, first, last, mean)
+            gram[begin:end, first:last] = own @ other.T
+            step()
+        rows.write(number, gram[begin:end, :end])
+    values, vectors, trace = _leading(gram, floor, components)
+    toward = (vectors / values.sqrt()).T.contiguous()
+    del gram, vectors
+    learned = torch.zeros(len(values), vertices * channels, dtype=torch.float64)
+    for begin, end in parts:
+        learned.addmm_(toward[:, begin:end], _centred(samples, begin, end, mean))
+        step()
+    learned.mul_(signs(learned)[:, None])
+    rows.remove()
+    return MorphableModel(
+        mean.reshape(vertices, channels),
+        learned.reshape(len(values), vertices, channels),
+        (values / (count - 1)).sqrt(),
+        trace / (count - 1),
+        count,
+    )
+
+
+def _mean(samples: Samples, parts: list[tuple[int, int]], step: Callable[[], None]) -> tuple[Tensor, float]:
+    """The mean (D,) float64, and the eigenvalue that rounding alone makes."""
+    total: Tensor | None = None
+    largest = eps = 0.0
+    for begin, end in parts:
+        part = samples.read(begin, end).flatten(1)
+        summed = part.sum(0, dtype=torch.float64)
+        if not bool(torch.isfinite(summed).all()):
+            bad = (~torch.isfinite(part)).any(1).nonzero()[:, 0] + begin
+            raise ValueRangeError(f"samples: number {int(bad[0])} holds NaN or infinity; expected none")
+        total = summed if total is None else total + summed
+        largest, eps = max(largest, float(part.abs().max())), torch.finfo(part.dtype).eps
+        step()
+    assert total is not None
+    return total / samples.shape[0], (eps * largest) ** 2 * len(total)
+
+
+def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
+    return samples.read(begin, end).flatten(1).double().sub_(mean)
+
+
+def _leading(gram: Tensor, floor: float, count: int | None) -> tuple[Tensor, Tensor, float]:
+    """The leading eigenpairs of a matrix whose lower triangle is filled, and its trace."""
+    size = len(gram)
+    if count is None or size <= _WHOLE_SPECTRUM or count > size // 4:
+        spectrum = gram_spectrum(gram, floor, count)
+        return spectrum.values, spectrum.vectors, spectrum.trace
+    trace = float(gram.diagonal().sum())
+    if trace <= floor:
+        check_rank(size, 0, count)
+    for begin in range(0, size, 1024):  # in strips: a transpose of the whole would be a second matrix
+        end = begin + 1024
+        gram[begin:end, end:] = gram[end:, begin:end].T
+        strip = gram[begin:end, begin:end]
+        strip.copy_(strip.tril() + strip.tril(-1).T)
+    apply = LinearOperator((size, size), matvec=lambda x: gram.numpy() @ x, dtype=np.float64)
+    start = np.cos(np.arange(size, dtype=np.float64))
+    values, vectors = eigsh(apply, count, which="LA", v0=start)
+    order = np.argsort(values)[::-1]
+    check_rank(size, int((values > max(floor, 1e-12 * values.max())).sum()), count)
+    return torch.from_numpy(values[order].copy()), torch.from_numpy(vectors[:, order].copy()), trace
+
+
+class _Rows:
+    """Finished rows of the Gram matrix on disk; another mean means other samples, and they begin anew."""
+
+    def __init__(self, folder: Path | None, mean: Tensor, count: int) -> None:
+        self._folder = folder
+        if folder is None:
+            return
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
+        key = f"{count} ".encode() + mean.numpy().tobytes()
+        path = folder / "mean.bin"
+        if not path.is_file() or read_file(path) != key:
+            self.remove()
+            folder.mkdir(exist_ok=True)
+            write_file(path, key)
+
+    def read(self, number: int, rows: int, columns: int) -> Tensor | None:
+        """The rows if they are there and whole."""
+        if self._folder is None or not (path := self._path(number)).is_file():
+            return None
+        try:
+            found = np.load(io.BytesIO(read_file(path)), allow_pickle=False)
+        except (ValueError, OSError, EOFError, FileFormatError):
+            return None  # what is damaged is computed again
+        right = found.shape == (rows, columns) and found.dtype == np.float64 and bool(np.isfinite(found).all())
+        return torch.from_numpy(found) if right else None
+
+    def write(self, number: int, rows: Tensor) -> None:
+        if self._folder is not None:
+            buffer = io.BytesIO()
+            np.save(buffer, rows.contiguous().numpy(), allow_pickle=False)
+            write_file(self._path(number), buffer.getbuffer())  # type: ignore[arg-type]
+
+    def remove(self) -> None:
+        if self._folder is not None and self._folder.is_dir():
+            for path in [*self._folder.glob("gram_*.npy"), self._folder / "mean.bin"]:
+                path.unlink(missing_ok=True)
+            if not any(self._folder.iterdir()):
+                self._folder.rmdir()
+
+    def _path(self, number: int) -> Path:
+        assert self._folder is not None
+        return self._folder / f"gram_{number:05}.npy"

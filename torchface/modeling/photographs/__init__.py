@@ -1,0 +1,1 @@
+"""A head model fitted to photographs: pose, identity, expression, texture."""

@@ -1,0 +1,238 @@
+"""A head from landmarks in photographs: identity, expression and cameras at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.cameras.pnp import Pose, solve_pnp
+from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
+from torchface.geometry.similarity import similarity_transform
+from torchface.mesh import Mesh
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.photographs.image_input import check_images, checked_landmark_vertices, checked_sizes, lens
+from torchface.modeling.photographs.image_solve import FitSettings, Problem, State, covariance, solve, solve_either
+from torchface.modeling.photographs.image_texture import photographed_skin
+from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
+from torchface.modeling.photographs.texture_fit import ColorFit
+from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import mirror
+
+_TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks
+_UNLIKE = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
+_SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFit:
+    """A person's head, found in I photographs with 68 landmarks each.
+
+    Args:
+        mesh: the head at rest, in the model's place, with the rig's topology and skin.
+        posed: the same with the expression of the photographs.
+        coefficients: of identity, (K,), standard deviations.
+        weights: of the rig's shapes, (N,).
+        cameras: one a photograph.
+        residuals: where the fit's landmarks are seen minus where they were found, (I,68,2), pixels, NaN for missing.
+        landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
+        noise: estimated deviation of an inner landmark, pixels.
+        covariance: of coefficients and weights, (K+N,K+N); rows of those that lie on their bound are zero.
+        color: what the colour model tells of the photographs; None without one, or without photographs.
+    """
+
+    mesh: Mesh
+    posed: Mesh
+    coefficients: Tensor
+    weights: Tensor
+    cameras: tuple[Camera, ...]
+    residuals: Tensor
+    landmarks: Tensor
+    noise: float
+    covariance: Tensor
+    color: ColorFit | None = None
+
+    @property
+    def errors(self) -> Tensor:
+        """Root mean square distance of the landmarks in each photograph, (I,), pixels."""
+        return self.residuals.square().sum(-1).nanmean(-1).sqrt()
+
+
+def fit_images(
+    model: HeadModel,
+    rig: BlendshapeRig,
+    landmarks: Tensor,
+    image_size: tuple[int, int] | Sequence[tuple[int, int]],
+    images: Sequence[Tensor] | None = None,
+    landmark_vertices: Tensor | None = None,
+    camera: float | Tensor | None = None,
+    settings: FitSettings | None = None,
+    transfers: int = 1,
+    texture_size: int = 1024,
+    masked: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> ImageFit:
+    r"""The head whose landmarks are seen where photographs show them.
+
+    .. math:: \min_{a,w,P} \sum_{i,l} c_l \lVert P_i(\bar S + \sum_k a_k s_k + \sum_n w_n B_n)_{v_l} - q_{il} \rVert^2
+              / \sigma^2 + \lVert a \rVert^2 + \rho(w), \quad |a| \le 3, \; 0 \le w \le 1
+
+    for all photographs of one person with one expression together. Poses start by PnP; then identity, expression,
+    poses and focal length move at once, each step a quadratic program in a box. Landmarks of the face's contour slide
+    to where the silhouette is. At the end the shapes that show are transferred to the head found, and it is fitted
+    again.
+
+    Args:
+        model: heads at rest.
+        rig: template with the model's topology.
+        landmarks: in iBUG's order, (I,68,2), pixels, x right, y down; NaN for missing.
+        image_size: (width, height) of all photographs, or one for each.
+        images: the photographs, (3,H,W) each, for the head's skin; see ``photographed_skin``.
+        landmark_vertices: of the 68, (68,); the rig's annotated ones, or the model's, if absent.
+        camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as known unless
+            ``settings.focal_spread`` says how far it may be off. Estimated if absent.
+        settings: how landmarks are trusted; see ``FitSettings``.
+        transfers: how often shapes are transferred to the head found; 0 keeps the template's.
+        texture_size: of the skin, texels a side; 0 makes no texture.
+        masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
+        progress: called with a line before each step.
+
+    Returns:
+        The head, what it took to find it, and how sure it is; see ``ImageFit``. Solved in float64 on the CPU.
+
+    Raises:
+        ShapeError: the landmarks are not (I,68,2), or sizes do not fit.
+        TopologyError: model and rig have other triangles.
+        ValueRangeError: too few landmarks in a view, or landmarks outside its picture.
+        AlignmentError: a face seen from behind, or landmarks that are not a face's in iBUG's order.
+
+    Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
+    """
+    say = progress or (lambda line: None)
+    vertices = checked_landmark_vertices(model, rig, landmark_vertices)
+    sizes = checked_sizes(landmarks, image_size)
+    if images is not None:
+        check_images(images, sizes)
+    intrinsics, settings = lens(camera, sizes, settings or FitSettings())
+    found = landmarks.detach().cpu().double()
+    mean, modes = model.shape.mean.cpu(), model.shape.modes.cpu()
+    deltas = _in_place(rig, mean)
+    curves = contour_curves(mean, model.faces.cpu(), vertices)
+    points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
+    say("placing the cameras")
+    pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
+    twins = len(modes) + _twins(rig.names)
+    problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, twins)
+    start = State(
+        torch.zeros(len(points.basis), dtype=torch.float64),
+        Views(intrinsics, pose.rotation, pose.translation),
+        torch.arange(LANDMARKS).expand(len(found), -1),
+        float(pose.errors.mean()) if settings.noise is None else settings.noise,
+    )
+    say("fitting identity and expression")
+    problem, state = solve_either(problem, start)
+    for turn in range(transfers):
+        say(f"transferring the shapes that show, {turn + 1} of {transfers}")
+        weights = state.coefficients[len(modes) :].float()
+        rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
+        deltas = _personal(rig, deltas, weights, vertices, rest)
+        points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
+        problem = replace(problem, points=points)
+        state = solve(problem, state)
+    fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
+    if images is None:
+        return fit
+    say("laying the photographs on the head")
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size, masked)
+    return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
+
+
+def _result(
+    problem: Problem, state: State, template: Mesh, mean: Tensor, modes: Tensor, deltas: Tensor, sizes: Tensor
+) -> ImageFit:
+    coefficients, weights = state.coefficients[: len(modes)].float(), state.coefficients[len(modes) :].float()
+    rest = mean + torch.tensordot(coefficients, modes, dims=1)
+    shown = rest + torch.tensordot(weights, deltas, dims=1)
+    views = state.views
+    cameras = tuple(
+        Camera(K, R, t, int(width), int(height))
+        for K, R, t, (width, height) in zip(
+            views.intrinsics, views.rotation, views.translation, sizes.tolist(), strict=True
+        )
+    )
+    seen = views.pixels(problem.points.at(state.coefficients)[state.rows])
+    mesh = template.to("cpu")
+    return ImageFit(
+        mesh.with_vertices(rest),
+        mesh.with_vertices(shown),
+        coefficients,
+        weights,
+        cameras,
+        seen - problem.found,
+        seen,
+        state.noise,
+        covariance(problem, state),
+    )
+
+
+def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
+    """The rig's deltas (N,V,3) where the model's heads are, turned and scaled as they are."""
+    rest, deltas = rig.vertices.detach().cpu(), rig.deltas.detach().cpu()
+    if torch.allclose(rest, mean, atol=1e-3):
+        return deltas.float()
+    return similarity_transform(rest[None], mean[None]).apply_vectors(deltas).float()
+
+
+def _twins(names: Sequence[str]) -> Tensor:
+    """Pairs (K,2) of shapes that mirror each other; eyes look to one side together, so their shapes are none."""
+    twin = mirror(names)
+    first = [i for i, name in enumerate(names) if i < int(twin[i]) and not name.lower().startswith("eyelook")]
+    return torch.stack([torch.tensor(first, dtype=torch.int64), twin[first]], dim=1)
+
+
+def contour_curves(mean: Tensor, faces: Tensor, landmarks: Tensor) -> LevelCurves:
+    """Where the contour landmarks of a head (V,3) slide: over the skin, but not over the nose."""
+    x, y = mean[:, 0].abs(), mean[:, 1]
+    wing, top, bottom = float(x[landmarks[[31, 35]]].max()), float(y[landmarks[27]]), float(y[landmarks[33]])
+    nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
+    return level_curves(mean, faces[~nose[faces].any(1)], landmarks[:JAW])
+
+
+def _checked_pose(mean: Tensor, found: Tensor, intrinsics: Tensor) -> Pose:
+    """By the inner landmarks, which mean the same points whatever the pose."""
+    inner = torch.ones(LANDMARKS, dtype=torch.float64)
+    inner[:JAW] = 0
+    pose = solve_pnp(mean, found, intrinsics, inner)
+    marks = found[:, JAW:]
+    size = (marks - marks.nanmean(1, keepdim=True)).square().sum(-1).nanmean(1).sqrt()
+    turned = torch.rad2deg(torch.arccos((-pose.rotation[:, 2, 2]).clamp(-1, 1)))
+    for i in range(len(found)):  # a view at a time, for its message
+        share = float(pose.errors[i] / size[i])
+        if share > _UNLIKE:
+            raise AlignmentError(
+                f"landmarks: found view {i}'s {share:.0%} of their extent away from a face's, expected less than "
+                f"{_UNLIKE:.0%}; are they in iBUG's order of 68, x before y?"
+            )
+        if float(turned[i]) > _TURNED:
+            raise AlignmentError(
+                f"landmarks: found a face turned by {float(turned[i]):.0f}° in view {i}, as if seen from behind, "
+                f"expected at most {_TURNED:.0f}°; are left and right swapped, or is y up?"
+            )
+    return pose
+
+
+def _personal(rig: BlendshapeRig, deltas: Tensor, weights: Tensor, landmarks: Tensor, rest: Tensor) -> Tensor:
+    """The deltas (N,V,3) with those shapes that show at a landmark transferred to a head at rest (V,3)."""
+    shows = weights * deltas[:, landmarks].norm(dim=-1).amax(1) > _SHOWS
+    names = [name for name, shown in zip(rig.names, shows.tolist(), strict=True) if shown]
+    if not names:
+        return deltas
+    transferred = transfer_with_report(rig.select(names), rig.neutral.with_vertices(rest.to(rig.vertices)))
+    deltas = deltas.clone()
+    deltas[shows] = transferred.rig.deltas.cpu().float()
+    return deltas

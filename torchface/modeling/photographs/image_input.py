@@ -1,0 +1,136 @@
+"""What is asked of landmarks, pictures and lenses before a head is fitted to them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.photographs.image_solve import FitSettings
+from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
+from torchface.rig import BlendshapeRig
+
+_FEWEST = 6
+_FOCAL, _FOCAL_SPREAD = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
+_INSIDE = 0.5
+
+
+def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
+    """The landmark vertices (68,).
+
+    Raises:
+        TopologyError: model and rig have other triangles, or a vertex is none of theirs.
+        ValueRangeError: landmarks are known nowhere.
+        ShapeError: not (68,) int64.
+    """
+    faces = rig.neutral.faces
+    if len(model.shape.mean) != len(rig.vertices) or not torch.equal(model.faces.cpu(), faces.cpu()):
+        raise TopologyError(
+            f"fit_images: found a model of {len(model.shape.mean)} vertices and {len(model.faces)} triangles for a rig "
+            f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
+        )
+    if landmark_vertices is None:
+        known = rig.neutral.annotations
+        landmark_vertices = known.landmarks if known is not None and known.landmarks is not None else model.landmarks
+    if landmark_vertices is None:
+        raise ValueRangeError(
+            "landmark_vertices: found none, neither given nor annotated on rig or model; expected (68,) vertex ids"
+        )
+    if landmark_vertices.shape != (LANDMARKS,) or landmark_vertices.dtype != torch.int64:
+        raise ShapeError(
+            f"landmark_vertices: found {tuple(landmark_vertices.shape)} of {landmark_vertices.dtype}, expected "
+            f"({LANDMARKS},) of torch.int64"
+        )
+    if not 0 <= int(landmark_vertices.min()) <= int(landmark_vertices.max()) < len(rig.vertices):
+        raise TopologyError(
+            f"landmark_vertices: found {int(landmark_vertices.min())} to {int(landmark_vertices.max())}, expected 0 "
+            f"to {len(rig.vertices) - 1}"
+        )
+    return landmark_vertices.cpu()
+
+
+def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:
+    """The photographs' sizes, (I,2): width and height.
+
+    Raises:
+        ShapeError: not (I,68,2), or not one size for all or for each.
+        ValueRangeError: too few landmarks in a view, or landmarks outside its picture.
+    """
+    if landmarks.ndim != 3 or landmarks.shape[1:] != (LANDMARKS, 2) or len(landmarks) == 0:
+        raise ShapeError(
+            f"landmarks: found {tuple(landmarks.shape)}, expected (I,{LANDMARKS},2) with at least one view"
+        )
+    sizes = torch.as_tensor(image_size, dtype=torch.float64)
+    if sizes.shape not in ((2,), (len(landmarks), 2)) or not bool((sizes >= 2).all()):
+        raise ShapeError(
+            f"image_size: found {image_size}, expected (width, height) in pixels, once or for each of "
+            f"{len(landmarks)} views"
+        )
+    sizes = sizes.expand(len(landmarks), 2)
+    for i, (marks, size) in enumerate(zip(landmarks.double(), sizes, strict=True)):  # a view at a time, for its message
+        _check_view(i, marks.cpu(), size)
+    return sizes
+
+
+def check_images(images: Sequence[Tensor], sizes: Tensor) -> None:
+    """Refuses photographs of other sizes than (I,2)."""
+    found = [tuple(image.shape) for image in images]
+    expected = [(3, int(height), int(width)) for width, height in sizes.tolist()]
+    if found != expected:
+        raise ShapeError(f"images: found {found}, expected {expected}, as image_size says")
+
+
+def _check_view(i: int, marks: Tensor, size: Tensor) -> None:
+    seen = torch.isfinite(marks).all(-1)
+    picture = f"a picture of {int(size[0])} x {int(size[1])}"
+    if int(seen.sum()) == 0:
+        raise ValueRangeError(f"landmarks: found none in view {i}, expected at least {_FEWEST}; leave that view out")
+    if int(seen[JAW:].sum()) < _FEWEST:
+        raise ValueRangeError(
+            f"landmarks: found {int(seen[JAW:].sum())} on brows, eyes, nose and mouth in view {i}, expected at least "
+            f"{_FEWEST}"
+        )
+    low, high = marks[seen].amin(0), marks[seen].amax(0)
+    found = f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
+    if float((high - low).max()) < 4:
+        raise ValueRangeError(f"landmarks: found view {i}'s from {found}, expected pixels in {picture}")
+    inside = ((marks[seen] > -0.1 * size) & (marks[seen] < 1.1 * size)).all(-1)
+    if float(inside.double().mean()) < _INSIDE:
+        raise ValueRangeError(
+            f"landmarks: found view {i}'s from {found}, most of them outside {picture}; expected pixels of that picture"
+        )
+
+
+def lens(camera: float | Tensor | None, sizes: Tensor, settings: FitSettings) -> tuple[Tensor, FitSettings]:
+    """Intrinsics (I,3,3), and the settings with what is known of the focal length.
+
+    Raises:
+        ShapeError, ValueRangeError: as for ``camera`` in ``fit_images``.
+    """
+    count = len(sizes)
+    if isinstance(camera, Tensor) and camera.ndim > 0:
+        intrinsics = camera.detach().cpu().double()
+        if intrinsics.shape not in ((3, 3), (count, 3, 3)):
+            raise ShapeError(f"camera: found {tuple(camera.shape)}, expected (3,3) or ({count},3,3)")
+        if not torch.isfinite(intrinsics).all() or not bool((intrinsics[..., [0, 1], [0, 1]] > 0).all()):
+            raise ValueRangeError("camera: found a focal length that is not positive, expected K with positive ones")
+        return intrinsics.expand(count, 3, 3), settings
+    if camera is None:
+        focal = _FOCAL * sizes.amax(1)
+        if settings.focal_spread == 0:
+            settings = replace(settings, focal_spread=_FOCAL_SPREAD)
+        if not bool((sizes == sizes[0]).all()):  # other sizes, other cameras or crops
+            settings = replace(settings, shared_focal=False)
+    else:
+        focal = torch.full((count,), float(camera), dtype=torch.float64)
+        if not math.isfinite(float(camera)) or not float(camera) > 0:
+            raise ValueRangeError(f"camera: found a focal length of {float(camera):g}, expected positive pixels")
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
+    intrinsics[:, :2, 2] = (sizes - 1) / 2
+    return intrinsics, settings

@@ -1,0 +1,148 @@
+"""What landmarks in photographs tell of a linear face: where its points are seen, and what moves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pnp import pixel_jacobian
+from torchface.geometry.cameras.sliding_contour import LevelCurves, outermost
+from torchface.geometry.rotations import cross_matrix, rotation_matrix
+
+LANDMARKS = 68
+JAW = 17
+"""How many of the 68 landmarks trace the face's contour; they come first."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPoints:
+    """Points that follow D coefficients: the landmarks, and the curves that the contour's ones slide along.
+
+    Args:
+        mean: (P,3); the first 68 rows are the landmarks.
+        basis: what a unit of each coefficient adds, (D,P,3).
+        rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
+        valid: which of them count, (J,C) bool.
+        side: of the face, +1 toward positive x, (J,).
+    """
+
+    mean: Tensor
+    basis: Tensor
+    rows: Tensor
+    valid: Tensor
+    side: Tensor
+
+    @staticmethod
+    def of(mean: Tensor, modes: Tensor, landmarks: Tensor, curves: LevelCurves) -> LinearPoints:
+        """Those of a whole mesh: mean (V,3), modes (D,V,3), landmark vertices (68,)."""
+        stacked = torch.cat([mean[None], modes])
+        used, place = torch.cat([landmarks, curves.vertices.flatten()]).unique(return_inverse=True)
+        values = stacked[:, used].transpose(0, 1).double()
+        local = replace(curves, vertices=place[len(landmarks) :].reshape(curves.vertices.shape))
+        on_curves = local.interpolate(values).flatten(0, 1)
+        points = torch.cat([values[place[: len(landmarks)]], on_curves]).transpose(0, 1)
+        rows = len(landmarks) + torch.arange(curves.valid.numel()).reshape(curves.valid.shape)
+        return LinearPoints(points[0], points[1:], rows, curves.valid, curves.side)
+
+    def at(self, coefficients: Tensor) -> Tensor:
+        """Positions (P,3) at coefficients (D,)."""
+        return self.mean + torch.tensordot(coefficients, self.basis, dims=1)
+
+    def picked(self, rows: Tensor) -> PickedPoints:
+        """Those of rows (I,L)."""
+        return PickedPoints(self.mean[rows], self.basis.movedim(0, -1)[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class PickedPoints:
+    """The points that are landmarks in I views: mean (I,L,3) and basis (I,L,3,D)."""
+
+    mean: Tensor
+    basis: Tensor
+
+    def at(self, coefficients: Tensor) -> Tensor:
+        """Positions (I,L,3) at coefficients (D,)."""
+        return self.mean + self.basis @ coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """How I cameras stand: intrinsics (I,3,3), world to camera rotation (I,3,3) and translation (I,3)."""
+
+    intrinsics: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def moved(self, step: Tensor, focal_step: Tensor) -> Views:
+        """Turned and shifted by (I,6), with focal lengths longer by the factors exp of (I,)."""
+        focal = torch.stack([focal_step.exp(), focal_step.exp(), torch.ones_like(focal_step)], dim=-1)
+        scaled = self.intrinsics * torch.where(torch.eye(3, dtype=torch.bool), focal[:, :, None], 1.0)
+        return Views(scaled, rotation_matrix(step[:, :3]) @ self.rotation, self.translation + step[:, 3:])
+
+    def pixels(self, points: Tensor) -> Tensor:
+        """Where points (I,L,3) or (L,3) are seen, (I,L,2)."""
+        seen = points @ self.rotation.transpose(-1, -2) + self.translation[:, None]
+        image = seen @ self.intrinsics.transpose(-1, -2)
+        return image[..., :2] / image[..., 2:]
+
+
+def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slides: bool = True) -> Tensor:
+    """Which point each landmark is in each view, rows (I,68) into the points.
+
+    A contour landmark is the point of its curve that the view shows furthest out, away from the face's own vertical;
+    on the near side of a turned face that is the landmark's own vertex.
+    """
+    count = len(points.mean) - points.rows.numel()
+    rows = torch.arange(count).expand(len(views.rotation), -1).clone()
+    if slides:
+        at = points.at(coefficients)
+        seen = views.pixels(at[points.rows].flatten(0, 1)).unflatten(1, points.rows.shape)
+        up = views.rotation[:, :2, 1]
+        across = torch.nn.functional.normalize(torch.stack([-up[:, 1], up[:, 0]], dim=-1), dim=-1)
+        across = across * torch.where((across * views.rotation[:, :2, 0]).sum(-1) < 0, -1.0, 1.0)[:, None]
+        best = outermost(seen, points.valid, across[:, None] * points.side[:, None])
+        moved = best > 0
+        slid = points.rows[torch.arange(len(points.rows)), best]
+        rows[:, : len(points.rows)] = torch.where(moved, slid, rows[:, : len(points.rows)])
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Residuals of I views with L landmarks, whitened, and their derivatives.
+
+    Args:
+        residual: seen minus found, (I,L,2).
+        by_coefficients: (I,L,2,D).
+        by_camera: by rotation and translation, (I,L,2,6).
+        by_focal: by the focal length's logarithm, (I,L,2).
+    """
+
+    residual: Tensor
+    by_coefficients: Tensor
+    by_camera: Tensor
+    by_focal: Tensor
+
+
+def linearised(
+    points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor
+) -> Linearised:
+    """At landmarks found (I,L,2) whose errors ``whitening`` (I,L,2,2) makes unit and independent."""
+    turned = points.at(coefficients) @ views.rotation.transpose(-1, -2)
+    pixels, by_place = pixel_jacobian(turned + views.translation[:, None], views.intrinsics)
+    by_place = whitening @ by_place
+    by_world = by_place @ views.rotation[:, None]
+    return Linearised(
+        (whitening @ (pixels - found)[..., None])[..., 0],
+        by_world @ points.basis,
+        torch.cat([by_place @ -cross_matrix(turned), by_place], dim=-1),
+        (whitening @ (pixels - views.intrinsics[:, None, :2, 2])[..., None])[..., 0],
+    )
+
+
+def residuals(points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor) -> Tensor:
+    """The residuals of ``linearised`` alone, (I,L,2)."""
+    pixels = views.pixels(points.at(coefficients))
+    return (whitening @ (pixels - found)[..., None])[..., 0]

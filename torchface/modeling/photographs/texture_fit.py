@@ -1,0 +1,156 @@
+"""A colour model fitted to photographs: the thesis's colour error over the skin that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.mesh import Mesh
+from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.optim import box_qp
+from torchface.rendering.camera_visibility import shown_in
+from torchface.rendering.raycast import RayCaster
+
+_SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with what stands behind
+_LEAST_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
+_FEWEST = 50
+_LIGHT_PRIOR = 1.0
+_ROUNDS, _DONE = 30, 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ColorFit:
+    """What a colour model tells of I photographs.
+
+    Args:
+        coefficients: (L,), standard deviations.
+        colors: of the vertices under even light, (V,3) in [0,1].
+        light: of each photograph's channels: ambient, then along x, y, z of the normal, (I,3,4); even light of
+            strength 1 is (1,0,0,0).
+        error: mean Euclidean colour distance at visible vertices, (I,).
+    """
+
+    coefficients: Tensor
+    colors: Tensor
+    light: Tensor
+    error: Tensor
+
+
+def fit_colors(
+    model: MorphableModel,
+    mesh: Mesh,
+    images: Sequence[Tensor],
+    cameras: Sequence[Camera],
+    lighting: bool = True,
+    bound: float = 3.0,
+    prior: float = 0.1,
+) -> ColorFit:
+    r"""The coefficients of a colour model under which a head looks as its photographs do.
+
+    .. math:: E_T = \frac1n \sum_v \lVert L_i(n_v)\, C_v(b) - c_{iv} \rVert, \quad |b| \le 3
+
+    over the vertices that each photograph shows: distances, not their squares, so that a highlight, a strand of hair
+    or a shadow counts little. Solved by reweighted least squares, each step a quadratic program in a box. The light L
+    is the thesis's missing part: per channel an ambient and a directed share; without it photographs must be lit
+    evenly.
+
+    Args:
+        model: of vertex colours.
+        mesh: the head as the photographs show it.
+        images: photographs, (3,H,W) each.
+        cameras: one each.
+        lighting: estimate each photograph's light.
+        bound: on each coefficient, standard deviations.
+        prior: weight of the model's own distribution beside one vertex at a colour error of 0.05.
+
+    Raises:
+        ShapeError: not one camera an image, or a picture of another size than its camera's.
+        TopologyError: the model has other vertices than the mesh.
+        AlignmentError: a photograph shows next to nothing of the head.
+
+    Source: thesis 3.2.5, algorithm 3, equation 16.
+    """
+    if len(images) != len(cameras) or not images:
+        raise ShapeError(f"fit_colors: found {len(images)} images and {len(cameras)} cameras, expected one each")
+    if model.mean.shape != mesh.vertices.shape:
+        raise TopologyError(
+            f"fit_colors: found a model of {tuple(model.mean.shape)} for a mesh of {len(mesh.vertices)} vertices"
+        )
+    if not bound > 0 or not prior >= 0:
+        raise ValueRangeError(f"fit_colors: found bound {bound} and prior {prior}, expected positive numbers")
+    views = _shown_vertices(mesh, images, cameras)
+    mean, modes = model.mean.cpu().double(), model.modes.cpu().double()
+    coefficients = torch.zeros(len(modes), dtype=torch.float64)
+    light = torch.zeros(len(views), 3, 4, dtype=torch.float64)
+    light[..., 0] = 1.0
+    strength = prior / 0.05
+    before = torch.inf
+    for _ in range(_ROUNDS):
+        H, f, total = strength * torch.eye(len(modes), dtype=torch.float64), torch.zeros_like(coefficients), 0.0
+        for i, view in enumerate(views):  # photographs: each shows other vertices
+            albedo = mean[view.ids] + torch.einsum("l,lvc->vc", coefficients, modes[:, view.ids])
+            shade = view.basis @ light[i].T
+            weight = view.share / (albedo * shade - view.colors).norm(dim=-1).clamp(min=_LEAST_ERROR)
+            if lighting:
+                light[i] = _light(albedo, view, weight)
+                shade = view.basis @ light[i].T
+            A = (modes[:, view.ids] * shade).flatten(1)
+            b = (mean[view.ids] * shade - view.colors).flatten()
+            w = weight.repeat_interleave(3)
+            H, f = H + (A * w) @ A.T, f + (A * w) @ b
+            total += float((view.share * (albedo * shade - view.colors).norm(dim=-1)).sum())
+        coefficients = box_qp(H, f[None], -bound, bound, start=coefficients[None])[0]
+        energy = total + 0.5 * strength * float(coefficients.square().sum())
+        if abs(before - energy) < _DONE * energy:
+            break
+        before = energy
+    colors = mean + torch.einsum("l,lvc->vc", coefficients, modes)
+    errors = [
+        (view.share * (colors[view.ids] * (view.basis @ lit.T) - view.colors).norm(dim=-1)).sum() / view.share.sum()
+        for view, lit in zip(views, light, strict=True)
+    ]
+    return ColorFit(coefficients.float(), colors.clamp(0, 1).float(), light.float(), torch.stack(errors).float())
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The vertices (Q,) that a photograph shows: colours (Q,3), 1 and the normal (Q,4), how squarely (Q,)."""
+
+    ids: Tensor
+    colors: Tensor
+    basis: Tensor
+    share: Tensor
+
+
+def _shown_vertices(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) -> list[_View]:
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    normals = vertex_normals(vertices, faces)
+    caster = RayCaster(vertices, faces)
+    views = []
+    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        shown = shown_in(image.cpu(), camera, caster, vertices, normals)
+        ids = (shown.cosine > _SQUARELY).nonzero()[:, 0]
+        if len(ids) < _FEWEST:
+            raise AlignmentError(
+                f"images: found {len(ids)} of {len(vertices)} vertices in view {i}, expected at least {_FEWEST}; "
+                "does the camera see the head?"
+            )
+        basis = torch.cat([torch.ones(len(ids), 1, dtype=torch.float64), normals[ids]], dim=1)
+        views.append(_View(ids, shown.colors[ids].double(), basis, shown.cosine[ids]))
+    return views
+
+
+def _light(albedo: Tensor, view: _View, weight: Tensor) -> Tensor:
+    """Of each channel, (3,4), by weighted least squares; held a little to even light of strength 1."""
+    X = albedo.T[:, :, None] * view.basis
+    H = torch.einsum("q,cqi,cqj->cij", weight, X, X)
+    g = torch.einsum("q,cqi,qc->ci", weight, X, view.colors)
+    even = torch.zeros(4, dtype=torch.float64)
+    even[0] = 1.0
+    return torch.linalg.solve(H + _LIGHT_PRIOR * torch.eye(4, dtype=torch.float64), g + _LIGHT_PRIOR * even)

@@ -1,0 +1,244 @@
+"""Photographs as a head's texture: blended by viewing angle, seams hidden, completed where none shows the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import border_vertices, components, edges, vertex_normals
+from torchface.geometry.meshes.uv_margin import laid_out
+from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.geometry.meshes.vertex_graph import VertexGraph
+from torchface.mesh import Mesh
+from torchface.rendering.camera_visibility import Shown, shown_in
+from torchface.rendering.raycast import RayCaster
+
+_SQUARELY = 0.2
+_TRUSTED = 0.5
+_SHARP = 3.0
+_FEATHER, _BROAD, _FILL = 6, 60, 400
+_TYPICAL, _SPARSE = 0.15, 0.05
+_LOST, _LOST_AT_MASK = 0.004, 0.01  # a ring of vertices, of what the edge knows
+_MOST_GAIN = 4.0
+_DARK, _MOST_TONE = 0.05, 0.5
+_NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoTexture:
+    """A texture made of photographs.
+
+    Args:
+        image: (3,size,size), first row on top.
+        colors: of the vertices, (V,3).
+        seen: how much of each vertex's colour comes from photographs, (V,) in [0,1].
+    """
+
+    image: Tensor
+    colors: Tensor
+    seen: Tensor
+
+
+def photo_texture(
+    mesh: Mesh,
+    images: Sequence[Tensor],
+    cameras: Sequence[Camera],
+    size: int = 1024,
+    base: Tensor | None = None,
+    trust: Tensor | None = None,
+) -> PhotoTexture:
+    """Lays photographs on a head.
+
+    Each texel takes the photographs that see it, the squarest most. Weights are made on the vertices and fade out over
+    the mesh before a photograph ends, so that no edge of one shows, also not where the layout is cut. What photographs
+    differ in broadly (exposure, white balance, shading) is brought to their mean, detail is kept from the squarest.
+    Where none shows the skin, the mirror image of the other side is taken, then the base; both are toned to what is
+    next to them.
+
+    Args:
+        mesh: the head as the photographs show it, with texture coordinates.
+        images: photographs, (3,H,W) each.
+        cameras: one each.
+        size: texels a side.
+        base: colours for what no photograph shows, (V,3), such as ``fit_colors`` gives; those nearby if absent.
+        trust: how far each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
+            everywhere if absent.
+
+    Raises:
+        ShapeError: not one camera an image, a picture of another size than its camera's, or a base of another shape.
+        TopologyError: the mesh has no texture coordinates.
+        AlignmentError: no photograph shows the head.
+
+    Source: thesis 3.2.5, algorithm 3; Burt and Adelson 1983 (bands blended apart).
+    """
+    if len(images) != len(cameras) or not images:
+        raise ShapeError(f"photo_texture: found {len(images)} images and {len(cameras)} cameras, expected one each")
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("photo_texture: found a mesh without texture coordinates, expected some to lay it out in")
+    if base is not None and base.shape != mesh.vertices.shape:
+        raise ShapeError(f"base: found {tuple(base.shape)}, expected {tuple(mesh.vertices.shape)}")
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    normals, caster, graph = (
+        vertex_normals(vertices, faces),
+        RayCaster(vertices, faces),
+        VertexGraph(faces, len(vertices)),
+    )
+    at_vertices = [
+        shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
+    ]
+    outside = _outer_border(vertices, faces)
+    trusted = torch.ones(len(images), len(vertices), dtype=torch.float64) if trust is None else trust.cpu().double()
+    weights = torch.stack([
+        _squareness(shown) * _inside((shown.cosine > _SQUARELY) & (one >= _TRUSTED) & ~outside, graph)
+        for shown, one in zip(at_vertices, trusted, strict=True)
+    ])  # fmt: skip
+    soft = torch.stack([_feathered((one >= _TRUSTED).double(), graph) for one in trusted]).amax(0)
+    seen = weights.sum(0)
+    if float(seen.max()) <= 0:
+        raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
+    gains = _gains(at_vertices, weights)
+    toned = [shown.colors.double() * gain for shown, gain in zip(at_vertices, gains, strict=True)]
+    blended, offsets = _blended(toned, weights, graph)
+    alpha = (seen / 0.05).clamp(max=1) * soft
+    filled = _filled(mesh, blended, alpha, base, graph, trust is not None)
+    colors = torch.lerp(filled, blended, alpha[:, None])
+    texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
+    points = texels.interpolate(vertices, faces)
+    outward = torch.nn.functional.normalize(texels.interpolate(normals, faces), dim=-1)
+    total = torch.zeros(len(points), 1, dtype=torch.float64)
+    values = torch.zeros(len(points), 3, dtype=torch.float64)
+    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):  # photographs: a ray a texel each
+        shown = shown_in(image.cpu(), camera, caster, points, outward)
+        weight = texels.interpolate(weights[i, :, None], faces) * (shown.cosine[:, None] > 0)
+        tone = texels.interpolate(offsets[i], faces)
+        values += weight * (shown.colors.double() * gains[i] + tone)
+        total += weight
+    under = texels.interpolate(filled, faces)
+    share = (total / 0.05).clamp(max=1) * texels.interpolate(soft[:, None], faces)
+    values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
+    return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
+
+
+def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
+    """The vertices (V,) of the widest opening, where the mesh ends but the person does not."""
+    border = border_vertices(faces, len(vertices))
+    along = edges(faces)
+    label = components(along[border[along].all(1)][:, [0, 1, 1]], len(vertices))
+    result = torch.zeros(len(vertices), dtype=torch.bool)
+    names = label[border].unique()
+    if len(names):
+        widths = [float((vertices[label == k].amax(0) - vertices[label == k].amin(0)).norm()) for k in names]
+        result = (label == names[int(torch.tensor(widths).argmax())]) & border
+    return result
+
+
+def _squareness(shown: Shown) -> Tensor:
+    """How squarely a photograph sees each vertex, (V,) in [0,1]."""
+    return ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
+
+
+def _inside(shown: Tensor, graph: VertexGraph) -> Tensor:
+    """1 well inside what a photograph shows of the head (V,) bool, falling to 0 before it ends."""
+    inner = shown.double()
+    for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is off
+        inner = graph.least(inner)
+    return _feathered(inner, graph)
+
+
+def _feathered(inner: Tensor, graph: VertexGraph) -> Tensor:
+    """What is 1 (V,), falling to 0 before it ends."""
+    soft = inner
+    for _ in range(_FEATHER):
+        soft = torch.minimum(inner, 0.5 * (soft + graph.sum(soft[:, None])[:, 0] / graph.degree))
+    return soft
+
+
+def _gains(shown: Sequence[Shown], weights: Tensor) -> Tensor:
+    """What each photograph's channels are multiplied by so that they agree where they overlap, (I,3)."""
+    count = len(shown)
+    logs = torch.stack([one.colors.double().clamp(0.02, 0.98).log() for one in shown])
+    H = torch.full((count, count), 1e-6, dtype=torch.float64) + 1e-6 * torch.eye(count, dtype=torch.float64)
+    g = torch.zeros(count, 3, dtype=torch.float64)
+    for i in range(count):  # pairs of photographs
+        for j in range(i):
+            both = (weights[i] * weights[j]).sqrt()
+            if float(both.sum()) < 1e-6:
+                continue
+            ratio = logs[i] - logs[j]
+            middle = ratio[both > 0].median(0).values
+            trust = both * (1 / (1 + ((ratio - middle) / 0.2).square().sum(-1)))
+            step = (trust[:, None] * ratio).sum(0) / trust.sum()
+            strength = trust.sum()
+            H[i, i] += strength
+            H[j, j] += strength
+            H[i, j] -= strength
+            H[j, i] -= strength
+            g[i] -= strength * step
+            g[j] += strength * step
+    return torch.linalg.solve(H, g).exp().clamp(1 / _MOST_GAIN, _MOST_GAIN)
+
+
+def _blended(toned: Sequence[Tensor], weights: Tensor, graph: VertexGraph) -> tuple[Tensor, Tensor]:
+    """The vertices' colours (V,3), and what brings each photograph's broad tone to the mean, (I,V,3)."""
+    colors = torch.stack(list(toned))
+    mean = (weights[..., None] * colors).sum(0) / weights.sum(0).clamp(min=1e-12)[:, None]
+    offsets = torch.stack([
+        graph.smoothed(mean - color, weight, _BROAD) for color, weight in zip(colors, weights, strict=True)
+    ])  # fmt: skip
+    corrected = (weights[..., None] * (colors + offsets)).sum(0) / weights.sum(0).clamp(min=1e-12)[:, None]
+    return corrected, offsets
+
+
+def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, graph: VertexGraph, masked: bool) -> Tensor:
+    """Colours (V,3) where no photograph shows the skin: the mirror image, the base, else what is nearest, toned.
+
+    What is nearest is the pixel at the edge where the photograph ends, and a broad mean where a mask ends it.
+    """
+    known, guess = alpha.clone(), colors * alpha[:, None]
+    mirror = None if mesh.annotations is None else mesh.annotations.mirror
+    if mirror is not None:
+        there = alpha[mirror.cpu()]
+        other = colors[mirror.cpu()]
+        # The other side stands in other light, in one factor: channels apart would tint what is dark.
+        other = _toned(other, colors, alpha * there, graph, _BROAD, apart=False)
+        guess = guess + ((1 - alpha) * there)[:, None] * other
+        known = known + (1 - alpha) * there
+    if base is not None:
+        under = base.detach().cpu().double()
+        # The tone at the edge of what is known counts, not that of the face as a whole.
+        edge = graph.smoothed(1 - known[:, None], torch.ones_like(known), _FEATHER)[:, 0]
+        told = guess / known.clamp(min=1e-9)[:, None]
+        return guess + (1 - known)[:, None] * _toned(under, told, known * (edge + 1e-3), graph, _FILL)
+    mean = (
+        colors[alpha > 0.5].median(0).values
+        if bool((alpha > 0.5).any())
+        else (guess * alpha[:, None]).sum(0) / alpha.sum()
+    )
+    label = components(mesh.faces.cpu(), len(alpha))
+    shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
+    mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
+    fixed = (known > 0.5)[:, None]
+    told = guess / known.clamp(min=0.5)[:, None]
+    if masked:  # lips, brows and what the edge still shows of hair do not spread
+        typical = known * torch.exp(-0.5 * ((told - mean) / _TYPICAL).square().sum(-1))
+        weight = graph.smoothed(typical[:, None], torch.ones_like(known), _BROAD)
+        told = torch.lerp(mean, graph.smoothed(told, typical, _BROAD), weight / (weight + _SPARSE))
+    under = torch.where(fixed, told, mean)
+    lost = _LOST_AT_MASK if masked else _LOST
+    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known; behind a mask it is lost
+        under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
+    return guess + (1 - known)[:, None] * under
+
+
+def _toned(
+    colors: Tensor, goal: Tensor, weights: Tensor, graph: VertexGraph, rounds: int, apart: bool = True
+) -> Tensor:
+    """Colours (V,3) times what makes them as bright as a goal where weights (V,) compare them, carried on beyond."""
+    ratio = goal.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()
+    ratio = ratio if apart else ratio.mean(-1, keepdim=True)
+    return colors * graph.smoothed(ratio, weights, rounds).clamp(-_MOST_TONE, _MOST_TONE).exp()

@@ -1,0 +1,1 @@
+"""A personal rig: deformation transfer, examples, the regression from neutral to expressions, parts behind the skin."""

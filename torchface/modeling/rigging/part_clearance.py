@@ -1,0 +1,156 @@
+"""Shapes in which no part of a head comes through the skin: shells give way to the lids, skin gives way to bone."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import triangle_normals
+from torchface.modeling.rigging.penetration import InnerParts
+from torchface.rig import BlendshapeRig
+
+_BONE_MARGIN, _SHELL_MARGIN = 0.15, 0.5
+_ALLOWED = 0.1
+_ROUNDS = 6
+_LONGEST_STEP = 2.0
+_SHELL_REACH, _SKIN_REACH = 2.0, 4.0
+_STILL = 0.01
+_LIFTED, _DEEPEST = 0.3, 3.0
+_MIXED_POSES, _MIXED, _WEAKEST, _STRONGEST = 32, 3, 0.3, 0.9
+_MOVES, _BESIDE = 1.5, 3.0
+
+
+def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = None) -> BlendshapeRig:
+    """The rig with deltas in which parts stay behind the skin.
+
+    What has come through goes back along the line to the middle of its group: a shell of the eye moves itself, with
+    its neighbourhood, and also leaves the slot between lids that close; before teeth, gums and eyeballs, which are
+    hard, the skin moves out. What a pose asks for is shared by its shapes according to their weights. Vertices that a
+    shape leaves still stay still in it, and shapes in which nothing comes through keep their deltas bit by bit.
+
+    Args:
+        rig: N shapes, V vertices.
+        parts: of a head in the rig's topology; see ``inner_parts``.
+        poses: weights to look at, (K,N), in this order; every shape by itself and mixtures of the shapes that move the
+            skin before the eyes if absent.
+    """
+    poses = clearance_poses(rig, parts) if poses is None else poses
+    rest, deltas = rig.vertices.detach().cpu().double(), rig.deltas.detach().cpu().double().clone()
+    moving = deltas.norm(dim=-1) > _STILL
+    clearance = Clearance(rest, parts)
+    changed = _cleared(deltas, moving, poses.double(), clearance)
+    # What mixtures ask of a shape may bring parts out again in its own pose.
+    again = torch.eye(len(deltas), dtype=torch.float64)[changed]
+    changed |= _cleared(deltas, moving, again, clearance)
+    whole = rig.deltas.detach().clone()
+    whole[changed.to(whole.device)] = deltas[changed].to(whole)
+    return BlendshapeRig(rig.neutral, whole, rig.names) if bool(changed.any()) else rig
+
+
+def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance) -> Tensor:
+    """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool."""
+    changed = torch.zeros(len(deltas), dtype=torch.bool)
+    for weights in poses:  # what one pose changes, the next one starts from
+        active = weights.nonzero()[:, 0]
+        pose = clearance.rest + torch.tensordot(weights[active], deltas[active], dims=1)
+        step = clearance.step(pose, closing=len(active) == 1)
+        ids = step.abs().amax(1).nonzero()[:, 0]
+        if len(ids) == 0:
+            continue
+        part = weights[active, None] * moving[active][:, ids]
+        share = part / part.square().sum(0).clamp(min=1e-9)
+        deltas[active[:, None], ids] += share[..., None] * step[ids]
+        changed[active] |= part.any(1)
+    return changed
+
+
+def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
+    """Every shape at weight 1, then random mixtures of three of those that move the skin before each small group.
+
+    Groups do not know each other: one pose mixes shapes for all of them. The largest group, the mouth, is left out:
+    lips part where they are mixed, and so many of them do that no few mixtures stand for all.
+
+    Returns:
+        Weights (K,N).
+    """
+    count = len(rig.names)
+    deltas = rig.deltas.detach().cpu().double()
+    points = rig.vertices.detach().cpu().double()
+    skin = parts.skin.unique()
+    generator = torch.Generator().manual_seed(0)
+    mixed = torch.zeros(_MIXED_POSES, count, dtype=torch.float64)
+    sizes = parts.group.bincount()
+    for group in sizes.argsort()[:-1].tolist() if len(sizes) > 1 else []:  # two eyes
+        own = cKDTree(points[parts.vertices[parts.group == group]].numpy())
+        beside = skin[torch.from_numpy(own.query(points[skin].numpy(), distance_upper_bound=_BESIDE)[0] < _BESIDE)]
+        motion = deltas[:, beside].norm(dim=-1).amax(1) if len(beside) else torch.zeros(count)
+        movers = motion.argsort(descending=True)[: int((motion > _MOVES).sum())]
+        if len(movers) < 2:
+            continue
+        for number, row in enumerate(mixed):  # each draws shapes of its own, every other with the strongest, a blink
+            others = 1 + torch.randperm(len(movers) - 1, generator=generator)
+            drawn = movers[torch.cat([torch.zeros(1 - number % 2, dtype=torch.int64), others])[:_MIXED]]
+            strength = torch.rand(len(drawn), generator=generator, dtype=torch.float64)
+            row[drawn] = _WEAKEST + (_STRONGEST - _WEAKEST) * strength
+    return torch.cat([torch.eye(count, dtype=torch.float64), mixed[mixed.any(1)]])
+
+
+class Clearance:
+    """What may give way in a head: the shells' vertices and the skin near the parts."""
+
+    def __init__(self, rest: Tensor, parts: InnerParts) -> None:
+        self.rest, self.parts, self.hard = rest, parts, parts.hard
+        self.skin = parts.skin.unique()
+        self.shells = parts.vertices[~parts.hard]
+        self.height_at_rest = self._height(rest)
+
+    def step(self, pose: Tensor, closing: bool) -> Tensor:
+        """How far each vertex of a pose (V,3) has to go, (V,3); ``closing``: lids may close."""
+        parts, start = self.parts, pose
+        if closing and len(self.shells):
+            pose = self._shells_on_bone(pose)
+        for _ in range(_ROUNDS):
+            standing = parts.standing(pose)
+            through = standing.depth > _ALLOWED
+            if not through.any():
+                break
+            pose = pose.clone()
+            normals = triangle_normals(pose, parts.skin)[standing.triangle]
+            margin = torch.where(self.hard, _BONE_MARGIN, _SHELL_MARGIN)
+            back = normals * (standing.depth + margin).clamp(max=_LONGEST_STEP)[:, None]
+            shells, bones = through & ~self.hard, through & self.hard
+            if bones.any():
+                met = pose[parts.vertices[bones]] - standing.way[bones, None] * standing.outward[bones]
+                pose[self.skin] += _spread(pose[self.skin], met, back[bones], _SKIN_REACH)
+            if shells.any():
+                at = pose[parts.vertices[shells]]
+                pose[self.shells] -= _spread(pose[self.shells], at, back[shells], _SHELL_REACH)
+        return pose - start
+
+    def _shells_on_bone(self, pose: Tensor) -> Tensor:
+        """Shells that closing lids squeeze off the eyeball give way below them instead, as far as they were lifted."""
+        lifted = self._height(pose) - self.height_at_rest
+        group = self.parts.group[~self.hard]
+        closing = torch.zeros(len(group), dtype=torch.bool)
+        for one in group.unique().tolist():  # two eyes
+            closing |= (group == one) & (lifted[group == one].median() > _LIFTED)
+        sink = torch.where(closing, 2 * lifted, 0.0).clamp(0, _DEEPEST)
+        pose = pose.clone()
+        pose[self.shells] -= sink[:, None] * self._outward(pose)
+        return pose
+
+    def _height(self, pose: Tensor) -> Tensor:
+        """How far each shell's vertex is from the middle of its group, (S,)."""
+        return (pose[self.shells] - self.parts.middles(pose)[self.parts.group[~self.hard]]).norm(dim=-1)
+
+    def _outward(self, pose: Tensor) -> Tensor:
+        away = pose[self.shells] - self.parts.middles(pose)[self.parts.group[~self.hard]]
+        return torch.nn.functional.normalize(away, dim=-1)
+
+
+def _spread(points: Tensor, at: Tensor, steps: Tensor, reach: float) -> Tensor:
+    """What steps (K,3) at some places (K,3) mean for points (n,3): that of the nearest place, less with distance."""
+    distance, nearest = torch.cdist(points, at).min(1)
+    share = torch.exp(-((distance / reach) ** 2))
+    return torch.where(share > 0.01, share, 0.0)[:, None] * steps[nearest]

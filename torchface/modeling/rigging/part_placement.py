@@ -1,0 +1,147 @@
+"""The parts inside a head put where they belong in a new one: eyeballs behind its lids, teeth behind its lips."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import triangle_normals
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.mesh import Mesh
+from torchface.modeling.rigging.part_clearance import Clearance
+from torchface.modeling.rigging.penetration import InnerParts
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
+
+_THIN, _THICKER, _FEWEST = 0.05, 4.0, 20
+_ROUNDS = 8
+_SAYS = 60.0
+_FAR, _LARGER = 2.0, 0.03
+_FACING = 0.6
+_OUTLIER, _LARGEST_CHANGE = 2.0, 0.1
+_HOSTS = 8
+_HIGHEST, _LOWEST = 1.0, 0.2
+_NOTHING = 1e-3
+
+
+def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Mesh:
+    r"""A head at rest with the template's parts fitted into it, whatever places they had.
+
+    Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: that of
+    the skin around them, then the shift :math:`\tau` and the growth :math:`\sigma` that give the skin before each
+    vertex p the thickness :math:`t_p` it has in the template, measured from the group's middle outward,
+
+    .. math:: \min_{\tau,\sigma} \sum_p w_p (t'_p(\tau,\sigma) - t_p)^2
+        + \lambda_\tau |\tau|^2 + \lambda_\sigma \sigma^2.
+
+    Shells and lashes follow the nearest skin; shells keep the height over the eyeball that they have in the template.
+    What is left of parts before the skin is cleared as in ``clear_parts``.
+
+    Args:
+        template: the rig whose neutral has every part in place.
+        neutral: a head of the same topology, millimetres, turned as the template is; a registered scan shows none of
+            its parts.
+        parts: of the template; see ``inner_parts``.
+
+    Returns:
+        The head with other places for what is not its largest connected part, and for skin that parts came through.
+    """
+    rest = template.vertices.detach().cpu().double()
+    found = neutral.vertices.detach().cpu().double()
+    body = (parts.label == parts.body).nonzero()[:, 0]
+    whole = similarity_transform(rest[None, body], found[None, body])
+    laid = whole.apply(rest[None])[0]
+    placed = _following(laid, found, parts, body)
+    for group in parts.group.unique().tolist():  # one mouth, two eyes
+        own = parts.group == group
+        bones = parts.vertices[own & parts.hard]
+        if len(bones) == 0:
+            continue
+        fitted = _fitted(laid, found, bones, parts)
+        placed[bones] = fitted.apply(laid[None, bones])[0]
+        shells = parts.vertices[own & ~parts.hard]
+        middle = placed[bones].mean(0)
+        height = fitted.scale[0] * (laid[shells] - laid[bones].mean(0)).norm(dim=-1)
+        away = placed[shells] - middle
+        kept = away.norm(dim=-1).clamp(height - _LOWEST, height + _HIGHEST)
+        placed[shells] = middle + torch.nn.functional.normalize(away, dim=-1) * kept[:, None]
+    placed = placed + Clearance(placed, parts).step(placed, closing=False)
+    if float((placed - found).abs().max()) < _NOTHING:
+        return neutral
+    return neutral.with_vertices(placed.to(neutral.vertices))
+
+
+def _following(laid: Tensor, found: Tensor, parts: InnerParts, body: Tensor) -> Tensor:
+    """Every part carried along by the body's nearest vertices."""
+    placed = found.clone()
+    rest = (parts.label != parts.body).nonzero()[:, 0]
+    if len(rest) == 0:
+        return placed
+    distance, nearest = cKDTree(laid[body].numpy()).query(laid[rest].numpy(), k=min(_HOSTS, len(body)))
+    distances = torch.from_numpy(distance).view(len(rest), -1)
+    hosts = body[torch.from_numpy(nearest).view(len(rest), -1)]
+    weights = 1 / (distances + 0.1 * distances.amax(1, keepdim=True) + 1e-6) ** 2
+    weights = weights / weights.sum(1, keepdim=True)
+    placed[rest] = laid[rest] + ((found - laid)[hosts] * weights[..., None]).sum(1)
+    return placed
+
+
+def _fitted(laid: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Similarity:
+    """The similarity that takes a group's hard parts from where the template laid on the head has them."""
+    middle = laid[bones].mean(0)
+    wanted = _SkinBefore.of(laid, parts.skin, middle, laid[bones])
+    thin = wanted.thickness[wanted.met].clamp(min=0)
+    use = wanted.met & (wanted.thickness < (float(thin.quantile(_THIN)) if len(thin) else 0.0) + _THICKER)
+    around = parts.skin[wanted.triangle[use]].unique()
+    if len(around) < _FEWEST:
+        around = parts.skin.unique()
+    # Lids alone say little of how a head is turned and how large an eyeball is: it is turned as the whole head is.
+    local = similarity_transform(laid[None, around], found[None, around])
+    size = float(local.scale[0].clamp(1 - _LARGEST_CHANGE, 1 + _LARGEST_CHANGE))
+    centre = found[around].mean(0) + size * (middle - laid[around].mean(0))
+    offsets = size * (laid[bones[use]] - middle)
+    state = torch.zeros(4, dtype=torch.float64)
+    prior = torch.tensor([1 / _FAR**2] * 3 + [1 / _LARGER**2], dtype=torch.float64)
+    for _ in range(_ROUNDS if bool(use.any()) else 0):
+        now = centre + state[:3] + (1 + state[3]) * offsets
+        have = _SkinBefore.of(found, parts.skin, centre + state[:3], now)
+        error = torch.where(have.met, have.thickness - wanted.thickness[use], 0.0)
+        says = have.met / (1 + (error / _OUTLIER) ** 2)
+        says = says * (_SAYS / max(float(says.sum()), _SAYS))
+        rows = torch.cat([have.across, offsets.norm(dim=-1)[:, None]], dim=1)
+        system = rows.T @ (says[:, None] * rows) + prior.diag()
+        state = state + torch.linalg.solve(system, rows.T @ (says * error) - prior * state)
+    scale = torch.tensor([size * (1 + float(state[3]))], dtype=torch.float64)
+    turned = torch.eye(3, dtype=torch.float64)[None]
+    return Similarity(scale, turned, (centre + state[:3] - scale * middle)[None])
+
+
+@dataclass(frozen=True, eq=False)
+class _SkinBefore:
+    """The skin before points (n,3), seen from a middle.
+
+    Args:
+        met: whether there is any, and looks the same way, (n,) bool.
+        thickness: how far it lies before each point, (n,), negative behind.
+        triangle: which, (n,) int64.
+        across: how much thinner it gets as the middle and the point move, (n,3).
+    """
+
+    met: Tensor
+    thickness: Tensor
+    triangle: Tensor
+    across: Tensor
+
+    @staticmethod
+    def of(vertices: Tensor, skin: Tensor, middle: Tensor, points: Tensor) -> _SkinBefore:
+        far = (points - middle).norm(dim=-1)
+        ways = (points - middle) / far.clamp(min=1e-9)[:, None]
+        hits = RayCaster(vertices, skin).cast(middle.expand_as(points), ways)
+        normals = triangle_normals(vertices, skin)[hits.triangle]
+        facing = (normals * ways).sum(-1)
+        met = (hits.triangle >= 0) & (facing > _FACING)
+        thickness = torch.where(met, hits.distance - far, 0.0)
+        return _SkinBefore(met, thickness, hits.triangle, normals / facing.clamp(min=_FACING)[:, None])

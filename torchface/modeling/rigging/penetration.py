@@ -1,0 +1,191 @@
+"""How far the parts inside a head (teeth, gums, eyeballs, shells of the eye) stand out of its skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import components, triangle_normals, vertex_normals
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.mesh import Mesh
+from torchface.modeling.rigging.rigid_parts import is_rigid
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
+
+TOLERANCE = 0.2
+"""Millimetres; a vertex that stands out of the skin by less is not seen."""
+
+_LIFT = 0.05
+_RAYS = 24
+_OPENING = 30.0
+_OPEN_SKIN = 0.15
+_HAIR = ("lash", "brow", "hair", "beard")
+_BEFORE_THE_SKIN = 0.42
+_TOUCHING = 2.0
+_NEAR = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Where parts stand to the skin in a pose.
+
+    Args:
+        depth: how far each vertex of a part stands out, (P,), millimetres; 0 where it does not.
+        outward: unit directions from the middle of its group through each vertex, (P,3).
+        triangle: row of ``InnerParts.skin`` that each vertex has come through, (P,) int64; -1 where it has not.
+        way: how far along ``outward`` that triangle lies behind the vertex, (P,), millimetres.
+    """
+
+    depth: Tensor
+    outward: Tensor
+    triangle: Tensor
+    way: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class InnerParts:
+    """The parts that belong behind the skin, and the skin that hides them.
+
+    Args:
+        vertices: ids of the parts' vertices, (P,) int64.
+        group: which pocket of the head each lies in (the mouth, an eye), (P,) int64 from 0.
+        label: the connected part of every vertex of the mesh, (V,) int64.
+        body: the connected part that carries the skin.
+        skin: triangles near the parts that are open to the outside at rest, (S,3) int64.
+        hard: which vertices are bone, such as teeth, gums and eyeballs, and not shells of the eye, (P,) bool.
+    """
+
+    vertices: Tensor
+    group: Tensor
+    label: Tensor
+    body: int
+    skin: Tensor
+    hard: Tensor
+
+    def depth(self, vertices: Tensor) -> Tensor:
+        """How far each vertex of a part stands out of the skin in a pose, (P,), millimetres; 0 where it does not.
+
+        A vertex stands out when the straight line from the middle of its group through it leaves the skin before it
+        gets there and meets no skin beyond: it has come through and is seen. What is seen through open lips or lids has
+        no skin behind it, what a lip covers has skin before it; neither counts. The depth is the distance to the
+        nearest point of the skin.
+
+        Args:
+            vertices: of the whole head in the pose, (V,3), millimetres.
+        """
+        return self.standing(vertices).depth
+
+    def standing(self, vertices: Tensor) -> Standing:
+        """``depth`` with where each vertex has come through."""
+        vertices = vertices.detach().cpu().double()
+        points = vertices[self.vertices]
+        away = points - self.middles(vertices)[self.group]
+        far = away.norm(dim=-1)
+        outward = away / far.clamp(min=1e-9)[:, None]
+        if len(points) == 0 or len(self.skin) == 0:
+            none = torch.zeros(len(points), dtype=torch.float64)
+            return Standing(none, outward, torch.full((len(points),), -1), none)
+        caster = RayCaster(vertices, self.skin)
+        hits = caster.cast(points, -outward)
+        entered = (triangle_normals(vertices, self.skin)[hits.triangle] * outward).sum(-1) > 0
+        through = (hits.triangle >= 0) & (hits.distance < far) & entered
+        through[through.clone()] = ~caster.occluded(points[through], outward[through])
+        way = torch.where(through, hits.distance, 0.0)
+        # The way along the ray is never shorter than the nearest one.
+        depth, deep = way.clone(), way > TOLERANCE / 2
+        if deep.any():
+            depth[deep] = SurfaceIndex(vertices, self.skin).among_nearest_samples(points[deep], 12).distance
+        return Standing(depth, outward, torch.where(through, hits.triangle, -1), way)
+
+    def middles(self, vertices: Tensor) -> Tensor:
+        """The middle of each group in a pose (V,3), (G,3)."""
+        count = int(self.group.max()) + 1 if len(self.group) else 0
+        total = vertices.new_zeros(count, 3).index_add_(0, self.group, vertices[self.vertices])
+        return total / self.group.bincount(minlength=count)[:, None]
+
+
+def inner_parts(template: BlendshapeRig) -> InnerParts:
+    """Finds the parts that lie inside a head at rest.
+
+    Every connected part is one but the largest, which carries the skin, and those of regions of hair, such as lashes,
+    which stand before the skin by nature, and groups of parts from which nearly half of all directions are free.
+
+    Args:
+        template: a rig, millimetres; its shapes tell which parts are bone.
+    """
+    mesh = template.neutral
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    label = components(faces, len(vertices))
+    body = int(label.bincount().argmax())
+    used = torch.zeros(len(vertices), dtype=torch.bool)
+    used[faces.flatten()] = True
+    rest = ((label != body) & used & ~_hair(mesh)).nonzero()[:, 0]
+    if len(rest) == 0:
+        return InnerParts(rest, rest, label, body, faces[:0], rest > 0)
+    skin = _open_skin(vertices, faces, label == body)
+    if len(rest) and len(skin):
+        distance = cKDTree(vertices[rest].numpy()).query(vertices.numpy(), distance_upper_bound=_NEAR)[0]
+        skin = skin[torch.from_numpy(distance < _NEAR)[skin].any(1)]
+    caster = RayCaster(vertices, faces[(label == body)[faces].all(1)])
+    free = _share_free(caster, vertices[rest], _random_directions(_RAYS, len(rest)))
+    group = _groups(vertices[rest], label[rest])
+    mean = torch.zeros(int(group.max()) + 1, dtype=torch.float64).index_add_(0, group, free) / group.bincount()
+    rest = rest[(mean < _BEFORE_THE_SKIN)[group]]
+    group = _groups(vertices[rest], label[rest])
+    return InnerParts(rest, group, label, body, skin, is_rigid(template, rest, group, label[rest]))
+
+
+def shape_depths(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
+    """How far each vertex of a part stands out of the skin at rest and in every shape at weight 1, (N+1,P)."""
+    poses = torch.cat([torch.zeros_like(rig.deltas[:1]), rig.deltas.detach()])
+    return torch.stack([parts.depth(rig.vertices + pose) for pose in poses])  # each pose is ray cast by itself
+
+
+def _hair(mesh: Mesh) -> Tensor:
+    mask = torch.zeros(len(mesh.vertices), dtype=torch.bool)
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    for name, region in regions.items():
+        if any(word in name.lower() for word in _HAIR):
+            mask |= region.cpu()
+    return mask
+
+
+def _open_skin(vertices: Tensor, faces: Tensor, body: Tensor) -> Tensor:
+    """The body's triangles from which a good part of the outside is seen at rest, not the linings of its pockets."""
+    normals = vertex_normals(vertices, faces)
+    ids = (body & (normals.norm(dim=-1) > 0.5)).nonzero()[:, 0]
+    about = torch.nn.functional.normalize(_random_directions(_RAYS, len(ids)) + normals[ids], dim=-1)
+    free = _share_free(RayCaster(vertices, faces), vertices[ids] + _LIFT * normals[ids], about)
+    seen = torch.zeros(len(vertices), dtype=torch.bool)
+    seen[ids] = free > _OPEN_SKIN
+    return faces[seen[faces].all(1)]
+
+
+def _share_free(caster: RayCaster, points: Tensor, directions: Tensor) -> Tensor:
+    """The share of the directions (R,Q,3) in which nothing stands before points (Q,3) within the opening, (Q,)."""
+    starts = points.expand_as(directions).reshape(-1, 3)
+    reach = caster.distances(starts, directions.reshape(-1, 3), _OPENING)
+    return (reach.view(len(directions), -1) >= 0.999 * _OPENING).double().mean(0)
+
+
+def _random_directions(rays: int, count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(rays, count, 3, generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(drawn, dim=-1)
+
+
+def _groups(points: Tensor, label: Tensor) -> Tensor:
+    """Parts that nearly touch lie in one pocket: a number a vertex, (P,) int64, from 0."""
+    if len(points) == 0:
+        return label
+    own = label.unique(return_inverse=True)[1].numpy()
+    count = int(own.max()) + 1
+    near = cKDTree(points.numpy()).query_pairs(_TOUCHING, output_type="ndarray")
+    first, second = own[near].T
+    _, group = connected_components(coo_array((first * 0 + 1, (first, second)), (count, count)), directed=False)
+    return torch.from_numpy(group.astype("int64"))[own]

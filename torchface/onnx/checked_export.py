@@ -1,0 +1,82 @@
+"""Writes a graph only where ONNX Runtime computes what PyTorch does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.files.whole_files import write_file
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written, and how near ONNX Runtime is to PyTorch.
+
+    Args:
+        path: the file.
+        size: in bytes.
+        parity: by output, the largest difference found, in the output's unit.
+        units: of the outputs.
+    """
+
+    path: Path
+    size: int
+    parity: dict[str, float]
+    units: dict[str, str]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The report as pairs of what and how much."""
+        rows = [("file", f"{self.path}, {self.size / 1000:.0f} kB")]
+        for name, gap in self.parity.items():
+            rows.append((name, f"ONNX Runtime against PyTorch: at most {gap:.1e} {self.units[name]} apart"))
+        return rows
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self.rows())
+
+
+def write_checked(
+    model: onnx.ModelProto,
+    path: str | Path,
+    cases: Sequence[tuple[Mapping[str, Tensor], Mapping[str, Tensor]]],
+    allowed: Mapping[str, float],
+    units: Mapping[str, str],
+) -> ExportReport:
+    """Runs a graph on cases of different batch sizes and writes it if it agrees.
+
+    Args:
+        model: the graph.
+        path: the file to write; it appears only when it is complete and checked.
+        cases: inputs by name, and the outputs that PyTorch gives for them.
+        allowed: by output, how far apart the two may be.
+        units: of the outputs.
+
+    Raises:
+        ValueRangeError: they are further apart; nothing is written.
+    """
+    content = model.SerializeToString()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    parity = dict.fromkeys(allowed, 0.0)
+    for inputs, expected in cases:
+        found = session.run(list(allowed), {name: value.detach().numpy() for name, value in inputs.items()})
+        for name, values in zip(allowed, found, strict=True):
+            gap = torch.from_numpy(np.asarray(values)) - expected[name].detach()
+            parity[name] = max(parity[name], float(gap.abs().max()))
+    for name, found_gap in parity.items():
+        if not found_gap <= allowed[name]:
+            raise ValueRangeError(
+                f"{path}: ONNX Runtime's {name} differ from PyTorch's by {found_gap:.2g} {units[name]}, expected "
+                f"{allowed[name]:.2g} at most"
+            )
+    write_file(path, content)
+    return ExportReport(Path(path), len(content), parity, dict(units))

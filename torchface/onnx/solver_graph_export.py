@@ -1,0 +1,300 @@
+"""Writes ``SolverGraph`` as an ONNX file and says how far it is from the exact solve."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver
+from torchface.errors import ValueRangeError
+from torchface.files.whole_files import write_file
+from torchface.geometry.similarity import Similarity
+from torchface.onnx.hybrid_graph import HybridGraph
+from torchface.onnx.solver_graph import STEPS, STEPS_WITH_GAPS, SolverGraph
+from torchface.onnx.solver_model import solver_model
+from torchface.rig import BlendshapeRig
+
+_RHOS = (0.03, 0.045, 0.06, 0.075, 0.09, 0.12, 0.16, 0.22, 0.3, 0.4)
+_PARITY = 1e-5
+# Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
+# that computes something else lies much farther.
+_ROUNDINGS = 10.0
+_TEST_FRAMES = 512
+_FRAMES_A_POSE = 10
+
+
+@dataclass(frozen=True)
+class SolverGap:
+    """How far the graph is from the exact solve, as (E(w) - E*) / E* with E in mm² a marker.
+
+    Args:
+        missing: share of markers missing.
+        worst, median: over the frames.
+        parity: largest difference of a weight between ONNX Runtime and the same graph in PyTorch.
+        rounding: the same between PyTorch in single and in double precision: what shapes that the markers hardly see
+            owe to rounding alone.
+    """
+
+    missing: float
+    worst: float
+    median: float
+    parity: float
+    rounding: float
+
+
+@dataclass(frozen=True)
+class SolverReport:
+    """What was written, and how good it is.
+
+    Args:
+        path: the file.
+        size: in bytes.
+        rho: the metric chosen for this rig and layout.
+        steps, steps_with_gaps: of splitting.
+        gaps: at 0, 10 and 30 % missing markers.
+        milliseconds: median of one frame by one thread of ONNX Runtime here, every marker seen.
+        milliseconds_with_gaps: the same with missing markers.
+    """
+
+    path: Path
+    size: int
+    rho: float
+    steps: int
+    steps_with_gaps: int
+    gaps: tuple[SolverGap, ...]
+    milliseconds: float
+    milliseconds_with_gaps: float
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The report as pairs of what and how much."""
+        rows = [
+            ("file", f"{self.path}, {self.size / 1000:.0f} kB"),
+            ("steps", f"{self.steps}, {self.steps_with_gaps} with missing markers; rho {self.rho}"),
+            ("one frame, one thread", f"{self.milliseconds:.3f} ms, {self.milliseconds_with_gaps:.3f} ms with gaps"),
+        ]
+        for gap in self.gaps:
+            rows.append(
+                (
+                    f"{gap.missing:.0%} missing",
+                    f"energy above the exact solve: worst {gap.worst:.1e}, median {gap.median:.1e}; "
+                    f"ONNX Runtime against PyTorch {gap.parity:.1e}, rounding {gap.rounding:.1e}",
+                )
+            )
+        return rows
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self.rows())
+
+
+def export_solver(
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    path: str | Path,
+    alignment: Similarity | None = None,
+    sparsity: float = SPARSITY,
+    ridge: float = RIDGE,
+    steps: int = STEPS,
+    steps_with_gaps: int = STEPS_WITH_GAPS,
+    markers: Tensor | None = None,
+) -> SolverReport:
+    """Writes the marker solve of one rig and layout as ONNX, and checks it.
+
+    The graph takes ``markers`` (B,M,3), millimetres, NaN where not seen, and ``previous`` (B,N), and gives ``weights``
+    (B,N). The metadata holds ``shape_names`` and ``marker_labels`` (JSON), ``units``, ``version`` and the settings.
+
+    Args:
+        rig: N shapes.
+        attachment: M markers.
+        path: the file to write; it appears only when it is complete and checked.
+        alignment: marker space to rig space, baked in.
+        sparsity, ridge: as in ``MarkerSolver``.
+        steps, steps_with_gaps: as in ``SolverGraph``.
+        markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
+
+    Raises:
+        ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
+            written.
+    """
+    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
+    return export_marker_solver(solver, path, steps, steps_with_gaps, markers)
+
+
+def export_marker_solver(
+    solver: MarkerSolver,
+    path: str | Path,
+    steps: int = STEPS,
+    steps_with_gaps: int = STEPS_WITH_GAPS,
+    markers: Tensor | None = None,
+    facts: Mapping[str, object] | None = None,
+) -> SolverReport:
+    """Writes a solver as ONNX, and checks it; see :func:`export_solver`.
+
+    Args:
+        solver: of N shapes and M markers.
+        path, steps, steps_with_gaps, markers: as there.
+        facts: further metadata, such as licence and data.
+    """
+    solver = copy.deepcopy(solver).cpu().float()
+    frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
+    graph = SolverGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    return _export(graph, solver, frames, (), path, facts)
+
+
+def export_hybrid_solver(
+    rig: BlendshapeRig,
+    attachment: Attachment,
+    path: str | Path,
+    alignment: Similarity | None = None,
+    sparsity: float = SPARSITY,
+    ridge: float = RIDGE,
+    steps: int = STEPS,
+    steps_with_gaps: int = STEPS_WITH_GAPS,
+    markers: Tensor | None = None,
+) -> SolverReport:
+    """Writes the hybrid solve of one rig and layout as ONNX, and checks it.
+
+    The graph has two inputs more than :func:`export_solver`'s: ``predicted`` (B,N), the weights that a classifier
+    says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
+    computes what the other graph does. It is checked with random predictions for a seventh of the weights.
+
+    Args, Raises: as :func:`export_solver`.
+    """
+    solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
+    frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
+    graph = HybridGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    generator = torch.Generator().manual_seed(1)
+    shape = (len(frames), len(solver.names))
+    predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
+    gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
+    return _export(graph, HybridSolver(solver), frames, (predicted, gamma), path)
+
+
+def _export(
+    graph: SolverGraph,
+    solver: MarkerSolver | HybridSolver,
+    frames: Tensor,
+    more: tuple[Tensor, ...],
+    path: str | Path,
+    facts: Mapping[str, object] | None = None,
+) -> SolverReport:
+    """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
+    model = solver_model(graph, facts)
+    session = _session(model)
+    gaps = tuple(_gap(session, graph, solver, frames, more, missing) for missing in (0.0, 0.1, 0.3))
+    for gap in gaps:
+        allowed = max(_PARITY, _ROUNDINGS * gap.rounding)
+        if not gap.parity <= allowed:
+            raise ValueRangeError(
+                f"{path}: ONNX Runtime differs from PyTorch by {gap.parity:.2g}, expected {allowed:.2g} at most"
+            )
+    content = model.SerializeToString()
+    path = Path(path)
+    write_file(path, content)
+    return SolverReport(
+        path,
+        len(content),
+        graph.rho,
+        graph.steps,
+        graph.steps_with_gaps,
+        gaps,
+        _milliseconds(session, frames, more),
+        _milliseconds(session, hide_markers(frames, 0.3), more),
+    )
+
+
+def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
+    """The metric's rho of a small set that leaves the least gap on these markers (T,M,3), from cold.
+
+    A small rho suits the few frames with a slow mode, a larger one all others: the 98 % quantile weighs the two.
+    """
+    exact = copy.deepcopy(solver).double()
+    markers = markers.double()
+    energy = exact.energy(markers)
+    least = energy.value(exact(markers))
+    cold = torch.zeros_like(energy.f)
+
+    def gap(rho: float) -> float:
+        return float((energy.value(SolverGraph(exact, steps, rho=rho)(markers, cold)) / least).quantile(0.98))
+
+    return min(_RHOS, key=gap)
+
+
+def random_frames(solver: MarkerSolver, count: int, noise: float = 0.3, seed: int = 0) -> Tensor:
+    """Markers (T,M,3) that move from one random sparse pose to the next, with noise in millimetres, in marker space."""
+    generator = torch.Generator().manual_seed(seed)
+    poses = (count // _FRAMES_A_POSE + 2, len(solver.names))
+    active = torch.rand(poses, generator=generator) < 0.2
+    keys = active * torch.rand(poses, generator=generator).square()
+    time_ = torch.arange(count) / _FRAMES_A_POSE
+    before, share = time_.long(), time_.frac()[:, None]
+    weights = (torch.lerp(keys[before], keys[before + 1], share)).to(solver.basis)
+    points = solver.rest + torch.einsum("mcn,bn->bmc", solver.basis, weights)
+    points = points + noise * torch.randn(points.shape, generator=generator)
+    return points if solver.alignment is None else solver.alignment.inverse().apply(points)
+
+
+def hide_markers(markers: Tensor, share: float, seed: int = 0) -> Tensor:
+    """The markers with this share of them NaN, at least one seen a frame."""
+    order = torch.rand(markers.shape[:2], generator=torch.Generator().manual_seed(seed)).argsort(-1)
+    hidden = order < min(round(share * markers.shape[1]), markers.shape[1] - 1)
+    return torch.where(hidden[..., None], torch.nan, markers)
+
+
+def _session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def _run(session: onnxruntime.InferenceSession, markers: Tensor, previous: Tensor, more: tuple[Tensor, ...]) -> Tensor:
+    names = (entry.name for entry in session.get_inputs())
+    inputs = zip(names, (markers, previous, *more), strict=True)
+    (weights,) = session.run(None, {name: value.numpy() for name, value in inputs})
+    return torch.from_numpy(np.asarray(weights))
+
+
+def _gap(
+    session: onnxruntime.InferenceSession,
+    graph: SolverGraph,
+    solver: MarkerSolver | HybridSolver,
+    frames: Tensor,
+    more: tuple[Tensor, ...],
+    missing: float,
+) -> SolverGap:
+    """Cold and, from the weights of the frame before, warm: the worse of the two."""
+    markers = hide_markers(frames, missing)
+    exact = copy.deepcopy(solver).double()
+    precise_more = tuple(value.double() for value in more)
+    energy = exact.energy(markers.double(), *precise_more)
+    optimum = exact(markers.double(), *precise_more)
+    least = energy.value(optimum)
+    starts = (torch.zeros_like(optimum).float(), optimum.roll(1, 0).float())
+    solved = [_run(session, markers, start, more) for start in starts]
+    here = [graph(markers, start, *more) for start in starts]
+    parity = max(float((own - weights).abs().max()) for own, weights in zip(here, solved, strict=True))
+    double = copy.deepcopy(graph).double()
+    precise = [double(markers.double(), start.double(), *precise_more) for start in starts]
+    rounding = max(float((own - weights).abs().max()) for own, weights in zip(here, precise, strict=True))
+    gaps = torch.stack([(energy.value(weights.double()) - least) / least for weights in solved])
+    return SolverGap(missing, float(gaps.max()), float(gaps.median()), parity, rounding)
+
+
+def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor, more: tuple[Tensor, ...]) -> float:
+    previous = torch.zeros(1, session.get_inputs()[1].shape[1])
+    times = []
+    for frame, *others in zip(frames.split(1), *(value.split(1) for value in more), strict=True):
+        begin = time.perf_counter()
+        previous = _run(session, frame, previous, tuple(others))
+        times.append(time.perf_counter() - begin)
+    return 1000 * float(np.median(times))

@@ -1,0 +1,287 @@
+"""Many scans registered to one template: one at a time, in processes, or on a cluster; killed, it continues."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.whole_files import write_file
+from torchface.io.length_units import millimetres_per
+from torchface.mesh import Mesh
+from torchface.registration.corpus.cluster import import_ray, on_cluster
+from torchface.registration.corpus.processes import in_processes
+from torchface.registration.corpus.scan_job import CorpusJob
+from torchface.registration.corpus.scan_record import CorpusEntry, CorpusTask, finished_entry, write_summary
+from torchface.registration.landmark_files import landmark_file
+from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
+from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
+from torchface.registration.scan_preparation import check_template
+
+try:
+    import fcntl
+except ImportError:  # Windows has none; two runs into one folder then go unnoticed
+    fcntl = None  # type: ignore[assignment]
+
+SCAN_ENDINGS = (".obj", ".ply", ".stl", ".glb", ".gltf")
+SUMMARY = "summary.csv"
+
+
+@dataclass(frozen=True)
+class CorpusReport:
+    """What became of a corpus.
+
+    Args:
+        entries: one a scan, in the order given.
+        out: the folder of results and records.
+        summary: the table, CSV.
+    """
+
+    entries: tuple[CorpusEntry, ...]
+    out: Path
+    summary: Path
+
+    @property
+    def registered(self) -> tuple[CorpusEntry, ...]:
+        """Those with a result."""
+        return tuple(entry for entry in self.entries if entry.registered)
+
+    @property
+    def skipped(self) -> tuple[CorpusEntry, ...]:
+        """Those without."""
+        return tuple(entry for entry in self.entries if not entry.registered)
+
+
+def register_corpus(
+    template: Mesh,
+    scans: Sequence[str | Path],
+    out: str | Path,
+    jobs: int = 1,
+    cluster: str | None = None,
+    progress: Callable[[int, int, CorpusEntry], None] | None = None,
+    *,
+    landmarks: str | Path | None = None,
+    unit: str | None = None,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+    texture_size: int = 1024,
+    detector: str | Path | None = None,
+    model: ShapeModel | HasShape | None = None,
+) -> CorpusReport:
+    """Registers scans one by one into a folder: ``NAME.glb`` and a record ``NAME.json`` for each, and ``summary.csv``.
+
+    A scan that cannot be registered is told in report, record and table, and the others go on. Results are complete
+    files and a record comes after its result: a run that was killed, started again, takes what is finished and goes
+    on with the rest. A scan is registered anew when its files (those beside it of the same name included), its
+    landmarks, the template or the settings have changed, or its record has been deleted; one that failed for
+    another reason than what it holds (a process that died) is tried again.
+
+    Args:
+        template: a face, millimetres.
+        scans: files and folders; a folder stands for the scans in it, sorted by name.
+        out: the folder to write into, made where it is missing; not one that holds scans or landmarks.
+        jobs: how many processes of one thread each; 1 registers in this one, with all its threads. A script that
+            asks for more must call under ``if __name__ == "__main__"``.
+        cluster: the address of a Ray cluster, or ``"auto"`` on one of its machines, instead of ``jobs``; scans and
+            ``out`` must lie where all its machines see them.
+        progress: called with (scans done, scans, the last one's entry), finished ones included.
+        landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
+            is registered without landmarks.
+        unit: of the scans' files; if absent metres for glTF, millimetres for the others.
+        schedule, texture_size: see ``register``.
+        detector: the folder of a landmark detector for the scans without landmarks; see ``load_detector``.
+        model: of faces in the template's topology, which each registration starts from; see ``register``.
+
+    Returns:
+        ``CorpusReport(entries, out, summary)``.
+
+    Raises:
+        FileFormatError: no scan is named or found, or ``out`` cannot be written to.
+        TopologyError, ValueRangeError: a template that nothing can be registered with.
+        ValueRangeError: settings that make no sense, another run writing into ``out``, or no cluster there.
+        MissingExtraError: a cluster is asked for and ray is not installed.
+    """
+    if jobs < 1:
+        raise ValueRangeError(f"jobs: found {jobs}, expected at least 1")
+    if unit is not None:
+        millimetres_per(unit)
+    if texture_size < 0 or texture_size > 16384:
+        raise ValueRangeError(f"texture_size: found {texture_size}, expected 0 to 16384")
+    if cluster is not None:
+        import_ray()
+    check_template(template)
+    files = find_scans(scans)
+    folder = Path(out).resolve()
+    marks = None if landmarks is None else _folder("landmarks", landmarks)
+    _check_apart(folder, files, marks)
+    _make(folder)
+    job = CorpusJob(
+        template,
+        folder,
+        schedule,
+        texture_size,
+        unit,
+        None if detector is None else _folder("detector", detector),
+        None if model is None else LinearShape.of(shape_model(model, template)),
+    )
+    tasks = _tasks(job, files, marks)
+    with _only_run(folder):
+        for left_over in folder.glob(".*.part"):
+            left_over.unlink(missing_ok=True)
+        entries: dict[str, CorpusEntry] = {}
+        for entry in _entries(job, tasks, jobs, cluster):
+            entries[entry.name] = entry
+            if progress is not None:
+                progress(len(entries), len(tasks), entry)
+        ordered = tuple(entries[task.name] for task in tasks)
+        write_summary(ordered, folder / SUMMARY)
+    return CorpusReport(ordered, folder, folder / SUMMARY)
+
+
+def find_scans(scans: Sequence[str | Path]) -> list[Path]:
+    """Files as named, and for each folder the scans in it, sorted by name; absolute, none twice.
+
+    Raises:
+        FileFormatError: nothing is named, or a folder holds no scan.
+    """
+    found: dict[Path, None] = {}
+    for one in map(Path, scans):
+        if not one.is_dir():
+            found[one.resolve()] = None
+            continue
+        inside = sorted(path for path in one.iterdir() if path.suffix.lower() in SCAN_ENDINGS and path.is_file())
+        if not inside:
+            raise FileFormatError(f"{one}: found no scan in the folder, expected files {', '.join(SCAN_ENDINGS)}")
+        found |= dict.fromkeys(path.resolve() for path in inside)
+    if not found:
+        raise FileFormatError("scans: found none named, expected files or folders")
+    return list(found)
+
+
+def _entries(job: CorpusJob, tasks: list[CorpusTask], jobs: int, cluster: str | None) -> Iterator[CorpusEntry]:
+    todo = []
+    for task in tasks:
+        entry = finished_entry(task, job.out)
+        if entry is None:
+            todo.append(task)
+        else:
+            yield entry
+    if not todo:
+        return
+    if cluster is not None:
+        yield from on_cluster(job, todo, cluster)
+    elif jobs > 1:
+        yield from in_processes(job, todo, jobs)
+    else:
+        yield from map(job.run, todo)
+
+
+def _tasks(job: CorpusJob, files: list[Path], marks: Path | None) -> list[CorpusTask]:
+    shared = _digest(job)
+    beside = {folder: _named(folder) for folder in {path.parent for path in files}}
+    tasks = []
+    for name, scan in zip(_names(files), files, strict=True):
+        points = None if marks is None else landmark_file(marks, scan)
+        own = [_state(path) for path in beside[scan.parent].get(scan.stem, [])]
+        stamp = json.dumps([shared, str(scan), own, None if points is None else _state(points)])
+        tasks.append(CorpusTask(name, scan, points, hashlib.sha256(stamp.encode()).hexdigest()))
+    return tasks
+
+
+def _names(files: list[Path]) -> list[str]:
+    """A name each, none twice: the file's, with its folder's or its ending's where others have the same."""
+    ways: tuple[Callable[[Path], str], ...] = (
+        lambda path: path.stem,
+        lambda path: f"{path.parent.name}_{path.stem}",
+        lambda path: f"{path.parent.name}_{path.stem}_{path.suffix[1:]}",
+        lambda path: f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}",
+    )
+    names = [ways[0](path) for path in files]
+    for way in ways[1:]:
+        # File systems may not tell upper from lower case.
+        count = Counter(name.lower() for name in names)
+        names = [way(path) if count[name.lower()] > 1 else name for name, path in zip(names, files, strict=True)]
+    return names
+
+
+def _named(folder: Path) -> dict[str, list[Path]]:
+    """The files of a folder by the part of their name before the first dot that a scan of the folder has whole."""
+    found: dict[str, list[Path]] = {}
+    if folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            parts = path.name.split(".")
+            for end in range(1, len(parts)):
+                found.setdefault(".".join(parts[:end]), []).append(path)
+    return found
+
+
+def _state(path: Path) -> list[str | int]:
+    try:
+        state = path.stat()
+    except OSError:
+        return [path.name]
+    return [path.name, state.st_size, state.st_mtime_ns]
+
+
+def _digest(job: CorpusJob) -> str:
+    """Of what all scans share."""
+    digest = hashlib.sha256()
+    template = job.template
+    for tensor in (template.vertices, template.faces, template.uvs, template.uv_faces):
+        if tensor is not None:
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    if template.annotations is not None and template.annotations.landmarks is not None:
+        digest.update(template.annotations.landmarks.cpu().contiguous().numpy().tobytes())
+    detector = None if job.detector is None else [_state(path) for path in sorted(job.detector.iterdir())]
+    digest.update(repr((job.schedule, job.texture_size, job.unit, detector)).encode())
+    for tensor in () if job.model is None else (job.model.mean, job.model.modes):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _folder(what: str, path: str | Path) -> Path:
+    folder = Path(path).resolve()
+    if not folder.is_dir():
+        raise FileFormatError(f"{what}: found no folder {path}, expected one")
+    return folder
+
+
+def _check_apart(folder: Path, files: list[Path], marks: Path | None) -> None:
+    """Results and records must not fall onto scans or landmarks of the same name."""
+    if marks == folder or any(path.parent == folder for path in files):
+        raise ValueRangeError(f"out: found {folder}, which holds scans or landmarks; expected another folder")
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
+    trial = folder / ".writable"
+    write_file(trial, b"1")
+    trial.unlink()
+
+
+@contextmanager
+def _only_run(folder: Path) -> Iterator[None]:
+    """Holds the folder for this run; the system lets go of it however the run ends."""
+    try:
+        handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be written to ({error.strerror})") from error
+    try:
+        if fcntl is not None:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueRangeError(f"out: found another run writing into {folder}, expected none") from None
+            except OSError:  # a file system without locks
+                pass
+        yield
+    finally:
+        os.close(handle)

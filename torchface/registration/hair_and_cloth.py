@@ -1,0 +1,139 @@
+"""What hides a person's skin on a scan: hair and cloth, told by their colour, and ears that came out in pieces."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.geometry.meshes.operators import components, edges, vertex_normals
+from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
+from torchface.mesh import Mesh
+from torchface.registration.ears import find_ears
+from torchface.registration.scan_colors import ScanColors
+from torchface.rendering.color_space import to_linear
+
+_AT_THE_EARS = (0, 1, 2, 14, 15, 16)
+_FEATURE = 0.17
+_GROWN = 0.06
+_DARKEST, _BLACK = 1.5, 1e-4
+_BRIGHTEST, _OTHER_HUE = 2.0, 0.6
+_SPREADS = 4.0
+_SMOOTHING = 3
+_NEAR = 4.0
+_WHOLE_EAR = 0.6
+_FEWEST = 20
+
+
+class Cover:
+    """Tells which vertices of a template have a place on the scan that is not the person's skin.
+
+    Skin is what has the colour of brows, nose, mouth and cheeks together, lit more or less. Only what lies away from
+    the features of the face (further than some 25 mm from their landmarks) can be covered: beards, brows and lips
+    have other colours too. All of it asks for the 68 landmarks on the template; nothing is covered without.
+
+    Args:
+        template: with 68 annotated landmarks.
+        exposed: ids of the vertices that look for a place on the scan.
+        surface: the scan.
+        colors: of the scan; without them only ears are judged.
+    """
+
+    def __init__(self, template: Mesh, exposed: Tensor, surface: SurfaceIndex, colors: ScanColors | None) -> None:
+        self._faces, self._surface, self._colors, self._exposed = template.faces.cpu(), surface, colors, exposed
+        self._rest = vertices = template.vertices.detach().cpu().double()
+        self._none = torch.zeros(len(vertices), dtype=torch.bool)
+        self.ears = find_ears(template)
+        self.features = ~self._none
+        notes = template.annotations
+        self.known = notes is not None and notes.landmarks is not None and len(notes.landmarks) == 68
+        if not self.known:
+            return
+        assert notes is not None
+        assert notes.landmarks is not None
+        landmarks = vertices[notes.landmarks.cpu()]
+        self._width = float((landmarks[0] - landmarks[16]).norm())
+        kept = torch.ones(68, dtype=torch.bool)
+        kept[list(_AT_THE_EARS)] = False
+        gap, _ = cKDTree(landmarks[kept].numpy()).query(vertices.numpy())
+        label = components(self._faces, len(vertices))
+        self.skin = label == label.bincount().argmax()
+        self.features = (torch.from_numpy(gap) < _FEATURE * self._width) | ~self.skin
+        self.features &= ~torch.stack([*self.ears, self._none]).any(0)
+
+    def hidden(self, current: Tensor, settled: bool) -> Tensor:
+        """The covered vertices, (V,) bool, with the template's vertices (V,3) about where they belong.
+
+        Args:
+            current: (V,3) float64.
+            settled: whether they lie near enough to the scan that an ear can be judged.
+        """
+        if not self.known or (self._colors is None and not (settled and self.ears)):
+            return self._none
+        found = self._surface.among_nearest_samples(current[self._exposed])
+        hidden = self._none if self._colors is None else self._by_color(found)
+        if settled:
+            hidden = hidden | self._broken_ears(current, found, hidden)
+        return hidden
+
+    def without_islands(self, seen: Tensor) -> Tensor:
+        """The seen vertices (V,) that hang together with the features of the face: no specks amid hair."""
+        if not self.known:
+            return seen
+        inside = self._faces[(seen | self.features)[self._faces].all(-1)]
+        label = components(inside, len(seen))
+        home = torch.zeros(len(seen), dtype=torch.bool)
+        home[label[self.features & self.skin]] = True
+        return seen & (home[label] | ~self.skin)
+
+    def _by_color(self, found: SurfacePoints) -> Tensor:
+        assert self._colors is not None
+        light = to_linear(self._colors.at(found.triangle, found.barycentric).double()).clamp(min=_BLACK)
+        red, green, blue = light.unbind(1)
+        look = torch.stack([light.mean(1).log(), (red / green).log(), (blue / green).log()], dim=1)
+        sample = look[self.features[self._exposed] & (found.distance < 3 * _NEAR)]
+        if len(sample) < _FEWEST:
+            return self._none
+        middle = sample.median(0).values
+        spread = _SPREADS * 1.4826 * (sample - middle).abs().median(0).values
+        off = look - middle
+        hue = (off[:, 1:] / torch.maximum(spread[1:], off.new_tensor(_OTHER_HUE))).norm(dim=1)
+        other = (off[:, 0] < -spread[0].clamp(min=_DARKEST)) | (off[:, 0] > spread[0].clamp(min=_BRIGHTEST)) | (hue > 1)
+        share = torch.zeros(len(self._none), dtype=torch.float64)
+        share[self._exposed] = other.double()
+        seen = torch.zeros_like(share)
+        seen[self._exposed] = 1.0
+        for _ in range(_SMOOTHING):  # rings of neighbours
+            share, count = self._summed(share * seen), self._summed(seen)
+            share = share / count.clamp(min=1)
+        return self._grown((share > 0.5) & ~self.features)
+
+    def _summed(self, values: Tensor) -> Tensor:
+        """Each vertex's value and its neighbours'."""
+        first, second = self._links.T
+        return values.index_add(0, first, values[second]).index_add(0, second, values[first])
+
+    @cached_property
+    def _links(self) -> Tensor:
+        return edges(self._faces)
+
+    def _grown(self, mask: Tensor) -> Tensor:
+        """With what lies within some 9 mm, where hair lifts the surface."""
+        if not mask.any():
+            return mask
+        gap, _ = cKDTree(self._rest[mask].numpy()).query(self._rest.numpy())
+        return (torch.from_numpy(gap) < _GROWN * self._width) & ~self.features
+
+    def _broken_ears(self, current: Tensor, found: SurfacePoints, hidden: Tensor) -> Tensor:
+        """Ears of which the scan shows too little: whole, or they come out as flakes."""
+        own = vertex_normals(current, self._faces)[self._exposed]
+        met = (found.distance < _NEAR) & ((own * self._surface.normals_at(found)).sum(-1) > 0.5)
+        met &= ~self._surface.on_border(found) & ~hidden[self._exposed]
+        broken = self._none.clone()
+        for ear in self.ears:
+            here = ear[self._exposed]
+            if here.any() and float(met[here].double().mean()) < _WHOLE_EAR:
+                broken |= ear
+        return broken

@@ -1,0 +1,1 @@
+"""Non-rigid ICP: energy, schedule and steps that bend a template onto a scan."""

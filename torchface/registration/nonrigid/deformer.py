@@ -1,0 +1,201 @@
+"""The template as it deforms: its stiffness, its levels, and one stage of Algorithm 1 after the other."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import cached_property
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.operators import triangle_areas
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.registration.nonrigid.correspondence import (
+    Correspondences,
+    correspondences,
+    evenly_spread,
+    exposed_vertices,
+)
+from torchface.registration.nonrigid.landmark_pull import LandmarkPull
+from torchface.registration.nonrigid.linear_step import Contacts, Data, LinearStep
+from torchface.registration.nonrigid.lip_contact import ContactPull
+from torchface.registration.nonrigid.schedule import Level, Schedule, Stage
+from torchface.registration.nonrigid.stage_record import StageRecord
+from torchface.registration.nonrigid.stiffness import identity_maps, linked_edges, positions, stiffness_rows
+from torchface.registration.nonrigid.subspace import Subspace, all_maps, graph, translations
+from torchface.registration.nonrigid.unfolding import turned_over, unfolded
+from torchface.rendering.raycast import RayCaster
+
+_AREA_OF_ONE = 10.0
+_MOST_ATTEMPTS = 8
+_SLIVER = 0.1
+
+
+class Deformer:
+    """A template on its way to a scan; vertices in ``hidden`` (V,) have no place there, and follow the others.
+
+    Args:
+        vertices: the template laid on the scan, (V,3) float64.
+        faces: its triangles.
+        scan: the surface.
+        landmarks: what is known of where vertices belong; none of them is needed.
+        contacts: what touches at rest.
+        schedule: of its constants; the stages are given one by one to ``run``.
+    """
+
+    def __init__(
+        self,
+        vertices: Tensor,
+        faces: Tensor,
+        scan: SurfaceIndex,
+        landmarks: LandmarkPull,
+        contacts: ContactPull,
+        schedule: Schedule,
+    ) -> None:
+        self.rest, self.faces, self._scan, self._landmarks = vertices, faces, scan, landmarks
+        self._contacts, self._schedule = contacts, schedule
+        self.maps = identity_maps(vertices)
+        self.outward = exposed_vertices(vertices, faces, schedule.opening)
+        self.exposed = self.outward.nonzero()[:, 0]
+        area = triangle_areas(vertices, faces)
+        self._sliver = area < _SLIVER * area.mean()
+        # A correspondence stands for its share of the surface, so that the stiffness means the same at any resolution.
+        self._area = float(area.sum())
+        self._folded = torch.zeros(len(vertices), dtype=torch.bool)
+        self.hidden = torch.zeros(len(vertices), dtype=torch.bool)
+
+    @property
+    def current(self) -> Tensor:
+        """Where the vertices are, (V,3) float64."""
+        return positions(self.maps)
+
+    @cached_property
+    def _stiffness(self) -> sparse.csr_array:
+        return stiffness_rows(self.rest, self.faces, self._schedule.gradient_length)
+
+    @cached_property
+    def _graph(self) -> Subspace:
+        pairs = linked_edges(self.rest, self.faces)
+        return graph(self.rest.numpy(), pairs, self._stiffness, self._schedule.nodes)
+
+    @cached_property
+    def _spaces(self) -> dict[Level, Subspace]:
+        return {Level.TRANSLATIONS: translations(self._stiffness), Level.VERTICES: all_maps(self._stiffness)}
+
+    def run(self, stage: Stage, number: int) -> StageRecord:
+        """One stage: correspondences and linear steps in turn, until ‖ΔX‖ < ε.
+
+        Where triangles turn over, as in an ear that hair covers, the correspondences and landmarks around them are
+        dropped from here on and the stage starts again. Slivers, which turn at the least motion, are left to
+        ``unfold``.
+
+        Raises:
+            ValueRangeError: no correspondence stands the tests.
+        """
+        begin, start = time.perf_counter(), self.maps
+        space = self._graph if stage.level is Level.GRAPH else self._spaces[stage.level]
+        vertices = self.exposed
+        if stage.samples is not None:
+            vertices = evenly_spread(self.rest, vertices, stage.samples)
+        record = self._attempt(stage, number, space, vertices)
+        for circle in range(1, _MOST_ATTEMPTS):  # in widening circles, until nothing turns over
+            folded = self.folded_triangles() & ~self._sliver
+            if not folded.any():
+                break
+            around = torch.zeros(len(self.rest), dtype=torch.bool)
+            around[self.faces[folded].flatten()] = True
+            for _ in range(circle):
+                around[self.faces[around[self.faces].any(-1)].flatten()] = True
+            self._folded |= around
+            self.maps = start
+            record = self._attempt(stage, number, space, vertices)
+        return replace(record, seconds=time.perf_counter() - begin)
+
+    def _attempt(self, stage: Stage, number: int, space: Subspace, vertices: Tensor) -> StageRecord:
+        held = ~self._folded[self._landmarks.vertices]
+        pull = self._landmarks.subset(held)
+        step = LinearStep(
+            space,
+            vertices.numpy(),
+            pull.vertices.numpy(),
+            stage.stiffness,
+            stage.landmark_weight,
+            self._schedule.sliding,
+            self._held_together(stage),
+            pull.weights(self.current).numpy(),
+        )
+        energies, moved, made = [], float("inf"), 0
+        while made < stage.iterations and moved >= stage.tolerance:
+            found = self._correspondences(vertices, stage)
+            data = self._data(found, pull)
+            before, place = step.energy(self.maps, data), self.current
+            self.maps = step.minimise(self.maps, data)
+            energies.append((before, step.energy(self.maps, data)))
+            moved = float((self.current - place).norm(dim=-1).mean())
+            made += 1
+        used = (found.weights > 0) & ~(self._folded | self.hidden)[vertices]
+        return StageRecord(
+            f"{number} {stage.level.value}",
+            stage.stiffness,
+            made,
+            moved,
+            float(found.distance[used].mean()),
+            self._landmark_distance(),
+            int(used.sum()),
+            {
+                **found.dropped,
+                "fold": int((self._folded[vertices] & (found.weights > 0)).sum()),
+                "hidden": int(((self.hidden & ~self._folded)[vertices] & (found.weights > 0)).sum()),
+            },
+            tuple(energies),
+            0.0,
+        )
+
+    def folded_triangles(self) -> Tensor:
+        """Mask (F,) of the triangles that have turned by more than 90° since the template was laid on the scan."""
+        return turned_over(self.rest, self.current, self.faces)
+
+    def unfold(self) -> None:
+        """Turns back what triangles are still turned over."""
+        self.lay(unfolded(self.rest, self.current, self.faces))
+
+    def lay(self, vertices: Tensor) -> None:
+        """Puts the vertices (V,3) where they are told to be."""
+        maps = self.maps.copy()
+        maps[3::4] = vertices.numpy()
+        self.maps = maps
+
+    def _correspondences(self, vertices: Tensor, stage: Stage) -> Correspondences:
+        found = correspondences(
+            self.current, self.faces, vertices, self._scan, stage.reach, self._schedule.largest_angle
+        )
+        if not (found.weights > 0).any():
+            reasons = ", ".join(f"{count} for {reason}" for reason, count in found.dropped.items())
+            raise ValueRangeError(
+                f"register: none of {len(vertices)} correspondences stands the tests (dropped: {reasons}); "
+                "expected the scan to show the template's face where the landmarks or its shape lay it"
+            )
+        return found
+
+    def _held_together(self, stage: Stage) -> Contacts | None:
+        if stage.contact_weight == 0 or not len(self._contacts.pairs):
+            return None
+        weights = stage.contact_weight**2 * self._contacts.weights(self.current, self._scan, self._caster)
+        return Contacts(self._contacts.pairs.numpy(), self._contacts.offsets.numpy(), weights.numpy())
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        return RayCaster(self._scan.vertices, self._scan.faces)
+
+    def _data(self, found: Correspondences, pull: LandmarkPull) -> Data:
+        share = self._area / _AREA_OF_ONE / max(len(found.vertices), 1)
+        left_out = (self._folded | self.hidden)[found.vertices]
+        weights = (share * found.weights).masked_fill(left_out, 0.0)
+        return Data(found.points.numpy(), found.normals.numpy(), weights.numpy(), pull.points.numpy())
+
+    def _landmark_distance(self) -> float:
+        left = self.current[self._landmarks.vertices] - self._landmarks.points
+        return float(left.square().sum(-1).mean().sqrt())

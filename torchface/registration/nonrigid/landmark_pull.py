@@ -1,0 +1,83 @@
+"""What landmarks pull: points of the face in full, those of its contour as far as the surface agrees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.landmarks.images.ibug import INNER
+from torchface.mesh import Mesh
+
+_DISAGREES = 10.0
+_REMARKABLE = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkPull:
+    """Template vertices and where they belong.
+
+    Args:
+        vertices: (L,) int64.
+        points: (L,3) float64.
+        contour: which of them outline the jaw, (L,) bool: annotators set these along the outline that they see, in
+            a picture or from a side, and not at a place of the skin.
+    """
+
+    vertices: Tensor
+    points: Tensor
+    contour: Tensor
+
+    @staticmethod
+    def of(vertices: Tensor, points: Tensor, template: Mesh) -> LandmarkPull:
+        """With the contour told by the template's 68 landmarks, where it has as many."""
+        contour = torch.zeros(len(vertices), dtype=torch.bool)
+        known = None if template.annotations is None else template.annotations.landmarks
+        if known is not None and len(known) == 68:
+            contour = torch.isin(vertices, known[: INNER.start].cpu())
+        return LandmarkPull(vertices, points, contour)
+
+    @staticmethod
+    def none() -> LandmarkPull:
+        """No landmark at all."""
+        empty = torch.zeros(0, dtype=torch.int64)
+        return LandmarkPull(empty, torch.zeros(0, 3, dtype=torch.float64), empty.bool())
+
+    def subset(self, rows: Tensor) -> LandmarkPull:
+        """Those of a mask (L,) or of rows."""
+        return LandmarkPull(self.vertices[rows], self.points[rows], self.contour[rows])
+
+    def distance(self, current: Tensor) -> Tensor:
+        """How far each landmark's vertex is from its point, (L,) millimetres, with the vertices (V,3)."""
+        return (current[self.vertices] - self.points).norm(dim=-1)
+
+    def slid(self, current: Tensor) -> float:
+        """How far the landmarks inside the face lie from their vertices (V,3), median, millimetres; NaN without any."""
+        inside = self.distance(current)[~self.contour]
+        return float(inside.median()) if len(inside) else float("nan")
+
+    def weights(self, current: Tensor) -> Tensor:
+        r"""How much each counts, (L,) in [0,1], with the vertices (V,3) where they are.
+
+        1 inside the face; along the contour :math:`(1 - r^2/c^2)^2` (Tukey) with r the distance that is left, and
+        nothing from c = 10 mm on: what the surface and the other landmarks contradict lets go.
+        """
+        kept = (1 - (self.distance(current) / _DISAGREES).square()).clamp(min=0).square()
+        return torch.where(self.contour, kept, 1.0)
+
+    def disagreement(self, current: Tensor) -> list[str]:
+        """A note of what the landmarks contradict, with the vertices (V,3) as the surface has left them; else none."""
+        off = self.distance(current)
+        told = []
+        for what, rows in (("along the jaw", self.contour), ("inside the face", ~self.contour)):
+            wrong = rows & (off > _REMARKABLE)
+            if wrong.any():
+                told.append(
+                    f"{int(wrong.sum())} of {int(rows.sum())} {what} by {float(off[wrong].mean()):.1f} mm on average, "
+                    f"at worst {float(off[wrong].max()):.1f} mm"
+                )
+        if not told:
+            return []
+        let_go = "; those along the jaw were let go" if (self.contour & (off > _DISAGREES)).any() else ""
+        return [f"landmarks disagree with the surface: {' and '.join(told)}{let_go}"]

@@ -1,0 +1,205 @@
+"""Where a template lies on a scan before it bends: by landmarks, or found by its shape alone, in any pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.errors import AlignmentError
+from torchface.geometry.meshes.operators import border_vertices, vertex_normals
+from torchface.geometry.similarity import Similarity
+
+_SEED = 0
+_ROTATIONS = 400
+_LANDMARK_WEIGHT = 20.0
+_SMALLEST_SCALE, _LARGEST_SCALE = 0.8, 1.25
+_DAMPING = 1e-6
+_LEAST_FIT = 0.35
+_SCAN_POINTS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points (N,3) and unit normals (N,3) of a template, float64, in an order whose beginnings are spread too."""
+
+    points: Tensor
+    normals: Tensor
+
+    def first(self, count: int) -> Samples:
+        """Fewer of them."""
+        return Samples(self.points[:count], self.normals[:count])
+
+    @staticmethod
+    def of(vertices: Tensor, faces: Tensor, ids: Tensor) -> Samples:
+        """Vertices ``ids`` in an order drawn once for all."""
+        order = ids[torch.randperm(len(ids), generator=torch.Generator().manual_seed(_SEED))]
+        points = vertices.double()
+        return Samples(points[order], vertex_normals(points, faces)[order])
+
+
+class ScanPoints:
+    """A scan's vertices with normals, to look up the nearest; at most 20,000 of them."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor) -> None:
+        points = vertices.double()
+        normals = vertex_normals(points, faces)
+        used = (normals.norm(dim=1) > 0.5).nonzero()[:, 0]
+        keep = used[torch.randperm(len(used), generator=torch.Generator().manual_seed(_SEED))[:_SCAN_POINTS]]
+        border = border_vertices(faces, len(points))
+        self.points, self.normals, self.border = points[keep], normals[keep], border[keep]
+        self._tree = cKDTree(self.points.numpy())
+
+    def nearest(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance and row of the nearest point to each query (...,3)."""
+        distance, row = self._tree.query(queries.reshape(-1, 3).numpy())
+        shape = queries.shape[:-1]
+        return torch.from_numpy(distance).reshape(shape), torch.from_numpy(row).reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Similarities, a batch of B, and how well each fits: the mean weight of its correspondences, (B,) in [0,1]."""
+
+    pose: Similarity
+    fit: Tensor
+
+    def best(self, count: int) -> Fit:
+        """The best fitting ones, best first."""
+        order = self.fit.argsort(descending=True, stable=True)[:count]
+        pose = Similarity(self.pose.scale[order], self.pose.rotation[order], self.pose.translation[order])
+        return Fit(pose, self.fit[order])
+
+
+def rigid_icp(
+    samples: Samples,
+    scan: ScanPoints,
+    start: Similarity,
+    reaches: tuple[float, ...],
+    scale: bool = False,
+    landmarks: tuple[Tensor, Tensor] | None = None,
+) -> Fit:
+    r"""Iterated closest points from many starts at once, across the surface and with falling reach.
+
+    .. math:: \min_{s,R,t} \sum_i w_i \big(n_i \cdot (s R x_i + t - u_i)\big)^2 + \lambda \sum_l \lVert s R x_l + t -
+        u_l \rVert^2, \qquad w_i = \max(0, R m_i \cdot n_i)\,(1 + d_i^2 / c^2)^{-2}
+
+    Args:
+        samples: x with normals m.
+        scan: u with normals n.
+        start: B similarities.
+        reaches: c of each step, millimetres.
+        scale: estimate s, within 0.8 to 1.25 of where it started.
+        landmarks: x and u, (L,3) each.
+
+    Source: Chen, Medioni 1992 (across the surface); Rusinkiewicz, Levoy 2001; thesis 3.2.3, figure 16.
+    """
+    s, rotation, translation = start.scale.double(), start.rotation.double(), start.translation.double()
+    lowest, highest = s * _SMALLEST_SCALE, s * _LARGEST_SCALE
+    for reach in reaches:
+        pose = Similarity(s, rotation, translation)
+        moved, targets, normals, weights = _planes(samples, scan, pose, reach)
+        if landmarks is not None:
+            extra = _landmark_planes(landmarks, pose, len(samples.points))
+            pairs = zip((moved, targets, normals, weights), extra, strict=True)
+            moved, targets, normals, weights = (torch.cat(pair, dim=1) for pair in pairs)
+        centre = moved.mean(1, keepdim=True)
+        arm = moved - centre
+        left = ((targets - moved) * normals).sum(-1)
+        rows = [torch.linalg.cross(arm, normals), normals, (arm * normals).sum(-1, keepdim=True)]
+        jacobian = torch.cat(rows if scale else rows[:2], dim=-1)
+        weighted = jacobian * weights[..., None]
+        matrix = weighted.transpose(1, 2) @ jacobian
+        size = matrix.diagonal(dim1=1, dim2=2)
+        matrix = matrix + torch.diag_embed(_DAMPING * size + 1e-9 * size.amax(1, keepdim=True) + 1e-12)
+        step = torch.linalg.solve(matrix, (weighted * left[..., None]).sum(1))
+        turn = torch.linalg.matrix_exp(_skew(step[:, :3]))
+        grow = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(s)
+        grow = (s * grow).clamp(lowest, highest) / s
+        # About the centre: x -> c + g T (x - c) + t.
+        translation = (
+            centre[:, 0] + grow[:, None] * (turn @ (translation - centre[:, 0])[..., None])[..., 0] + step[:, 3:6]
+        )
+        rotation, s = turn @ rotation, s * grow
+    pose = Similarity(s, rotation, translation)
+    return Fit(pose, _planes(samples, scan, pose, reaches[-1])[3].mean(1))
+
+
+def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
+    """The similarity that lays the template on the scan, found from starts in all directions.
+
+    Few points of the template from 400 rotations, then more of them from the best of these, and all from the best few.
+
+    Raises:
+        AlignmentError: even the best fits badly.
+    """
+    turns = _rotations(_ROTATIONS)
+    one = torch.ones(len(turns), dtype=torch.float64)
+    middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
+    own = (samples.points.amax(0) + samples.points.amin(0)) / 2
+    start = Similarity(one, turns, middle - turns @ own)
+    few = rigid_icp(samples.first(120), scan, start, _falling(80, 40, 8)).best(40)
+    more = rigid_icp(samples.first(400), scan, few.pose, _falling(40, 15, 12)).best(8)
+    most = rigid_icp(samples.first(1500), scan, more.pose, _falling(20, 8, 20), scale=True).best(1)
+    if float(most.fit[0]) < _LEAST_FIT:
+        raise AlignmentError(
+            f"register: found no pose in which the template fits the scan by shape (best fit {float(most.fit[0]):.2f} "
+            f"of 1, expected at least {_LEAST_FIT}); give landmarks"
+        )
+    return most
+
+
+def _falling(first: float, last: float, steps: int) -> tuple[float, ...]:
+    return tuple(first * (last / first) ** (i / (steps - 1)) for i in range(steps))
+
+
+def _planes(
+    samples: Samples, scan: ScanPoints, pose: Similarity, reach: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Moved samples, their scan points, normals, each (B,N,3), and weights (B,N)."""
+    moved = pose.apply(samples.points)
+    own = samples.normals @ pose.rotation.transpose(1, 2)
+    distance, row = scan.nearest(moved)
+    normals = scan.normals[row]
+    agree = (own * normals).sum(-1).clamp(min=0)
+    weights = agree * (1 + (distance / reach).square()).pow(-2) * ~scan.border[row]
+    return moved, scan.points[row], normals, weights
+
+
+def _landmark_planes(
+    landmarks: tuple[Tensor, Tensor], pose: Similarity, count: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Each landmark as three planes through its scan point, (B,3L,3); together they weigh 20 times the samples."""
+    moved = pose.apply(landmarks[0].double()).repeat_interleave(3, 1)
+    targets = landmarks[1].double().repeat_interleave(3, 0).expand_as(moved)
+    normals = torch.eye(3, dtype=torch.float64).repeat(len(landmarks[0]), 1).expand_as(moved)
+    weight = _LANDMARK_WEIGHT * count / moved.shape[1]
+    return moved, targets, normals, torch.full(moved.shape[:2], weight, dtype=torch.float64)
+
+
+def _skew(vector: Tensor) -> Tensor:
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
+
+
+def _rotations(count: int) -> Tensor:
+    """Rotations (N,3,3) spread evenly over all, the first the identity.
+
+    Source: Alexa 2022, Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3).
+    """
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    t, d = i / count, 2 * math.pi * i
+    r, rest = t.sqrt(), (1 - t).sqrt()
+    a, b = d / math.sqrt(2), d / 1.533751168755204288118041
+    x, y, z, w = r * a.sin(), r * a.cos(), rest * b.sin(), rest * b.cos()
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    spread = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    return torch.cat([torch.eye(3, dtype=torch.float64)[None], spread])

@@ -1,0 +1,153 @@
+"""A scan's colours on the registered mesh: one a vertex, and a texture in the template's layout."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchface.errors import TopologyError
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.proximity import SurfacePoints
+from torchface.geometry.meshes.uv_margin import laid_out
+from torchface.geometry.meshes.uv_raster import interpolate, rasterise_uvs
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.raycast import RayCaster
+
+_REACH = 5.0
+_BLEND = 10.0
+_LARGEST_ANGLE = 75.0
+
+
+@dataclass(frozen=True, eq=False)
+class ScanColors:
+    """Where a scan's colours are looked up.
+
+    Args:
+        scan: the scan as it came, with a texture or vertex colours.
+        faces: triangles of ``vertices`` that are registered to, (F',3), the right side out.
+        vertices: (V',3).
+        face_ids: the scan's own row of each, (F',).
+    """
+
+    scan: Mesh
+    vertices: Tensor
+    faces: Tensor
+    face_ids: Tensor
+
+    def at(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
+        """Colours (Q,3) at barycentric coordinates (Q,3) of rows (Q,) of ``faces``."""
+        rows, barycentric = self.face_ids[triangle], self._own_order(triangle, barycentric)
+        scan = self.scan
+        if scan.texture is not None and scan.uvs is not None and scan.uv_faces is not None:
+            uv = interpolate(scan.uvs.cpu().double(), scan.uv_faces.cpu()[rows], barycentric)
+            return sample_texture(scan.texture.cpu(), uv)
+        assert scan.colors is not None
+        return interpolate(scan.colors.cpu().double(), scan.faces.cpu()[rows], barycentric).float()
+
+    def _own_order(self, triangle: Tensor, barycentric: Tensor) -> Tensor:
+        """Barycentric coordinates in the order of the scan's own corners: turned triangles have them backwards."""
+        corner = self.scan.vertices.cpu().double()[self.scan.faces.cpu()[self.face_ids[:1], 0]]
+        same = torch.equal(corner, self.vertices[self.faces[:1, 0]])
+        return barycentric if same else barycentric.flip(1)
+
+
+def has_colors(scan: Mesh) -> bool:
+    """Whether a scan brings a texture that its coordinates reach, or vertex colours."""
+    return scan.colors is not None or (scan.texture is not None and scan.uvs is not None)
+
+
+def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -> Tensor:
+    """Colours (V,3) of the registered mesh's vertices; one that the scan does not show has its nearest neighbour's.
+
+    Args:
+        source: the scan.
+        nearest: of each vertex.
+        trusted: which vertices lie on the scan, (V,) bool.
+    """
+    colors = source.at(nearest.triangle, nearest.barycentric)
+    if trusted.any() and not trusted.all():
+        known = nearest.points[trusted]
+        _, row = cKDTree(known.numpy()).query(nearest.points[~trusted].numpy())
+        colors[~trusted] = colors[trusted][torch.from_numpy(row)]
+    return colors.clamp(0, 1)
+
+
+def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:
+    """What is painted where nothing is seen, (V,3): the template's colours in the person's tone, else one skin colour.
+
+    Args:
+        colors: of the registered mesh's vertices, (V,3).
+        template: with or without vertex colours.
+        seen: whose colours are the person's, (V,) bool.
+    """
+    skin = colors[seen].median(0).values if seen.any() else colors.mean(0)
+    if template.colors is None:
+        return skin.expand(len(colors), 3)
+    own = template.colors.detach().cpu().to(colors)
+    return (own * (skin / own[seen].median(0).values.clamp(min=1e-3))).clamp(0, 1) if seen.any() else own
+
+
+def shown_share(vertices: Tensor, unseen: Tensor) -> Tensor:
+    """How much of each vertex's colour is the scan's, (V,) in [0,1]: 0 where unseen, 1 from 10 mm away from there on.
+
+    Args:
+        vertices: (V,3) millimetres.
+        unseen: (V,) bool.
+    """
+    if not unseen.any():
+        return torch.ones(len(vertices))
+    gap, _ = cKDTree(vertices[unseen].numpy()).query(vertices.numpy())
+    ramp = (torch.from_numpy(gap).float() / _BLEND).clamp(0, 1)
+    return ramp.square() * (3 - 2 * ramp)
+
+
+def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanColors, size: int) -> Tensor:
+    """A texture (3,size,size) in the mesh's own layout.
+
+    From each texel's place on the registered mesh a ray goes out and one in along the normal; the nearer hit within
+    5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do, and they take
+    over where the scan does not show the skin. Charts are widened by four texels, so that no background shows at
+    their seams.
+
+    Args:
+        mesh: registered, with texture coordinates.
+        colors: of its vertices, (V,3).
+        shown: how much of the colour is the scan's, (V,) in [0,1].
+        source: the scan.
+        size: texels a side.
+    """
+    if mesh.uvs is None or mesh.uv_faces is None:
+        raise TopologyError("mesh: found no texture coordinates, expected some to lay a texture out in")
+    texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
+    faces, vertices = mesh.faces.cpu(), mesh.vertices.detach().cpu().double()
+    points = texels.interpolate(vertices, faces)
+    normals = torch.nn.functional.normalize(texels.interpolate(vertex_normals(vertices, faces), faces), dim=-1)
+    values = texels.interpolate(colors.double(), faces).float()
+    share = texels.interpolate(shown[:, None].double(), faces).float()
+    wanted = (share[:, 0] > 0).nonzero()[:, 0]
+    triangle, barycentric, found = _along_normals(source, points[wanted], normals[wanted])
+    rows = wanted[found]
+    values[rows] = torch.lerp(values[rows], source.at(triangle[found], barycentric[found]), share[rows])
+    return laid_out(values.clamp(0, 1), texels)
+
+
+def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    caster = RayCaster(source.vertices, source.faces)
+    surface = vertex_normals(source.vertices, source.faces)
+    best = torch.full((len(points),), _REACH, dtype=torch.float64)
+    triangle = torch.full((len(points),), -1, dtype=torch.int64)
+    barycentric = torch.zeros(len(points), 3, dtype=torch.float64)
+    for way in (normals, -normals):
+        hits = caster.cast(points, way)
+        there = interpolate(surface, source.faces[hits.triangle.clamp(min=0)], hits.barycentric.double())
+        alike = (there * normals).sum(-1) > math.cos(math.radians(_LARGEST_ANGLE)) * there.norm(dim=-1)
+        better = (hits.triangle >= 0) & alike & (hits.distance < best)
+        best = torch.where(better, hits.distance, best)
+        triangle = torch.where(better, hits.triangle, triangle)
+        barycentric = torch.where(better[:, None], hits.barycentric.double(), barycentric)
+    return triangle, barycentric, triangle >= 0

@@ -1,0 +1,170 @@
+"""What is wrong with a scan and its landmarks, mended where that is safe and said where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.operators import components, triangle_areas, triangle_cross
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.mesh import Mesh
+
+_LEAST_TRIANGLES = 50
+_CRUMB = 0.02
+_OFF_SURFACE = 15.0
+_WORST_LANDMARK_FIT = 0.1
+_LINE = 0.02
+_UNITS = {"metres": ("m", 1e-3), "centimetres": ("cm", 0.1), "inches": ("", 1 / 25.4), "micrometres": ("", 1e3)}
+
+Landmarks = tuple[Tensor, Tensor]
+"""Template vertex ids (L,) int64, and where they lie on the scan, (L,3) millimetres; a NaN row is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScan:
+    """The surface of a scan that is registered to.
+
+    Args:
+        vertices: (V',3) float64, those at the same place made one.
+        faces: (F',3), without crumbs, the right side out.
+        face_ids: the scan's own row of each, (F',).
+        notes: what was done.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    face_ids: Tensor
+    notes: tuple[str, ...]
+
+    def turned(self) -> PreparedScan:
+        """The other side out."""
+        note = "the scan's triangles are clockwise seen from outside (flipped normals); they were turned over"
+        return PreparedScan(self.vertices, self.faces.flip(1), self.face_ids, (*self.notes, note))
+
+
+def check_template(template: Mesh) -> None:
+    """Raises ``TopologyError`` or ``ValueRangeError`` where nothing can be registered."""
+    if len(template.faces) < _LEAST_TRIANGLES:
+        raise TopologyError(
+            f"template: found {len(template.faces)} triangles, expected at least {_LEAST_TRIANGLES}, a face's mesh"
+        )
+    if not float(triangle_areas(template.vertices, template.faces).sum()) > 0:
+        raise ValueRangeError("template: found no triangle with any area, expected a face's mesh")
+
+
+def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
+    """Checks size and unit, joins vertices that lie at one place, drops small loose parts, turns the outside out.
+
+    Raises:
+        TopologyError: the scan is empty or tiny.
+        ValueRangeError: it has no area, or its extent tells another unit than millimetres.
+    """
+    found = len(scan.faces)
+    if found < _LEAST_TRIANGLES:
+        raise TopologyError(
+            f"scan: found {len(scan.vertices)} vertices and {found} triangles, expected a surface of at least "
+            f"{_LEAST_TRIANGLES} triangles"
+        )
+    vertices, place = torch.unique(scan.vertices.detach().cpu().double(), dim=0, return_inverse=True)
+    faces = place[scan.faces.cpu()]
+    areas = triangle_areas(vertices, faces)
+    solid = areas > 0
+    if int(solid.sum()) < _LEAST_TRIANGLES:
+        raise ValueRangeError(
+            f"scan: found {int(solid.sum())} triangles with any area, expected at least {_LEAST_TRIANGLES}"
+        )
+    _check_unit(vertices[faces[solid].flatten()], template)
+    label = components(faces, len(vertices))[faces[:, 0]]
+    area_of = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, areas)
+    large = area_of >= _CRUMB * area_of.max()
+    keep = solid & large[label]
+    notes = []
+    crumbs = int((~large & (area_of > 0)).sum())
+    if crumbs:
+        lost = int((solid & ~large[label]).sum())
+        share = float(area_of[~large].sum() / area_of.sum())
+        notes.append(f"{crumbs} loose parts of the scan ({lost} triangles, {share:.1%} of its area) were left out")
+    face_ids = keep.nonzero()[:, 0]
+    used, faces = faces[face_ids].unique(return_inverse=True)
+    prepared = PreparedScan(vertices[used], faces, face_ids, tuple(notes))
+    return prepared.turned() if _inside_out(prepared) else prepared
+
+
+def _check_unit(points: Tensor, template: Mesh) -> None:
+    """A scan may show less than the face or the whole person; units differ by more than that."""
+    used = template.vertices[template.faces.flatten()].double()
+    sizes = [float((x.amax(0) - x.amin(0)).norm()) for x in (used, points)]
+    ratio = sizes[1] / sizes[0]
+    if 0.17 <= ratio <= 9:
+        return
+    close = [(name, code) for name, (code, size) in _UNITS.items() if 0.3 < ratio / size < 6]
+    looks = f"; it looks as if the scan were in {close[0][0]}" if close else ""
+    mend = (
+        f" (load it with unit={close[0][1]!r}; on the command line --unit {close[0][1]})"
+        if close and close[0][1]
+        else ""
+    )
+    raise ValueRangeError(
+        f"scan: found an extent of {sizes[1]:.4g} mm beside a template of {sizes[0]:.4g} mm{looks}{mend}; "
+        "expected both in millimetres"
+    )
+
+
+def _inside_out(scan: PreparedScan) -> bool:
+    """Whether the triangles look toward the middle of the bounding box, where a face's or head's do not."""
+    cross = triangle_cross(scan.vertices, scan.faces)
+    centres = scan.vertices[scan.faces].mean(1)
+    mean = (centres * cross.norm(dim=-1, keepdim=True)).sum(0) / cross.norm(dim=-1).sum()
+    # An open shell's mean lies behind it, a head's inside: on both the outside looks away from there.
+    return float((cross * (centres - mean)).sum()) < 0
+
+
+def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) -> tuple[Landmarks, Similarity, str]:
+    """The landmarks that can be used, the similarity they give, and a note of what was left out ("" if nothing).
+
+    Raises:
+        ShapeError: not (L,) and (L,3), or fewer than three are left.
+        TopologyError: a vertex id outside the template.
+        ValueRangeError: they lie on a line, or off the scan.
+        AlignmentError: no similarity brings the template's landmarks near the scan's.
+    """
+    ids, points = landmarks[0].detach().cpu(), landmarks[1].detach().cpu().double()
+    if ids.ndim != 1 or points.shape != (len(ids), 3) or ids.dtype != torch.int64:
+        raise ShapeError(
+            f"landmarks: found {ids.dtype} {tuple(ids.shape)} and {tuple(points.shape)}, "
+            "expected template vertex ids (L,) int64 and scan points (L,3)"
+        )
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < len(template.vertices):
+        raise TopologyError(
+            f"landmarks: found template vertices {int(ids.min())} to {int(ids.max())}, "
+            f"expected 0 to {len(template.vertices) - 1}"
+        )
+    present = torch.isfinite(points).all(-1)
+    off = torch.zeros_like(present)
+    off[present] = scan.nearest(points[present]).distance > _OFF_SURFACE
+    keep = present & ~off
+    told = [f"{int((~present).sum())} are NaN"] * bool((~present).any())
+    told += [f"{int(off.sum())} lie more than {_OFF_SURFACE:g} mm off the scan's surface"] * bool(off.any())
+    if int(keep.sum()) < 3:
+        why = f" ({', '.join(told)})" if told else ""
+        raise ShapeError(f"landmarks: found {int(keep.sum())} that can be used of {len(ids)}{why}, expected at least 3")
+    ids, points = ids[keep], points[keep]
+    own = template.vertices.detach().cpu().double()[ids]
+    for name, cloud in (("template", own), ("scan", points)):
+        spread = torch.linalg.svdvals(cloud - cloud.mean(0))
+        if float(spread[1]) <= _LINE * float(spread[0]):
+            raise ValueRangeError(f"landmarks: those on the {name} lie on a line, expected a triangle of them")
+    pose = similarity_transform(own[None], points[None])
+    error = float((pose.apply(own)[0] - points).square().sum(-1).mean().sqrt())
+    size = float((points.amax(0) - points.amin(0)).norm())
+    if error > _WORST_LANDMARK_FIT * size:
+        raise AlignmentError(
+            f"landmarks: the best similarity leaves {error:.1f} mm (root mean square) between the template's and the "
+            f"scan's, which are {size:.0f} mm across; expected both in the same order"
+        )
+    note = f"of {len(keep)} landmarks {' and '.join(told)}; they were left out" if told else ""
+    return (ids, points), pose, note

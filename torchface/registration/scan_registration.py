@@ -1,0 +1,363 @@
+"""A template bent onto a raw scan: the scan's face in the template's topology."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ShapeError
+from torchface.geometry.meshes.operators import edges, vertex_normals
+from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
+from torchface.geometry.similarity import Similarity
+from torchface.mesh import Mesh
+from torchface.registration.completion import completed_colors, completed_form
+from torchface.registration.hair_and_cloth import Cover
+from torchface.registration.model_fit import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
+from torchface.registration.nonrigid.correspondence import evenly_spread, exposed_vertices
+from torchface.registration.nonrigid.deformer import Deformer
+from torchface.registration.nonrigid.landmark_pull import LandmarkPull
+from torchface.registration.nonrigid.lip_contact import contact_pull
+from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
+from torchface.registration.nonrigid.stage_record import RegistrationRecord
+from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose, rigid_icp
+from torchface.registration.scan_colors import (
+    ScanColors,
+    has_colors,
+    resampled_texture,
+    shown_share,
+    skin_base,
+    vertex_colors,
+)
+from torchface.registration.scan_preparation import (
+    Landmarks,
+    PreparedScan,
+    check_landmarks,
+    check_template,
+    prepare_scan,
+)
+
+_RIGID_SAMPLES = 1500
+_RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
+_NEAR = 3.0
+_FAR = 10.0
+_SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lies close to the scan
+_MOST_COMPLETIONS = 6
+_FEWEST_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
+
+Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
+"""Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
+space to the other's; gives template vertex ids and scan points, or nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A template registered to a scan.
+
+    Args:
+        mesh: the scan's face in the template's topology, in the scan's place, with the scan's colours.
+        pose: the similarity that first laid the template on the scan, a batch of one.
+        distance: of each vertex to the scan, (V,) float64, millimetres; beyond 10 mm it may be a little too long.
+        matched: which vertices' places the scan tells, (V,) bool; the others follow their neighbours.
+        record: what was done.
+        coefficients: of the model that the registration started from, (K,), where one was given.
+    """
+
+    mesh: Mesh
+    pose: Similarity
+    distance: Tensor
+    matched: Tensor
+    record: RegistrationRecord
+    coefficients: Tensor | None = None
+
+
+def register(
+    template: Mesh,
+    scan: Mesh,
+    landmarks: Landmarks | None = None,
+    *,
+    detector: Detector | None = None,
+    model: ShapeModel | HasShape | None = None,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+    texture_size: int = 1024,
+    progress: Callable[[str], None] | None = None,
+) -> Registration:
+    r"""The scan's face in the template's topology, by non-rigid iterated closest points.
+
+    .. math:: E(X) = \lVert \alpha (M \otimes G) X \rVert^2 + \lVert W (D X - U) \rVert^2
+        + \lVert \beta (D_L X - U_L) \rVert^2
+
+    A similarity lays the template on the scan, by landmarks where there are any, else by its shape alone, in any
+    pose. Rigid iterated closest points settle it. Then the template bends: for stiffness :math:`\alpha` falling in
+    steps, correspondences and the best affine maps X are found in turn until the vertices rest. All in float64 on
+    the CPU; the same input gives the same result.
+
+    Args:
+        template: a face, millimetres. Only what faces outward looks for the scan; parts that share no vertex with it
+            (eyeballs, teeth) follow the rest.
+        scan: millimetres; any topology and pose, with holes, hair, collar, crumbs, either side out.
+        landmarks: template vertex ids (L,) int64 and scan points (L,3); at least three, NaN rows are skipped. Those of
+            the jaw's contour (of a template with 68) let go where surface and other landmarks contradict them.
+        detector: asked for landmarks where none are given, once the template lies on the scan.
+        model: of faces in the template's topology (a ``MorphableModel`` or ``HeadModel``). It is fitted to the scan
+            first and the template bends from there: what the model knows no longer slides along the surface. The
+            schedule's first stage, which does the same roughly, is left out.
+        schedule: which steps, see ``Schedule``.
+        texture_size: texels a side of the texture that is made where the scan has colours and the template
+            texture coordinates; 0 makes none.
+        progress: called with a line before each step.
+
+    Returns:
+        ``Registration(mesh, pose, distance (V,), matched (V,), record)``.
+
+    Raises:
+        ShapeError: landmarks of the wrong shape, or fewer than three that can be used.
+        TopologyError: an empty or tiny mesh, a landmark on no vertex of the template, or a model of another topology.
+        ValueRangeError: another unit than millimetres, landmarks on a line, or a scan that does not show the face.
+        AlignmentError: the landmarks do not fit, no pose is found without them, or hardly anything of the template
+            comes to lie on the scan.
+
+    Source: Amberg, Romdhani, Vetter 2007; thesis 3.2.3, equation 7 and Algorithm 1.
+    """
+    begin, say = time.perf_counter(), progress or (lambda line: None)
+    if texture_size < 0 or texture_size > 16384:
+        raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")
+    check_template(template)
+    shape = None if model is None else shape_model(model, template)
+    say("checking the scan")
+    prepared = prepare_scan(scan, template)
+    say("laying the template on the scan")
+    start = _start(template, scan, prepared, landmarks, detector, schedule)
+    laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
+    contacts = contact_pull(laid, template)
+    fit, stages_left = None, schedule.stages
+    if shape is not None:
+        say("fitting the model")
+        fit = _model_fit(shape, template, laid, start, schedule)
+        laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
+    deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
+    cover = Cover(template, deformer.exposed, start.surface, _scan_colors(scan, start.prepared))
+    start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
+    stages = []
+    for number, stage in enumerate(stages_left, 1):
+        say(f"bending, stage {number} of {len(stages_left)}")
+        deformer.hidden = cover.hidden(deformer.current, settled=stage.reach <= _SETTLED)
+        stages.append(deformer.run(stage, number))
+    deformer.unfold()
+    say("measuring")
+    nearest = _nearest(start.surface, deformer.current)
+    matched = cover.without_islands(_matched(deformer, start.surface, nearest, schedule))
+    met = float(matched[deformer.exposed].double().mean())
+    if met < _FEWEST_MET:
+        raise AlignmentError(
+            f"scan: found only {met:.0%} of the bent template's surface on the scan, expected at least "
+            f"{_FEWEST_MET:.0%}; do the landmarks belong to this scan, and does it show what the template shows?"
+        )
+    unseen = ~cover.features & ~matched
+    if unseen.any():
+        say("completing what the scan does not show")
+        nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
+        matched &= ~unseen
+    mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
+    notes = [*start.notes, *start.pull.disagreement(deformer.current), *_model_notes(fit)]
+    notes += _final_notes(template, scan, deformer, texture_size)
+    colors = _scan_colors(scan, start.prepared)
+    if colors is not None:
+        say("resampling the scan's colours")
+        mesh = _colored(mesh, template, colors, nearest, matched, unseen, texture_size)
+    record = RegistrationRecord(
+        start.by,
+        start_distance,
+        tuple(stages),
+        tuple(notes),
+        float(nearest.distance[matched].median()) if matched.any() else float("nan"),
+        float(matched.double().mean()),
+        time.perf_counter() - begin,
+        float(nearest.distance[matched].quantile(0.95)) if matched.any() else float("nan"),
+        float(matched[deformer.outward].double().mean()),
+        float((deformer.hidden & ~matched)[deformer.outward].double().mean()),
+        _stretch(template, deformer.current, matched),
+        start.pull.slid(deformer.current),
+    )
+    device = template.vertices.device
+    coefficients = None if fit is None else fit.coefficients.to(template.vertices)
+    return Registration(mesh, start.pose, nearest.distance.to(device), matched.to(device), record, coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    by: str
+    pose: Similarity
+    pull: LandmarkPull
+    prepared: PreparedScan
+    surface: SurfaceIndex
+    notes: tuple[str, ...]
+
+
+def _start(
+    template: Mesh,
+    scan: Mesh,
+    prepared: PreparedScan,
+    landmarks: Landmarks | None,
+    detector: Detector | None,
+    schedule: Schedule,
+) -> _Start:
+    """The pose, by landmarks or shape, and the scan with its outside out."""
+    vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
+    exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
+    samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
+    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), []
+    if landmarks is None:
+        by = "shape"
+        pose = _pose_by_shape(template, samples, ScanPoints(prepared.vertices, prepared.faces), exposed)
+        if detector is not None:
+            laid = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
+            landmarks = detector(laid, scan, pose)
+            by = "detected landmarks" if landmarks is not None else by
+    if landmarks is None:
+        return _Start(by, pose, LandmarkPull.none(), prepared, surface, prepared.notes)
+    (ids, points), pose, note = check_landmarks(landmarks, template, surface)
+    notes += [note] if note else []
+    if _faces_away(samples, surface, pose):
+        prepared = prepared.turned()
+        surface = SurfaceIndex(prepared.vertices, prepared.faces)
+    targets = ScanPoints(prepared.vertices, prepared.faces)
+    pose = rigid_icp(samples, targets, pose, _RIGID_REACHES, scale=True, landmarks=(vertices[ids], points)).pose
+    return _Start(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
+
+
+def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> Similarity:
+    """By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan."""
+    try:
+        return find_pose(samples, scan).pose
+    except AlignmentError:
+        notes = template.annotations
+        if notes is None or "face" not in notes.regions:
+            raise
+        face = exposed[notes.regions["face"].cpu()[exposed]]
+        if len(face) < 3:
+            raise
+        vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
+        return find_pose(Samples.of(vertices, faces, evenly_spread(vertices, face, _RIGID_SAMPLES)), scan).pose
+
+
+def _model_fit(model: ShapeModel, template: Mesh, laid: Tensor, start: _Start, schedule: Schedule) -> ModelFit:
+    faces = template.faces.cpu()
+    exposed = exposed_vertices(laid, faces, schedule.opening).nonzero()[:, 0]
+    landmarks = (start.pull.vertices, start.pull.points)
+    return fit_to_scan(model, faces, laid, exposed, start.surface, landmarks, schedule.largest_angle)
+
+
+def _model_notes(fit: ModelFit | None) -> list[str]:
+    if fit is None:
+        return []
+    far = float(fit.coefficients.abs().max())
+    return [f"the model comes to {fit.noise:.2f} mm (robust deviation) of the scan, {far:.1f} standard deviations off"]
+
+
+def _faces_away(samples: Samples, surface: SurfaceIndex, pose: Similarity) -> bool:
+    """Whether most normals of the scan oppose the template's where both are near each other."""
+    found = surface.among_nearest_samples(pose.apply(samples.points)[0])
+    agree = (surface.normals_at(found) * (samples.normals @ pose.rotation[0].double().T)).sum(-1)
+    near = found.distance <= found.distance.median()
+    return float(agree[near].mean()) < 0
+
+
+def _nearest(surface: SurfaceIndex, points: Tensor) -> SurfacePoints:
+    """Exact where the scan is near; what has no place on it would take many times as long as all the rest."""
+    quick = surface.among_nearest_samples(points)
+    near = quick.distance <= _FAR
+    exact = surface.nearest(points[near])
+    for found, better in ((quick.points, exact.points), (quick.barycentric, exact.barycentric)):
+        found[near] = better
+    quick.triangle[near], quick.distance[near] = exact.triangle, exact.distance
+    return quick
+
+
+def _matched(deformer: Deformer, surface: SurfaceIndex, nearest: SurfacePoints, schedule: Schedule) -> Tensor:
+    own = vertex_normals(deformer.current, deformer.faces)
+    cosine = torch.cos(torch.deg2rad(torch.tensor(schedule.largest_angle, dtype=torch.float64)))
+    alike = (own * surface.normals_at(nearest)).sum(-1) >= cosine
+    return deformer.outward & ~deformer.hidden & alike & ~surface.on_border(nearest) & (nearest.distance <= _NEAR)
+
+
+def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: int) -> list[str]:
+    notes = []
+    folded = int(deformer.folded_triangles().sum())
+    if folded:
+        notes.append(f"{folded} triangles of the result are turned over")
+    if not has_colors(scan):
+        notes.append(
+            "the scan has neither a texture with coordinates nor vertex colours (is the picture that its material "
+            "names beside it?); the result has no colours"
+        )
+    elif template.uvs is None and texture_size:
+        notes.append("the template has no texture coordinates; the scan's colours are on the vertices only")
+    return notes
+
+
+def _completed(
+    deformer: Deformer, template: Mesh, surface: SurfaceIndex, nearest: SurfacePoints, unseen: Tensor, cover: Cover
+) -> tuple[SurfacePoints, Tensor]:
+    """Lays the unseen vertices where the template has them; the places on the scan and what is unseen then.
+
+    Where that turns triangles over, as between skin and an ear under hair, what lies around them is unseen too, and
+    of an ear all.
+    """
+    before, rest, faces = deformer.current, template.vertices.detach().cpu().double(), deformer.faces
+    for _ in range(_MOST_COMPLETIONS):
+        shown = deformer.outward & ~unseen
+        deformer.lay(completed_form(rest, before, faces, unseen, shown))
+        folded = faces[deformer.folded_triangles()].flatten()
+        around = torch.zeros_like(unseen)
+        around[folded[~cover.features[folded]]] = True
+        around[faces[around[faces].any(-1)].flatten()] = True
+        around &= ~cover.features
+        if not around.any():
+            break
+        unseen = torch.stack([unseen, around, *(ear for ear in cover.ears if (ear & around).any())]).any(0)
+    deformer.unfold()
+    moved = ((deformer.current - before).square().sum(-1) > 0).nonzero()[:, 0]
+    newer = _nearest(surface, deformer.current[moved])
+    found = SurfacePoints(*(part.clone() for part in vars(nearest).values()))
+    found.points[moved], found.triangle[moved] = newer.points, newer.triangle
+    found.barycentric[moved], found.distance[moved] = newer.barycentric, newer.distance
+    return found, unseen
+
+
+def _stretch(template: Mesh, current: Tensor, matched: Tensor) -> float:
+    """The 95th percentile of how much an edge between matched vertices has grown or shrunk beyond the whole."""
+    first, second = edges(template.faces.cpu()).T
+    seen = matched[first] & matched[second]
+    if not seen.any():
+        return float("nan")
+    before, after = (x[first[seen]] - x[second[seen]] for x in (template.vertices.detach().cpu().double(), current))
+    ratio = (after.norm(dim=-1) / before.norm(dim=-1).clamp(min=1e-9)).clamp(min=1e-9).log()
+    return float((ratio - ratio.median()).abs().quantile(0.95).expm1())
+
+
+def _scan_colors(scan: Mesh, prepared: PreparedScan) -> ScanColors | None:
+    return ScanColors(scan, prepared.vertices, prepared.faces, prepared.face_ids) if has_colors(scan) else None
+
+
+def _colored(
+    mesh: Mesh,
+    template: Mesh,
+    source: ScanColors,
+    nearest: SurfacePoints,
+    matched: Tensor,
+    unseen: Tensor,
+    size: int,
+) -> Mesh:
+    colors = vertex_colors(source, nearest, matched)
+    place, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    shown = shown_share(place, unseen)
+    # The last skin before hair is in its shadow: the fill starts where the scan's colours count in full.
+    filled = completed_colors(colors, skin_base(colors, template, matched), place, faces, shown < 1)
+    colors = torch.lerp(filled, colors, shown[:, None])
+    texture = resampled_texture(mesh, filled, shown, source, size) if size and mesh.uvs is not None else None
+    device = mesh.vertices.device
+    return replace(mesh, colors=colors.to(device), texture=None if texture is None else texture.to(device))

@@ -1,0 +1,71 @@
+"""What of a head a photograph shows, and how squarely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import distort
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.raycast import RayCaster
+
+_OFF_THE_SKIN = 0.2  # millimetres; a ray that starts on the skin would hit it
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Points (Q,) in one photograph.
+
+    Args:
+        cosine: between the normal and the way to the camera, (Q,); 0 where the point is hidden or outside the picture.
+        colors: of the picture there, (Q,3), bilinear.
+    """
+
+    cosine: Tensor
+    colors: Tensor
+
+
+def shown_in(
+    image: Tensor,
+    camera: Camera,
+    caster: RayCaster,
+    points: Tensor,
+    normals: Tensor,
+    calibration: CameraCalibration | None = None,
+) -> Shown:
+    """What a photograph (3,H,W) shows at points (Q,3) with normals (Q,3).
+
+    Args:
+        image: the photograph, in the camera's size.
+        camera: that took it.
+        caster: the mesh that the points lie on, which hides some of them.
+        points: millimetres.
+        normals: unit.
+        calibration: of a lens that bends the picture; none if absent.
+
+    Raises:
+        ShapeError: the picture is not of the camera's size.
+    """
+    if image.ndim != 3 or image.shape != (3, camera.height, camera.width):
+        raise ShapeError(f"images: found {tuple(image.shape)}, expected (3,{camera.height},{camera.width})")
+    points, normals = points.double(), normals.double()
+    toward = torch.nn.functional.normalize(camera.centre.double() - points, dim=-1)
+    cosine = (toward * normals).sum(-1).clamp(min=0)
+    depth = points @ camera.rotation.double()[2] + camera.translation.double()[2]
+    pixels = camera.project(points)
+    limit = torch.tensor([camera.width - 1, camera.height - 1], dtype=torch.float64)
+    if calibration is not None:
+        pixels = distort(pixels, calibration)
+    within = ((pixels >= 0) & (pixels <= limit)).all(-1) & (depth > 0)
+    asked = (within & (cosine > 0)).nonzero()[:, 0]
+    starts = points[asked] + _OFF_THE_SKIN * (normals[asked] + toward[asked])
+    hidden = caster.occluded(starts, toward[asked])
+    result = torch.zeros_like(cosine)
+    result[asked[~hidden]] = cosine[asked[~hidden]]
+    uv = (torch.nan_to_num(pixels) + 0.5) / (limit + 1)
+    return Shown(result, sample_texture(image, torch.stack([uv[:, 0], 1 - uv[:, 1]], dim=-1)))

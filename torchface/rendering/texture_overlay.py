@@ -1,0 +1,252 @@
+"""A painted texture on a filmed face in the light of the film, and a filmed face under another light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.mesh import Mesh
+from torchface.rendering.color_space import to_linear, to_srgb
+from torchface.rendering.pixel_coverage import Footprint, footprint
+from torchface.rendering.point_light import PointLight, irradiance, lit_by
+
+_NOT_SKIN = (
+    "eyeball", "eye_socket", "eye_blend", "eye_occlusion", "eyelash", "lacrimal", "mouth_interior", "mouth_socket",
+    "gums", "teeth", "tongue", "nostrils",
+)  # fmt: skip
+_MOST_GAIN = 10.0
+_FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
+_BESIDE = 9  # rounds of blur; three pixels
+_LARGEST = 8192
+
+
+def skin_faces(mesh: Mesh) -> Tensor:
+    """Triangles that are skin, (F,) bool: all but those that touch eyeballs, sockets, teeth or the inside of the mouth.
+
+    By the names of the annotated regions; a mesh without is skin all over.
+    """
+    skin = torch.ones(len(mesh.vertices), dtype=torch.bool)
+    if mesh.annotations is not None:
+        for name, mask in mesh.annotations.regions.items():
+            if name.startswith(_NOT_SKIN):
+                skin &= ~mask.cpu()
+    return skin[mesh.faces.cpu()].all(1)
+
+
+@dataclass(frozen=True, eq=False)
+class FacePaint:
+    """Paint for the skin of a mesh, prepared once for many frames.
+
+    Args:
+        mesh: topology, texture coordinates and regions; where its vertices are does not matter.
+        levels: the paint, linear, colour times alpha and alpha, (4,h,w), each half as large as the one before.
+        skin: triangles that take paint, (F,).
+    """
+
+    mesh: Mesh
+    levels: tuple[Tensor, ...]
+    skin: Tensor
+
+    @staticmethod
+    def of(mesh: Mesh, texture: Tensor) -> FacePaint:
+        """Paint of a picture in the mesh's texture coordinates.
+
+        Args:
+            mesh: with texture coordinates.
+            texture: red, green, blue (sRGB) and alpha, (4,h,w), uint8 or in [0,1], first row on top; alpha 0 leaves
+                the video as it is.
+
+        Raises:
+            TopologyError: the mesh has no texture coordinates.
+            ShapeError: the texture is not (4,h,w).
+            ValueRangeError: its values are outside of [0,1].
+        """
+        if mesh.uvs is None or mesh.uv_faces is None:
+            raise TopologyError("overlay: found a mesh without texture coordinates, expected some to paint by")
+        if texture.ndim != 3 or texture.shape[0] != 4 or not 1 <= min(texture.shape) <= max(texture.shape) <= _LARGEST:
+            raise ShapeError(
+                f"texture: found {tuple(texture.shape)}, expected (4,h,w), red, green, blue and alpha, at most "
+                f"{_LARGEST} a side"
+            )
+        values = texture.detach().cpu()
+        values = values.float() / 255 if values.dtype == torch.uint8 else values.float()
+        if not bool(((values >= 0) & (values <= 1)).all()):
+            raise ValueRangeError("texture: found values outside of [0,1] or NaN, expected colours and alpha in [0,1]")
+        levels = [torch.cat([to_linear(values[:3]) * values[3:], values[3:]])]
+        while min(levels[-1].shape[1:]) > 4:
+            levels.append(torch.nn.functional.avg_pool2d(levels[-1][None], 2, ceil_mode=True)[0])
+        return FacePaint(mesh, tuple(levels), skin_faces(mesh))
+
+    def at(self, covered: Footprint, coarseness: float) -> Tensor:
+        """The paint at samples, (S,4), where a pixel is ``coarseness`` texels wide."""
+        assert self.mesh.uvs is not None
+        assert self.mesh.uv_faces is not None
+        uv = covered.of_vertices(self.mesh.uvs.cpu().double(), self.mesh.uv_faces.cpu()).float()
+        grid = torch.stack([uv[:, 0] * 2 - 1, 1 - uv[:, 1] * 2], dim=-1)[None, None]
+        level = min(max(math.log2(max(coarseness, 1e-6)), 0.0), len(self.levels) - 1.0)
+        below = min(int(level), len(self.levels) - 1)
+        result = _read(self.levels[below], grid)
+        if below + 1 < len(self.levels) and level > below:
+            result = torch.lerp(result, _read(self.levels[below + 1], grid), level - below)
+        return result
+
+
+def overlay(
+    frame: Tensor,
+    vertices: Tensor,
+    paint: FacePaint,
+    light: PointLight,
+    camera: Camera,
+    calibration: CameraCalibration | None = None,
+) -> Tensor:
+    r"""A frame with paint on the face, lit as the face is.
+
+    .. math:: C = (1 - \alpha)\, C_{frame} + \alpha\, g\text{-coded}\; T (I_a + I_p \max(0, N \cdot L)\, s)
+
+    mixed in linear light. What the mesh itself hides stays unpainted, eyeballs and the inside of the mouth too; hair,
+    hands and glasses in front of the face are not known and are painted over. Edges are antialiased.
+
+    Args:
+        frame: (3,H,W) sRGB, uint8 or in [0,1].
+        vertices: of the face in it, (V,3), millimetres.
+        paint: see :meth:`FacePaint.of`.
+        light: as ``estimate_light`` finds it; its strengths belong to an albedo that the paint replaces.
+        camera: of the frame.
+        calibration: of a lens that bends the frame; paint is bent with it.
+
+    Returns:
+        A frame of the same kind; the same where the face lies outside.
+
+    Raises:
+        ShapeError: the frame is not of the camera's size, or the vertices are not the mesh's.
+        ValueRangeError: NaN in the vertices.
+
+    Source: thesis 4.2.11 and figure 80.
+    """
+    picture = _checked(frame, vertices, paint.mesh, camera)
+    covered = footprint(vertices, paint.mesh.faces.cpu(), paint.skin, camera, calibration)
+    if len(covered.pixel) == 0:
+        return frame
+    colors = paint.at(covered, _coarseness(covered, paint))
+    painted = (colors[:, 3] > 1e-4).nonzero()[:, 0]
+    if len(painted) == 0:
+        return frame
+    covered, colors = covered.select(painted), colors[painted]
+    shade = _light_on(covered, light, _soft_shadow(covered, light))
+    mixed = covered.blended(to_linear(picture), colors[:, :3] * shade, colors[:, 3])
+    return _as(frame, picture, mixed, covered.pixel)
+
+
+def relight(
+    frame: Tensor,
+    vertices: Tensor,
+    mesh: Mesh,
+    light: PointLight,
+    new_light: PointLight,
+    camera: Camera,
+    calibration: CameraCalibration | None = None,
+    share: Tensor | None = None,
+) -> Tensor:
+    r"""A frame with the face under another light: each pixel times the quotient of new and old light there.
+
+    .. math:: C' = C\; \frac{I'_a + I'_p \max(0, N \cdot L')\, s'}{I_a + I_p \max(0, N \cdot L)\, s}
+
+    in linear light, so that pores, beard and colour stay; no albedo is needed. At most ten times as bright: noise of
+    black shadows is no skin. Highlights of the old lamp stay where they were.
+
+    Args:
+        frame: (3,H,W) sRGB, uint8 or in [0,1].
+        vertices: of the face in it, (V,3), millimetres.
+        mesh: its topology.
+        light: of the frame, as ``estimate_light`` finds it.
+        new_light: wanted instead.
+        camera: of the frame.
+        calibration: of a lens that bends the frame.
+        share: how far each vertex is relit, (V,) in [0,1]; fade it out where hair or collar begins. All of it if
+            absent.
+
+    Returns:
+        A frame of the same kind.
+
+    Raises:
+        ShapeError: the frame is not of the camera's size, or vertices or share are not the mesh's.
+        ValueRangeError: NaN in the vertices.
+
+    Source: thesis 4.2.11 and figure 80.
+    """
+    picture = _checked(frame, vertices, mesh, camera)
+    if share is not None and share.shape != (len(mesh.vertices),):
+        raise ShapeError(f"share: found {tuple(share.shape)}, expected ({len(mesh.vertices)},)")
+    faces = mesh.faces.cpu()
+    covered = footprint(vertices, faces, torch.ones(len(faces), dtype=torch.bool), camera, calibration)
+    if len(covered.pixel) == 0:
+        return frame
+    linear = to_linear(picture)
+    old, lit = linear.reshape(3, -1).T[covered.pixel], _soft_shadow(covered, light)
+    reflected = (old + _FLOOR) / (_light_on(covered, light, lit) + _FLOOR)
+    # Where the old shadow ends, a pixel's lag between mesh and face would draw a line, and where the face ends, pixels
+    # hold some of what is behind: the skin beside it goes there.
+    clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2 * (covered.share == 1)
+    reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
+    new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
+    new = torch.minimum(new.clamp(min=0), _MOST_GAIN * old)
+    alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
+    return _as(frame, picture, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
+
+
+def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
+    """The share of the lamp that samples see, (S,); edges are soft, as those of lamps with a size and lenses."""
+    lit = lit_by(light.position, covered.caster, covered.points, covered.normals)
+    return covered.softened(lit[:, None])[:, 0]
+
+
+def _light_on(covered: Footprint, light: PointLight, lit: Tensor) -> Tensor:
+    """Red, green and blue light at the samples, (S,3)."""
+    return irradiance(covered.points, covered.normals, light, lit.double()).float()
+
+
+def _coarseness(covered: Footprint, paint: FacePaint) -> float:
+    """Texels that a pixel covers side by side, the median over the face; one for the whole face, so no seam shows."""
+    mesh, rows = paint.mesh, covered.triangle.unique()
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    height, width = paint.levels[0].shape[1:]
+    a, b, c = (mesh.uvs.cpu().double()[mesh.uv_faces.cpu()[rows, k]] * torch.tensor([width, height]) for k in range(3))
+    texels = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).abs().sum() / 2
+    pixels = float(covered.share.sum())
+    return math.sqrt(float(texels) / max(pixels, 1.0))
+
+
+def _read(texture: Tensor, grid: Tensor) -> Tensor:
+    sampled = torch.nn.functional.grid_sample(
+        texture[None], grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[0, :, 0].T
+
+
+def _checked(frame: Tensor, vertices: Tensor, mesh: Mesh, camera: Camera) -> Tensor:
+    """The frame as floats in [0,1], on the CPU."""
+    if frame.shape != (3, camera.height, camera.width):
+        raise ShapeError(f"frame: found {tuple(frame.shape)}, expected the camera's (3,{camera.height},{camera.width})")
+    if vertices.shape != mesh.vertices.shape:
+        raise ShapeError(f"vertices: found {tuple(vertices.shape)}, expected the mesh's {tuple(mesh.vertices.shape)}")
+    if not bool(torch.isfinite(vertices).all()):
+        raise ValueRangeError("vertices: found NaN or infinity, expected a face")
+    return frame.detach().cpu().float() / 255 if frame.dtype == torch.uint8 else frame.detach().cpu().float()
+
+
+def _as(frame: Tensor, picture: Tensor, linear: Tensor, pixel: Tensor) -> Tensor:
+    """The picture with the pixels changed that something was laid on, in the frame's kind; the others stay exactly."""
+    touched = pixel.unique()
+    result = picture.reshape(3, -1).clone()
+    result[:, touched] = to_srgb(linear.reshape(3, -1)[:, touched].clamp(0, 1))
+    result = result.view(picture.shape)
+    if frame.dtype == torch.uint8:
+        return (result * 255).round().to(torch.uint8)
+    return result.to(frame)

@@ -1,0 +1,1 @@
+"""The embedded performer, sculpted in code: form, identities, skin, blendshapes."""

@@ -1,0 +1,120 @@
+"""How far each handle's motion reaches over the skin: smooth weights, solved once on the mean head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
+from torchface.synthetic.head.topology import MOUTH_BORDER, MOUTH_CONTACT, topology
+
+LIP_HANDLES = 52
+"""Handles round the mouth: 27 on the left from the upper midline over the corner (13) to the lower midline (26), and
+25 more on the right, back up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Influence:
+    """Weights over the mean head's vertices.
+
+    Args:
+        lips: how much each vertex follows each lip handle, (V,52); rows of the red of the lips sum to 1.
+        jaw: how much each vertex turns with the jaw, (V,).
+        lip_position: each lip vertex's handle, (V,) int64, -1 elsewhere; ``lip_ring`` its ring, -1 elsewhere.
+    """
+
+    lips: Tensor
+    jaw: Tensor
+    lip_position: Tensor
+    lip_ring: Tensor
+
+
+@lru_cache(maxsize=1)
+def influence() -> Influence:
+    """The weights, computed once."""
+    t = topology()
+    p = mean_vertices()
+    position = torch.full((t.count,), -1)
+    ring = torch.full((t.count,), -1)
+    around = torch.arange(27)
+    for side, handles in ((1, torch.where((around > 0) & (around < 26), 52 - around, around)), (0, around)):
+        ids = both_sides(t.rings["mouth"])[side]
+        position[ids] = handles.expand_as(ids)
+        ring[ids] = torch.arange(len(ids))[:, None].expand_as(ids)
+    return Influence(_lip_weights(p, position, ring), _jaw_weights(p, position, ring), position, ring)
+
+
+def _lip_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
+    on_lips = (ring >= MOUTH_BORDER) & (ring <= MOUTH_CONTACT + 2)
+    values = torch.zeros(len(p), LIP_HANDLES, dtype=torch.float64)
+    values[on_lips] = torch.nn.functional.one_hot(position[on_lips], LIP_HANDLES).double()
+    still = (p[:, 1] > -18) | (p[:, 1] < -111) | (p[:, 2] < 22) | (ring > MOUTH_CONTACT + 5) | _named("still_for_lips")
+    # The nose stays: only the skin beside its wings gives.
+    still |= (p[:, 1] > -44.5) & (p[:, 0].abs() < 20)
+    return _spread(values, on_lips | still)
+
+
+def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
+    values = torch.zeros(len(p), 1, dtype=torch.float64)
+    side = torch.where(position > 26, 52 - position, position).double()
+    turn = ramp(side, 6.5, 20.0)
+    lips = ring >= 3
+    values[lips, 0] = turn[lips]
+    cap = torch.zeros(len(p), dtype=torch.bool)
+    bag = topology().caps["mouth"]
+    depth = torch.linspace(0, 1, bag.shape[0], dtype=torch.float64)[:, None].expand(bag.shape)
+    for both in both_sides(bag):
+        cap[both] = True
+        inner = ~(ring[both] >= 0)
+        values[both[inner], 0] = ramp(depth, 0.0, 1.0)[inner]
+    # The bone: below a line from under the mouth's corner to the jaw's angle; the throat follows part of the way.
+    line = -82 + 0.10 * (80 - p[:, 2])
+    below_chin = (p[:, 1] < -106) & (p[:, 2] < 62)
+    bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 40) & ~lips & ~cap & ~below_chin & (ring < 3)
+    values[bone] = 1.0
+    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -26) | _named("still_for_lips")
+    still |= (p[:, 1] > -50) & (p[:, 0].abs() < 22) & (p[:, 2] > 60) & (ring < 0)
+    still &= ~(lips | cap)
+    return _spread(values, bone | lips | cap | still)[:, 0].clamp(0, 1)
+
+
+def _named(name: str) -> Tensor:
+    """Parts that no lip moves: eyes, ears, nostrils."""
+    t = topology()
+    assert name == "still_for_lips"
+    mask = torch.zeros(t.count, dtype=torch.bool)
+    ids = [t.rings["eye"][1:], t.caps["eye"], t.rings["ear"], t.caps["ear"], t.rings["nostril"], t.caps["nostril"]]
+    for half in (*ids, t.eyeball, t.caps["eyeball_front"], t.caps["eyeball_back"]):
+        for both in both_sides(half):
+            mask[both] = True
+    return mask
+
+
+def _spread(values: Tensor, fixed: Tensor) -> Tensor:
+    """Values known where fixed, (V,C), elsewhere as smooth as a bent plate: the squared Laplacian is zero there."""
+    t = topology()
+    p = mean_vertices().numpy()
+    quads = t.quads.numpy()
+    pairs = np.concatenate([quads[:, [i, (i + 1) % 4]] for i in range(4)])
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    length = np.linalg.norm(p[pairs[:, 0]] - p[pairs[:, 1]], axis=1)
+    weight = 1 / np.maximum(length, 0.3)
+    count = len(p)
+    adjacency = coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    adjacency = (adjacency + adjacency.T).tocsr()
+    degree = np.asarray(adjacency.sum(1)).ravel()
+    laplacian = diags(degree) - adjacency
+    area = np.bincount(pairs.ravel(), np.repeat(length**2, 2), count) / np.maximum(np.bincount(pairs.ravel()), 1)
+    plate = (laplacian @ diags(1 / area) @ laplacian).tocsr()
+    known = fixed.numpy()
+    free = ~known
+    right = -(plate[free][:, known] @ values.numpy()[known])
+    result = values.clone()
+    result[torch.from_numpy(free)] = torch.from_numpy(splu(plate[free][:, free].tocsc()).solve(np.asarray(right)))
+    return result

@@ -1,0 +1,40 @@
+"""The embedded performer: a head of any identity with 51 of ARKit's 52 shapes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT
+from torchface.synthetic.head.identity import anatomy, mirrored
+from torchface.synthetic.head.lower_face_shapes import lower_face
+from torchface.synthetic.head.neutral_head import dress
+from torchface.synthetic.head.upper_face_shapes import upper_face
+
+SHAPES: tuple[str, ...] = tuple(name for name in ARKIT if name != "tongueOut")
+"""The performer's shapes, in ARKit's order."""
+
+
+def performer(identity: Tensor | None = None, texture: bool = True) -> BlendshapeRig:
+    """A whole rig made by code; every performer has the same topology.
+
+    Args:
+        identity: coefficients (K,) in standard deviations, in the order of ``IDENTITY``; the mean if absent.
+        texture: with painted skin.
+
+    Returns:
+        The rig: ``neutral_head(identity)`` as its neutral and ARKit's shapes but ``tongueOut``. Their size and form
+        depend smoothly on the identity; left and right shapes are mirror images.
+
+    Raises:
+        ShapeError: ``identity`` is not (K,).
+        ValueRangeError: a coefficient is NaN or infinite.
+    """
+    person = anatomy(identity)
+    made = upper_face(person) | lower_face(person)
+    for name in list(made):
+        if name.endswith("Left"):
+            made[name.removesuffix("Left") + "Right"] = mirrored(made[name])
+    deltas = torch.stack([made[name] for name in SHAPES])
+    return BlendshapeRig(dress(person, texture), deltas.float(), SHAPES)

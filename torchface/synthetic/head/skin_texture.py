@@ -1,0 +1,170 @@
+"""Painted skin: colours decided at points of the mean head, so that no seam shows."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from torchface.mesh import fan_triangulation
+from torchface.rendering.raycast import RayCaster
+from torchface.synthetic.head.facial_openings import lid_order
+from torchface.synthetic.head.head_annotations import head_annotations
+from torchface.synthetic.head.identity import both_sides, mean_vertices, ramp
+from torchface.synthetic.head.signed_distance import EYE_CENTRE
+from torchface.synthetic.head.topology import EYE_RIM, MOUTH_BORDER, MOUTH_CONTACT, topology
+from torchface.synthetic.head.uv_layout import unwrapping
+
+SKIN = (0.86, 0.665, 0.565)
+LIPS = (0.70, 0.40, 0.37)
+HAIR = (0.20, 0.145, 0.115)
+_MARKS = ("lips", "mouth", "depth", "socket", "lash", "eyeball", "nostril", "ear")
+
+
+@lru_cache(maxsize=2)
+def skin_texture(size: int = 1024) -> Tensor:
+    """The skin every performer wears, (3,size,size), first row on top.
+
+    Args:
+        size: pixels a side.
+    """
+    covered, values = texel_values(size, torch.cat([mean_vertices().float(), _vertex_marks()], dim=1))
+    color = _paint(values[:, :3], values[:, 3:])
+    image = torch.zeros(size * size, 3)
+    image[covered] = color
+    # What no triangle covers repeats its nearest neighbour, so that no border colour bleeds in.
+    nearest = distance_transform_edt(~covered.view(size, size).numpy(), return_distances=False, return_indices=True)
+    image = image.view(size, size, 3)[torch.from_numpy(nearest[0]), torch.from_numpy(nearest[1])]
+    return image.permute(2, 0, 1).contiguous()
+
+
+def texel_values(size: int, table: Tensor) -> tuple[Tensor, Tensor]:
+    """Which texels a triangle covers (size²,), and for those the values (N,C) of a table (V,C) of the vertices."""
+    flat, t = unwrapping(), topology()
+    uv_faces, faces = fan_triangulation(flat.quads), fan_triangulation(t.quads)
+    page = torch.cat([flat.uvs.double() * size, torch.zeros(len(flat.uvs), 1, dtype=torch.float64)], dim=1)
+    step = torch.arange(size, dtype=torch.float64) + 0.5
+    across, up = torch.meshgrid(step, size - step, indexing="xy")
+    starts = torch.stack([across.flatten(), up.flatten(), torch.full((size * size,), 10.0).double()], dim=1)
+    hits = RayCaster(page, uv_faces).cast(starts, torch.tensor([0.0, 0.0, -1.0]).double().expand_as(starts))
+    covered = hits.triangle >= 0
+    corners, barycentric = faces[hits.triangle[covered]], hits.barycentric[covered].float()
+    return covered, (table[corners] * barycentric[..., None]).sum(1)
+
+
+def _vertex_marks() -> Tensor:
+    """What the painter must know beyond positions, (V,8), in the order of ``_MARKS``."""
+    t, regions = topology(), head_annotations().regions
+    marks = torch.zeros(t.count, len(_MARKS))
+    lips = torch.tensor([0.0] * (MOUTH_BORDER - 1) + [0.0, 0.55, 1.0, 1.0, 1.0, 1.0] + [1.0] * 7)
+    deep = (torch.arange(len(t.rings["mouth"])) - MOUTH_CONTACT).clamp(min=0) / 7
+    above, _ = lid_order()
+    for side in (0, 1):
+        mouth, eye = both_sides(t.rings["mouth"])[side], both_sides(t.rings["eye"])[side]
+        marks[mouth, 0] = lips[:, None].expand(-1, 27)
+        marks[mouth, 2] = deep[:, None].expand(-1, 27)
+        marks[both_sides(t.caps["mouth"])[side], 2] = 1.0
+        marks[eye[EYE_RIM + 1 :], 3] = 1.0
+        marks[eye[EYE_RIM], 4] = 0.35
+        marks[eye[EYE_RIM][above[1:-1]], 4] = 1.0
+        marks[eye[EYE_RIM - 1][above[2:]], 4] = 0.25
+        marks[both_sides(t.rings["ear"])[side][1:], 7] = 1.0
+        marks[both_sides(t.caps["ear"])[side], 7] = 1.0
+    marks[:, 1] = regions["mouth_interior"].float()
+    marks[regions["eye_sockets"], 3] = 1.0
+    marks[regions["eyeball_left"] | regions["eyeball_right"], 5] = 1.0
+    marks[regions["nostrils"], 6] = 1.0
+    return marks
+
+
+def _noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
+    """Smooth random values (N,) in about [-1,1] that change over a length; the same at the same point everywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    lattice = torch.rand(1, 1, 32, 32, 32, generator=generator) * 2 - 1
+    place = points / millimetres / 32
+    wrapped = (place - place.floor()) * 2 - 1
+    grid = wrapped.view(1, 1, 1, -1, 3)
+    return torch.nn.functional.grid_sample(lattice, grid, padding_mode="border", align_corners=True)[0, 0, 0, 0]
+
+
+def _blob(points: Tensor, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Tensor:
+    folded = torch.cat([points[:, :1].abs(), points[:, 1:]], dim=1)
+    return torch.exp(-(((folded - torch.tensor(centre)) / torch.tensor(width)) ** 2).sum(1))
+
+
+def _mix(color: Tensor, other: tuple[float, float, float], share: Tensor) -> Tensor:
+    return color + (torch.tensor(other) - color) * share.clamp(0, 1)[:, None]
+
+
+def _paint(p: Tensor, marks: Tensor) -> Tensor:
+    lips, mouth, depth, socket, lash, eyeball, nostril, ear = marks.unbind(1)
+    color = torch.tensor(SKIN).expand(len(p), 3).clone()
+    broad, fine, pores = _noise(p, 16.0, 1), _noise(p, 4.5, 2), _noise(p, 0.9, 3)
+    red = 0.55 * _blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * _blob(p, (3, -36, 108), (15, 10, 14))
+    red += 0.3 * _blob(p, (0, -100, 88), (22, 12, 20)) + 0.35 * ear + 0.18 * broad.clamp(min=0) + 0.08 * fine
+    color = _mix(color, (0.76, 0.43, 0.37), 0.62 * red)
+    dark = 0.5 * _blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.45 * _blob(p, (22, 6, 80), (10, 7, 14))
+    color = _mix(color, (0.53, 0.36, 0.33), 0.75 * dark)
+    color = _mix(color, (0.87, 0.70, 0.59), 0.35 * _blob(p, (0, 45, 92), (34, 18, 40)))
+    color = color * (1 + 0.035 * broad + 0.03 * fine + 0.028 * pores)[:, None]
+    freckled = _blob(p, (22, -18, 82), (28, 14, 30)) + 0.35 * _blob(p, (20, 40, 90), (50, 26, 40))
+    spots = ramp(_noise(p, 1.2, 4) + 0.35 * _noise(p, 5.0, 5), 0.66, 1.0)
+    color = _mix(color, (0.55, 0.34, 0.24), 0.32 * spots * freckled)
+    color = _mix(color, HAIR, _cropped_hair(p, fine, pores) * (1 - ear))
+    color = _mix(color, HAIR, _brows(p))
+    lip_tone = torch.tensor(LIPS) * (1 + 0.10 * _noise(p * torch.tensor([4.0, 0.7, 0.7]), 2.2, 6))[:, None]
+    color = color + (lip_tone - color) * (0.9 * ramp(lips, 0.25, 0.85))[:, None]
+    color = _mix(color, (0.40, 0.15, 0.14), ramp(mouth, 0.3, 1.0) * 0.9)
+    color = _mix(color, (0.13, 0.04, 0.04), depth**0.7 * ramp(mouth, 0.5, 1.0))
+    color = _mix(color, (0.74, 0.46, 0.41), ramp(socket, 0.2, 0.8))
+    color = _mix(color, (0.12, 0.08, 0.07), 0.9 * lash * (1 - socket))
+    color = _mix(color, (0.22, 0.10, 0.08), 0.92 * nostril)
+    is_ball = eyeball > 0.5
+    color[is_ball] = _eye(p[is_ball])
+    return color.clamp(0, 1)
+
+
+def _brows(p: Tensor) -> Tensor:
+    """Share of brow hair: a tapering arch of strokes that lean outward."""
+    x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
+    along = (x - 9.0) / 41.0
+    knots, arch = np.array([0, 0.3, 0.62, 0.82, 1.0]), np.array([18.2, 20.6, 23.0, 21.6, 17.4])
+    middle = torch.from_numpy(np.interp(along.numpy(), knots, arch)).float()
+    half = torch.from_numpy(np.interp(along.numpy(), knots, np.array([3.4, 3.7, 3.0, 2.2, 0.9]))).float()
+    inside = 1 - ramp((y - middle).abs() / half, 0.55, 1.15)
+    ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
+    # Strokes: noise drawn out along a direction that turns from upright to outward.
+    lean = 0.9 - 0.6 * along.clamp(0, 1)
+    stroke = torch.stack([(x - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.45, z * 0.3], dim=1)
+    hair = 0.68 + 0.42 * _noise(stroke, 0.9, 7) + 0.12 * _noise(stroke, 2.4, 9)
+    return (inside * ends * hair * (z > 40)).clamp(0, 0.92)
+
+
+def _cropped_hair(p: Tensor, fine: Tensor, pores: Tensor) -> Tensor:
+    """Share of hair cropped to the scalp: above a hairline that drops at the temples, round the ears to the nape."""
+    x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
+    line = np.interp(
+        z.numpy(), [-200, -70, -30, -14, 8, 20, 34, 48, 62, 90], [-75, -72, -50, -18, -8, 8, 36, 52, 57, 63]
+    )
+    edge = torch.from_numpy(line).float() + 0.03 * (x - 40).clamp(min=0)
+    return 0.66 * ramp(y - edge + 5.0 * fine, -6.0, 11.0) * (0.86 + 0.3 * pores)
+
+
+def _eye(p: Tensor) -> Tensor:
+    centre = torch.tensor(EYE_CENTRE)
+    offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
+    polar = torch.acos(torch.nn.functional.normalize(offset, dim=1)[:, 2].clamp(-1, 1))
+    turn = torch.atan2(offset[:, 1], offset[:, 0])
+    color = torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3).clone()
+    color = _mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
+    spokes = torch.stack([turn.cos() * 9, turn.sin() * 9, polar * 2.5], dim=1)
+    iris = torch.tensor((0.33, 0.24, 0.14)) * (1 + 0.45 * _noise(spokes, 1.0, 8))[:, None]
+    iris = _mix(iris, (0.46, 0.34, 0.17), 1 - ramp(polar, 0.17, 0.34))
+    iris = _mix(iris, (0.09, 0.06, 0.05), ramp(polar, 0.35, 0.45))
+    color = color + (iris - color) * (1 - ramp(polar, 0.425, 0.475))[:, None]
+    color = _mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
+    glint = torch.nn.functional.normalize(offset, dim=1) - torch.tensor([-0.13, 0.20, 0.97])
+    return _mix(color, (1.0, 1.0, 1.0), 0.9 * (1 - ramp(glint.norm(dim=1), 0.04, 0.09)))

@@ -1,0 +1,213 @@
+"""Shapes of the upper face: lids that slide over the eyeball, eyes that turn, brows, nose and cheeks."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchface.synthetic.head.facial_openings import lid_order
+from torchface.synthetic.head.identity import Anatomy, both_sides, bump, mean_vertices, ramp
+from torchface.synthetic.head.signed_distance import LID_THICKNESS
+from torchface.synthetic.head.topology import EYE_RIM, topology
+
+CLOSING_HEIGHT = 0.28
+"""Where the lids meet, as a share of the way from the lower to the upper edge."""
+
+GAZE = math.radians(26.0)
+"""How far an eye turns at weight 1."""
+
+# How much of the lid edge's way each ring goes: skin from the orbit to the edge (8), then the inner lid and socket.
+_FOLLOW = torch.tensor(
+    [0.0, 0.04, 0.16, 0.34, 0.55, 0.76, 0.89, 0.96, 1.0, 1.0, 0.72, 0.42, 0.18, 0.05, 0.0, 0.0], dtype=torch.float64
+)
+
+
+def _lids(head: Anatomy, upper: Tensor | float, lower: Tensor | float, lean: float = 0.0) -> Tensor:
+    """The left lids moved by shares of their own way to where they meet; negative opens. Displacement (V,3).
+
+    Args:
+        head: whose lids.
+        upper, lower: share of the way at weight 1, one number a lid or (17,) along it from the inner corner.
+        lean: how far the upper skin fold follows beyond the edge's own motion, millimetres up.
+    """
+    t = topology()
+    rings = t.rings["eye"]
+    centre = head.eye_centres[0]
+    around = head.vertices[rings] - centre
+    above, below = lid_order()
+    moved = around.clone()
+    share = torch.zeros(2, 17, dtype=torch.float64)
+    share[0], share[1] = upper, lower
+    way = torch.zeros(len(rings), 32, 3, dtype=torch.float64)
+    height = _closing_heights(around, above, below)[:, None]
+    for ring in range(EYE_RIM, EYE_RIM + 2):
+        a, b = around[ring, above], around[ring, below]
+        meet = height * a + (1 - height) * b
+        longest = torch.maximum(a.norm(dim=1), b.norm(dim=1))
+        meet = torch.nn.functional.normalize(meet, dim=1) * longest[:, None]
+        way[ring, above] = share[0][:, None] * (meet - a)
+        way[ring, below[1:-1]] = (share[1][:, None] * (meet - b))[1:-1]
+        moved[ring] = around[ring] + way[ring]
+        radius = around[ring].norm(dim=1)
+        goal = radius.clone()
+        goal[above] += share[0].clamp(-1, 1).abs() * (longest - a.norm(dim=1))
+        goal[below[1:-1]] += (share[1].clamp(-1, 1).abs() * (longest - b.norm(dim=1)))[1:-1]
+        moved[ring] *= (goal / moved[ring].norm(dim=1))[:, None]
+    travel = torch.zeros(32, dtype=torch.float64)
+    travel[below] = share[1].clamp(-1, 1).abs()
+    travel[above] = share[0].clamp(-1, 1).abs()
+    edge_way = moved[EYE_RIM] - around[EYE_RIM]
+    step = torch.arange(17)
+    from_corner = torch.zeros(32, dtype=torch.float64)
+    for lid in (above, below):
+        from_corner[lid] = torch.minimum(step, 16 - step).double()
+    for ring in (*range(1, EYE_RIM), *range(EYE_RIM + 2, len(rings) - 1)):
+        # Near the corners the skin gives way sooner: it turns about the corner instead of sliding past it.
+        give = (EYE_RIM - ring) if ring < EYE_RIM else 0
+        near = 1 - min(0.75 + 0.06 * give, 0.92) * torch.exp(-from_corner / 1.5) if give else torch.ones(32)
+        moved[ring] = around[ring] + (_FOLLOW[ring] * near)[:, None] * edge_way
+        if ring >= 4:  # nearer the edge the skin slides over the ball; what lay folded in the crease comes up
+            now = around[ring].norm(dim=1)
+            cover = head.eye_radius + (LID_THICKNESS + 0.1 if ring < EYE_RIM else 0.0)
+            goal = now + travel * 0.2 * torch.nn.functional.softplus((cover - now) / 0.2)
+            moved[ring] *= (goal / moved[ring].norm(dim=1))[:, None]
+    fold = torch.zeros(32, dtype=torch.float64)
+    fold[above] = torch.sin(math.pi * torch.arange(17).double() / 16)
+    moved[1:6, :, 1] += lean * fold * torch.tensor([0.3, 0.7, 1.0, 0.9, 0.5]).double()[:, None]
+    delta = torch.zeros_like(head.vertices)
+    delta[rings] = moved - around
+    return delta
+
+
+def _closing_heights(around: Tensor, above: Tensor, below: Tensor) -> Tensor:
+    """Where the lids meet, as a share of the way from the lower to the upper edge, (17,).
+
+    Beside a corner they meet on the line in which the skin outside goes on, so that nothing folds there.
+    """
+    step = torch.arange(17)
+    height = torch.full((17,), CLOSING_HEIGHT, dtype=torch.float64)
+    rim = around[EYE_RIM]
+    for beside, corner in ((1, 0), (15, 16)):
+        tip = rim[above[corner]]
+        way = around[EYE_RIM - 1, above[corner]] - tip
+        a, b = rim[above[beside]], rim[below[beside]]
+        line = tip[1] + way[1] / way[0] * (0.5 * (a[0] + b[0]) - tip[0])
+        wanted = ((line - b[1]) / (a[1] - b[1])).clamp(-0.1, 1.1)
+        near = torch.exp(-((step - beside).abs().double() / 1.5))
+        height = height + (wanted - CLOSING_HEIGHT) * near
+    return height
+
+
+def _turn_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
+    """The left eyeball turned: pitch up, yaw toward the viewer's right, radians."""
+    t = topology()
+    ids = torch.cat([t.eyeball.flatten(), t.caps["eyeball_front"].flatten(), t.caps["eyeball_back"].flatten()]).unique()
+    c, s = math.cos(yaw), math.sin(yaw)
+    about_y = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+    c, s = math.cos(-pitch), math.sin(-pitch)
+    about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
+    delta = torch.zeros_like(head.vertices)
+    offset = head.vertices[ids] - head.eye_centres[0]
+    delta[ids] = offset @ (about_y @ about_x).T - offset
+    return delta
+
+
+def _skin(head: Anatomy) -> Tensor:
+    """1 where brow and cheek motion may go: not on lid edges, eyeballs, sockets or inside the mouth, (V,)."""
+    t = topology()
+    free = torch.ones(len(head.vertices), dtype=torch.float64)
+    share = torch.tensor([1, 0.9, 0.6, 0.3, 0.12, 0.04, 0.0, 0.0] + [0.0] * 8, dtype=torch.float64)[:, None]
+    for side in (0, 1):
+        free[both_sides(t.rings["eye"])[side]] = share.expand(-1, 32)
+        for part in ("eye", "eyeball_front", "eyeball_back"):
+            free[both_sides(t.caps[part])[side]] = 0.0
+        free[both_sides(t.eyeball)[side]] = 0.0
+        free[both_sides(t.rings["mouth"])[side][9:]] = 0.0
+        free[both_sides(t.caps["mouth"])[side]] = 0.0
+    return free
+
+
+def _push(
+    head: Anatomy,
+    centre: tuple[float, float, float],
+    width: tuple[float, float, float],
+    way: tuple[float, float, float],
+    one_side: bool = True,
+) -> Tensor:
+    """Skin near a point of the mean head moved along ``way`` (millimetres, left side; x is mirrored)."""
+    p = mean_vertices()
+    left = ramp(p[:, 0], -9, 9) if one_side else torch.ones(len(p), dtype=p.dtype)
+    amount = bump(p, centre, width)
+    amount = torch.where(amount > 0.02, amount - 0.02, 0.0) * left * _skin(head)
+    direction = torch.tensor(way, dtype=p.dtype) * torch.stack(
+        [torch.tanh(p[:, 0] / 5), torch.ones(len(p)), torch.ones(len(p))], dim=1
+    )
+    return amount[:, None] * direction * _scale(head)
+
+
+def _scale(head: Anatomy) -> Tensor:
+    """How large the face is against the mean: pupils to the mouth's corners, pupil to pupil."""
+    t = topology()
+    corner = t.rings["mouth"][9, 13]
+    size = lambda v, eyes: (eyes.mean(0)[1] - v[corner, 1]) * eyes[0, 0]  # noqa: E731
+    mean = size(mean_vertices(), torch.tensor([[31.5, 0.0, 66.5], [-31.5, 0.0, 66.5]]).double())
+    return (size(head.vertices, head.eye_centres) / mean).sqrt()
+
+
+def upper_face(head: Anatomy) -> dict[str, Tensor]:
+    """Left and unpaired shapes of eyes, brows, nose and cheeks; displacements (V,3) by ARKit name."""
+    lids = lambda *args, **more: _lids(head, *args, **more)  # noqa: E731
+    push = lambda *args, **more: _push(head, *args, **more)  # noqa: E731
+    open_height = _opening(head)
+    brow_inner, brow_mid, brow_outer = (9.0, 22.0, 89.0), (26.0, 24.0, 86.0), (46.0, 19.0, 70.0)
+    return {
+        "eyeBlinkLeft": lids(1.0, 1.0) + push((30, 16, 80), (16, 7, 20), (0, -1.0, 0)),
+        "eyeWideLeft": lids(-0.33, -0.12, lean=0.8) + push((30, 20, 82), (17, 8, 20), (0, 1.2, 0)),
+        "eyeSquintLeft": lids(0.26, 0.85) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
+        "eyeLookDownLeft": _turn_eye(head, -GAZE, 0) + lids(0.52, -0.35),
+        "eyeLookUpLeft": _turn_eye(head, GAZE, 0) + lids(-0.30, 0.35, lean=0.6),
+        "eyeLookInLeft": _turn_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),
+        "eyeLookOutLeft": _turn_eye(head, 0, 1.15 * GAZE) + _sideways(head, 0.55),
+        "browDownLeft": push(brow_inner, (11, 11, 20), (-2.2, -6.5, 0.6))
+        + push(brow_mid, (15, 10, 20), (-1.6, -4.6, 0.4))
+        + push(brow_outer, (11, 9, 20), (-0.4, -1.4, 0.0))
+        + lids(0.10 * open_height, 0.0),
+        "browOuterUpLeft": push(brow_outer, (13, 13, 24), (0.3, 6.5, -1.2)) + push(brow_mid, (11, 12, 24), (0, 3.6, 0)),
+        "browInnerUp": push((10.0, 25.0, 89.0), (15, 14, 24), (0.4, 8.0, -0.6), one_side=False)
+        + push((24.0, 24.0, 86.0), (10, 11, 24), (0, 2.6, 0), one_side=False),
+        "cheekSquintLeft": push((38, -24, 68), (16, 12, 22), (0.4, 5.2, 2.2))
+        + push((36, -14, 70), (16, 7, 22), (0, 2.2, 0.8))
+        + lids(0.0, 0.55),
+        "noseSneerLeft": push((15, -34, 92), (8, 9, 16), (1.2, 5.0, -0.4))
+        + push((20, -46, 86), (10, 9, 18), (0.6, 4.2, 0.4))
+        + push((9, 4, 84), (8, 11, 14), (0.4, 1.6, 0.9)),
+        "cheekPuff": push((38, -60, 56), (15, 15, 24), (8.5, 0.0, 4.5), one_side=False)
+        + push((14, -53, 88), (11, 6, 14), (0.5, 0.0, 2.2), one_side=False)
+        + push((14, -80, 86), (11, 6, 14), (0.5, 0.0, 2.0), one_side=False),
+    }
+
+
+def _opening(head: Anatomy) -> float:
+    """The lids' opening against the mean head's."""
+    rim = topology().rings["eye"][EYE_RIM]
+    above, below = lid_order()
+    gap = lambda v: float(v[rim[above[8]], 1] - v[rim[below[8]], 1])  # noqa: E731
+    return gap(head.vertices) / gap(mean_vertices())
+
+
+def _sideways(head: Anatomy, amount: float) -> Tensor:
+    """Lids drawn a little along with an eye that looks aside; the corners stay."""
+    t = topology()
+    rings = t.rings["eye"]
+    ways = torch.zeros(32, dtype=torch.float64)
+    for lid in lid_order():
+        ways[lid] = torch.sin(math.pi * torch.arange(17).double() / 16) ** 2
+    delta = torch.zeros_like(head.vertices)
+    radial = head.vertices[rings] - head.eye_centres[0]
+    turned = radial.clone()
+    turned[..., 0] += amount * 1.2 * (_FOLLOW[:, None] * ways)
+    turned *= (radial.norm(dim=-1) / turned.norm(dim=-1))[..., None]
+    delta[rings] = turned - radial
+    return delta

@@ -1,0 +1,264 @@
+"""A camera stage: a performer with painted strokes and reflective markers, filmed by a camera on a helmet.
+
+A real video file, the markers as C3D beside it, a description of what was performed, and the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.errors import ShapeError
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.io.action_labels import ActionLabels, Box, save_action_labels
+from torchface.io.take_files import save_take
+from torchface.io.video import VideoFile, write_video
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.identity import both_sides, mean_vertices
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.topology import EYE_RIM, topology
+from torchface.synthetic.stages.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
+from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS, FilmedHead
+from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, loose_cameras
+from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
+from torchface.synthetic.stages.reflective_paint import reflective_paint
+
+SIDE_MARKERS = ("SIDE_L", "SIDE_R")
+"""Labels of the two markers by which pictures are stabilised."""
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """How a session is filmed.
+
+    Args:
+        width, height: of the video, pixels.
+        markers: on the face, besides the two on its sides.
+        flaws: of the camera.
+        marker_flaws: of the marker system.
+        unsteadiness: of the painter's hand, millimetres.
+        performance: what is performed how often.
+    """
+
+    width: int = 192
+    height: int = 256
+    markers: int = 40
+    flaws: CameraFlaws = field(default_factory=CameraFlaws)
+    marker_flaws: StageFlaws = field(default_factory=lambda: StageFlaws(noise=0.1, standoff=MARKER_RADIUS))
+    unsteadiness: float = 0.5
+    performance: PerformanceSettings = field(default_factory=PerformanceSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class FilmedSession:
+    """The files of a session, and the truth behind them.
+
+    Args:
+        video: the file.
+        take_path: the C3D with the markers, as many frames as the video.
+        labels_path: what :func:`torchface.io.action_labels.load_action_labels` reads.
+        labels: the same.
+        rig: the performer.
+        attachment: where the markers sit.
+        performance: weights and intensities.
+        recording: the markers, and what their system did to them.
+        rotation, translation: of the camera, world to camera, (T,3,3) and (T,3).
+    """
+
+    video: VideoFile
+    take_path: Path
+    labels_path: Path
+    labels: ActionLabels
+    rig: BlendshapeRig
+    attachment: Attachment
+    performance: ActionPerformance
+    recording: Recording
+    rotation: Tensor
+    translation: Tensor
+
+
+def film_session(
+    folder: str | Path,
+    name: str,
+    identity: Tensor | None,
+    generator: torch.Generator,
+    settings: StageSettings = StageSettings(),
+    progress: Callable[[int, int], None] | None = None,
+    attachment: Attachment | None = None,
+) -> FilmedSession:
+    """Paints a performer, sets markers, films a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
+
+    Args:
+        folder: that exists.
+        name: of the files, without ending.
+        identity: of the performer, (K,); the mean if absent.
+        generator: where all randomness comes from.
+        settings: how.
+        progress: is told how many frames are done, and of how many.
+        attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+        NameMismatchError: the attachment lacks a marker on a side of the face.
+        TopologyError: the attachment belongs to another mesh.
+    """
+    folder = Path(folder)
+    rig = performer(identity, texture=True)
+    performance = perform_action_units(rig.names, generator, settings.performance)
+    attachment = stage_markers(rig, settings.markers) if attachment is None else attachment
+    attachment.select(SIDE_MARKERS)  # without them there is no way to hold pictures still; said before hours of filming
+    recording = record(rig, attachment, performance.weights, generator, settings.marker_flaws, settings.performance.fps)
+    paint = reflective_paint(rig.neutral.texture.shape[-1], generator, settings.unsteadiness)  # type: ignore[union-attr]
+    camera = helmet_camera(settings.width, settings.height)
+    rotation, translation = loose_cameras(camera, len(performance.weights), performance.fps, settings.flaws, generator)
+    labels = replace(
+        describe(rig, attachment, replace(camera, rotation=rotation[0], translation=translation[0])),
+        frames=len(performance.weights),
+        performed=performance.performed,
+    )
+    frames = film(rig, performance.weights, paint, attachment, camera, rotation, translation, settings.flaws, generator)
+    if progress is not None:
+        frames = _counted(frames, len(performance.weights), progress)
+    video = write_video(frames, folder / f"{name}.avi", performance.fps)
+    take_path, labels_path = folder / f"{name}.c3d", folder / f"{name}.toml"
+    save_take(recording.take, take_path)
+    save_action_labels(labels, labels_path)
+    return FilmedSession(
+        video, take_path, labels_path, labels, rig, attachment, performance, recording, rotation, translation
+    )
+
+
+def _counted(frames: Iterator[Tensor], total: int, progress: Callable[[int, int], None]) -> Iterator[Tensor]:
+    for done, frame in enumerate(frames):
+        yield frame
+        progress(done + 1, total)
+
+
+def stage_markers(rig: BlendshapeRig, count: int = 40) -> Attachment:
+    """Markers spread over the performer's skin, and one on each side of the face where it moves least.
+
+    Args:
+        rig: a performer of :func:`torchface.synthetic.head.performer`.
+        count: how many besides the two.
+    """
+    spots = place_markers(rig, count)
+    p = mean_vertices()
+    aside = torch.tensor([60.0, -4.0, 44.0], dtype=p.dtype)
+    left = int((p - aside).norm(dim=1).argmin())
+    right = int(topology().mirror[left])
+    sides = Attachment.from_vertices(rig.neutral, [left, right], SIDE_MARKERS)
+    points, side_points = spots.on(rig.neutral.faces, rig.vertices), sides.on(rig.neutral.faces, rig.vertices)
+    apart = torch.cdist(points, side_points).amin(1) > 6.0  # two markers side by side would be one blob
+    spots = spots.select([label for label, free in zip(spots.labels or (), apart.tolist(), strict=True) if free])
+    return Attachment(
+        torch.cat([spots.triangles, sides.triangles]),
+        torch.cat([spots.barycentric, sides.barycentric]),
+        (*(spots.labels or ()), *SIDE_MARKERS),
+        fingerprint=rig.neutral.fingerprint(),
+    )
+
+
+def describe(rig: BlendshapeRig, attachment: Attachment, camera: Camera) -> ActionLabels:
+    """Where in a neutral picture the helmet's point, the side markers and the regions are; one frame, no actions."""
+    points = attachment.select(SIDE_MARKERS).on(rig.neutral.faces, rig.vertices).double()
+    normals = vertex_normals(rig.vertices.double(), rig.neutral.faces)
+    normals = attachment.select(SIDE_MARKERS).on(rig.neutral.faces, normals)
+    sides = camera.project(points + MARKER_RADIUS * torch.nn.functional.normalize(normals, dim=-1)).tolist()
+    helmet = camera.project(torch.tensor([HELMET_POINT], dtype=torch.float64))[0].tolist()
+    pixels = camera.project(rig.vertices.double())
+    regions = {name: _box(pixels[mask]) for name, mask in _region_vertices().items()}
+    return ActionLabels(1, 0, (helmet[0], helmet[1]), (tuple(sides[0]), tuple(sides[1])), regions)
+
+
+def _box(pixels: Tensor, margin: float = 0.08) -> Box:
+    low, high = pixels.amin(0), pixels.amax(0)
+    low, high = low - margin * (high - low), high + margin * (high - low)
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _region_vertices() -> dict[str, Tensor]:
+    """Vertices (V,) whose extent is a region: over the brows, between them, round the eyes, round the mouth."""
+    t, p = topology(), mean_vertices()
+    x, y, front = p[:, 0], p[:, 1], p[:, 2] > 40
+    skin = torch.zeros(t.count, dtype=torch.bool)
+    skin[t.grid[t.grid >= 0]] = True
+    skin |= skin[t.mirror]
+    regions = {}
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        regions[f"brow_{name}"] = skin & front & (side * x > 3) & (side * x < 52) & (y > 17) & (y < 57)
+    regions["between_brows"] = skin & front & (x.abs() < 16) & (y > -24) & (y < 26)
+    for side, name in enumerate(("left", "right")):
+        eye = torch.zeros(t.count, dtype=torch.bool)
+        eye[both_sides(t.rings["eye"])[side][1 : EYE_RIM + 1]] = True
+        regions[f"eye_{name}"] = eye
+    mouth = torch.zeros(t.count, dtype=torch.bool)
+    for ring in both_sides(t.rings["mouth"][:6]):
+        mouth[ring] = True
+    regions["mouth"] = mouth
+    return regions
+
+
+def film(
+    rig: BlendshapeRig,
+    weights: Tensor,
+    paint: Tensor,
+    attachment: Attachment,
+    camera: Camera,
+    rotation: Tensor,
+    translation: Tensor,
+    flaws: CameraFlaws,
+    generator: torch.Generator,
+) -> Iterator[Tensor]:
+    """Grey pictures (H,W) in [0,1] of a painted performer, one a frame.
+
+    The light sits round the lens: skin scatters it, paint throws much of it back, markers all of it.
+
+    Args:
+        rig: a performer with skin.
+        weights: (T,N).
+        paint: where paint is, (size,size).
+        attachment: of the markers.
+        camera: intrinsics and size.
+        rotation, translation: world to camera in each frame, (T,3,3) and (T,3).
+        flaws: of the camera.
+        generator: of the noise.
+
+    Raises:
+        ShapeError: weights and camera motion differ in length.
+    """
+    if not len(weights) == len(rotation) == len(translation):
+        raise ShapeError(
+            f"film: found {len(weights)} frames of weights and {len(rotation)} of camera, expected as many"
+        )
+    scene = FilmedHead(rig, paint, attachment)
+    _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
+    shape = ways.shape[:2]
+    shade = _vignette(shape, flaws.vignette)
+    for t in range(len(weights)):  # a picture at a time: each has a surface of its own
+        centre = -rotation[t].T @ translation[t]
+        light = scene.picture(weights[t], centre, ways.reshape(-1, 3) @ rotation[t]).view(shape)
+        light = flaws.exposure * shade * _blurred(light, flaws.blur)
+        noise = flaws.noise * torch.randn(shape, generator=generator)
+        yield (light + noise * (light.clamp(min=0).sqrt() + 1 / 3)).clamp(0, 1)
+
+
+def _vignette(shape: torch.Size, amount: float) -> Tensor:
+    y, x = torch.meshgrid(torch.linspace(-1, 1, shape[0]), torch.linspace(-1, 1, shape[1]), indexing="ij")
+    return 1 - amount * (x**2 + y**2) / 2
+
+
+def _blurred(picture: Tensor, sigma: float) -> Tensor:
+    if sigma == 0:
+        return picture
+    offsets = torch.arange(-2, 3).float()
+    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    padded = torch.nn.functional.pad(picture[None, None], (2, 2, 2, 2), mode="replicate")
+    across = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
+    return torch.nn.functional.conv2d(across, kernel.view(1, 1, -1, 1))[0, 0]

@@ -1,0 +1,185 @@
+"""A performer filmed in colour under a lamp of known place: gloss, cast shadows, noise, and the truth beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.rotations import rotation_matrix
+from torchface.io.video import VideoFile, write_video
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.color_space import to_linear, to_srgb
+from torchface.rendering.point_light import PointLight
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
+
+_OFF_THE_SKIN = 0.3
+_WALL = (0.16, 0.18, 0.20)  # linear
+
+
+@dataclass(frozen=True)
+class LightStageSettings:
+    """How the performer is filmed.
+
+    Args:
+        width, height: pixels.
+        field_of_view: vertical, degrees.
+        span: millimetres that the picture's height covers at the face.
+        turn: how far the head turns to each side, degrees; half as far up and down.
+        gloss: strength of highlights beside the lamp's; skin has about 0.15.
+        shininess: exponent of the highlights.
+        samples: rays a pixel side.
+        noise: of the camera, standard deviation at full white, linear; shot noise, less where it is dark.
+    """
+
+    width: int = 320
+    height: int = 240
+    field_of_view: float = 24.0
+    span: float = 330.0
+    turn: float = 22.0
+    gloss: float = 0.15
+    shininess: float = 24.0
+    samples: int = 2
+    noise: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= 0) or (name in ("width", "height", "samples") and value < 1):
+                raise ValueRangeError(f"light stage: {name} is {value}, expected a finite number that is not negative")
+
+
+@dataclass(frozen=True, eq=False)
+class LitFilm:
+    """A colour video of a performer, and the truth behind it.
+
+    Args:
+        video: the file.
+        rig: the performer, with skin.
+        weights: (T,N).
+        cameras: world to camera, one a frame: the camera stands still, so the head's motion is in here.
+        light: in the camera's frame.
+    """
+
+    video: VideoFile
+    rig: BlendshapeRig
+    weights: Tensor
+    cameras: tuple[Camera, ...]
+    light: PointLight
+
+    @property
+    def vertices(self) -> Tensor:
+        """The mesh of every frame, (T,V,3)."""
+        return self.rig(self.weights)
+
+
+def film_under_light(
+    path: str | Path,
+    rig: BlendshapeRig,
+    weights: Tensor,
+    light: PointLight,
+    fps: float,
+    generator: torch.Generator,
+    settings: LightStageSettings = LightStageSettings(),
+    progress: Callable[[int, int], None] | None = None,
+) -> LitFilm:
+    """Films a performance in colour; the head turns slowly from side to side.
+
+    Args:
+        path: of the video; ``.avi`` and ``.mkv`` are lossless.
+        rig: a performer with skin.
+        weights: (T,N).
+        light: the lamp and the ambient light, in the camera's frame.
+        fps: frames a second.
+        generator: of motion and noise.
+        settings: how.
+        progress: is told how many frames are done, and of how many.
+
+    Raises:
+        ShapeError: the weights are not (T,N), or the rig has no skin.
+        FileFormatError: the file cannot be written.
+    """
+    if weights.ndim != 2 or weights.shape[1] != len(rig.names) or len(weights) == 0:
+        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
+    cameras = turning_cameras(rig, len(weights), fps, generator, settings)
+
+    def pictures() -> Iterator[Tensor]:
+        for t, camera in enumerate(cameras):  # a picture at a time: each has a surface of its own
+            mesh = rig.neutral.with_vertices(rig(weights[t : t + 1])[0])
+            linear = lit_picture(mesh, camera, light, settings)
+            noise = settings.noise * linear.sqrt() * torch.randn(linear.shape, generator=generator)
+            yield (to_srgb((linear + noise).clamp(0, 1)) * 255).round().to(torch.uint8)[None]
+            if progress is not None:
+                progress(t + 1, len(cameras))
+
+    return LitFilm(write_video(pictures(), path, fps), rig, weights, cameras, light)
+
+
+def turning_cameras(
+    rig: BlendshapeRig, frames: int, fps: float, generator: torch.Generator, settings: LightStageSettings
+) -> tuple[Camera, ...]:
+    """Cameras before a head that turns and nods: one that stands still, told in the head's own frame."""
+    middle = rig.vertices[rig.neutral.landmarks].double().mean(0)
+    still = look_at(middle, 0.0, 0.0, settings.span, settings.width, settings.height, settings.field_of_view)
+    seconds = torch.arange(frames, dtype=torch.float64) / fps
+    phase = 2 * math.pi * torch.rand(4, generator=generator, dtype=torch.float64)
+    rates = torch.tensor([0.31, 0.23, 0.17, 0.13], dtype=torch.float64)
+    wave = torch.sin(2 * math.pi * rates * seconds[:, None] + phase)
+    reach = math.radians(settings.turn) * torch.tensor([0.5, 1.0, 0.25], dtype=torch.float64)
+    pivot = middle + torch.tensor([0.0, -50.0, -90.0], dtype=torch.float64)
+    cameras = []
+    for t in range(frames):  # each frame its own camera
+        turned = rotation_matrix(wave[t, :3] * reach)
+        shift = torch.stack([12 * wave[t, 3], 6 * wave[t, 1], 20 * wave[t, 2]])
+        rotation = still.rotation @ turned
+        cameras.append(
+            replace(
+                still,
+                rotation=rotation,
+                translation=still.translation + still.rotation @ (pivot + shift - turned @ pivot),
+            )
+        )
+    return tuple(cameras)
+
+
+def lit_picture(mesh: Mesh, camera: Camera, light: PointLight, settings: LightStageSettings) -> Tensor:
+    """What the camera sees of a mesh with skin, linear light, (3,H,W): Lambert, Blinn's gloss, cast shadows.
+
+    Raises:
+        ShapeError: the mesh has no texture.
+    """
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
+        raise ShapeError("light stage: found a mesh without skin, expected performer(identity, texture=True)")
+    vertices = mesh.vertices.double()
+    caster = RayCaster(vertices, mesh.faces)
+    origins, ways = camera.rays(settings.samples)
+    shape = ways.shape[:2]
+    origins, ways = origins.reshape(-1, 3), ways.reshape(-1, 3)
+    hits = caster.cast(origins, ways)
+    seen = hits.triangle >= 0
+    triangle, barycentric = hits.triangle[seen], hits.barycentric[seen].double()
+    point = origins[seen] + hits.distance[seen, None] * ways[seen]
+    corner_normals = vertex_normals(vertices, mesh.faces)[mesh.faces[triangle]]
+    normal = torch.nn.functional.normalize((corner_normals * barycentric[..., None]).sum(1), dim=-1)
+    uv = (mesh.uvs[mesh.uv_faces[triangle]] * barycentric[..., None].float()).sum(1)
+    albedo = to_linear(sample_texture(mesh.texture, uv)).double()
+    lamp = camera.rotation.double().T @ (light.position.double() - camera.translation.double())  # in the world
+    toward = torch.nn.functional.normalize(lamp - point, dim=-1)
+    cosine = (normal * toward).sum(-1)
+    shadow = caster.occluded(point + _OFF_THE_SKIN * (normal + toward), toward)
+    falling = cosine.clamp(min=0) * ~shadow
+    half = torch.nn.functional.normalize(toward - ways[seen], dim=-1)
+    gloss = settings.gloss * (normal * half).sum(-1).clamp(min=0) ** settings.shininess * (falling > 0)
+    ambient, intensity = light.ambient.double(), light.intensity.double()
+    picture = torch.tensor(_WALL, dtype=torch.float64).expand(len(ways), 3).clone()
+    picture[seen] = albedo * (ambient + intensity * falling[:, None]) + intensity * gloss[:, None]
+    rows = picture.view(shape[0] // settings.samples, settings.samples, -1, settings.samples, 3)
+    return rows.mean((1, 3)).permute(2, 0, 1).float()

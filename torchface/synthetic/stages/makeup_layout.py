@@ -1,0 +1,214 @@
+"""Where a make-up artist sets markers: by muscles and action units, symmetric, each with its name.
+
+A site is a weighted sum of the 68 landmarks, laid on the skin. The tables hold the subject's right side and the
+midline; the left side is the mirror image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.operators import components, corners
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.mesh import Mesh
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.stages.landmarks_by_shape import landmarks_by_shape
+
+LANDMARKS = 68
+
+# iBUG's points in the order of their mirror images.
+_MIRROR = (
+    *range(16, -1, -1),
+    *range(26, 16, -1),
+    *range(27, 31),
+    *range(35, 30, -1),
+    *(45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40),
+    *(54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55),
+    *(64, 63, 62, 61, 60, 67, 66, 65),
+)
+
+_Site = dict[int, float]
+_SIDE: dict[str, dict[str, _Site]] = {
+    "forehead": {
+        "foreheadInner": {21: 1.7, 39: -0.7},
+        "foreheadMid": {19: 1.1, 20: 0.55, 37: -0.4, 38: -0.25},
+        "foreheadOuter": {17: 0.95, 18: 0.75, 36: -0.7},
+        "foreheadHigh": {18: 1.2, 20: 1.4, 37: -0.8, 38: -0.8},
+        "temple": {0: 0.4, 17: 0.75, 36: -0.15},
+    },
+    "brow": {
+        "browTail": {17: 1.0},
+        "browOuter": {18: 0.75, 19: 0.25},
+        "browMid": {19: 0.4, 20: 0.6},
+        "browInner": {21: 1.0},
+    },
+    "lids": {
+        "lidUpperOuter": {36: 0.2, 37: 0.65, 18: 0.15},
+        "lidUpperMid": {37: 0.43, 38: 0.43, 19: 0.14},
+        "lidUpperInner": {39: 0.15, 38: 0.7, 20: 0.15},
+        "lidLowerOuter": {36: 0.25, 41: 1.05, 37: -0.3},
+        "lidLowerMid": {40: 0.65, 41: 0.65, 37: -0.15, 38: -0.15},
+        "lidLowerInner": {39: 0.25, 40: 1.05, 38: -0.3},
+        "canthusOuter": {36: 1.35, 39: -0.35},
+    },
+    "infraorbital": {
+        "infraorbitalOuter": {36: 0.75, 3: 0.25},
+        "infraorbitalMid": {41: 0.55, 40: 0.2, 48: 0.25},
+        "infraorbitalInner": {40: 0.45, 39: 0.25, 31: 0.3},
+    },
+    "cheek": {
+        "cheekZygoma": {36: 0.5, 2: 0.5},
+        "cheekApple": {41: 0.4, 48: 0.4, 3: 0.2},
+        "cheekMid": {36: 0.15, 48: 0.45, 3: 0.4},
+        "cheekOuter": {36: 0.25, 48: 0.15, 2: 0.4, 3: 0.2},
+        "cheekLower": {48: 0.6, 4: 0.4},
+    },
+    "nasolabial fold": {
+        "nasolabialUpper": {31: 1.2, 33: -0.4, 41: 0.2},
+        "nasolabialMid": {31: 0.55, 48: 0.6, 51: -0.15},
+        "nasolabialLower": {48: 1.3, 51: -0.4, 31: 0.1},
+    },
+    "nose": {
+        "noseSideUpper": {28: 0.6, 39: 0.4},
+        "noseSideLower": {29: 0.3, 31: 0.4, 39: 0.3},
+        "noseAla": {31: 1.0, 33: -0.15, 29: 0.15},
+    },
+    "upper lip": {
+        "philtrumSide": {50: 0.5, 32: 0.5},
+        "upperLipSide": {49: 0.55, 31: 0.45},
+        "lipUpperInner": {50: 0.88, 32: 0.12},
+        "lipUpperOuter": {49: 0.88, 31: 0.12},
+        "lipCorner": {48: 1.07, 54: -0.07},
+    },
+    "lower lip": {
+        "lipLowerInner": {58: 0.9, 7: 0.1},
+        "lipLowerOuter": {59: 0.9, 6: 0.1},
+    },
+    "chin": {
+        "mentolabialSide": {58: 0.65, 7: 0.35},
+        "marionette": {48: 0.6, 59: 0.1, 6: 0.3},
+        "chinSide": {58: 0.3, 7: 0.7},
+    },
+    "jaw": {
+        "jawFront": {48: 0.1, 6: 0.6, 7: 0.3},
+        "jawMid": {48: 0.1, 5: 0.75, 6: 0.15},
+        "jawBack": {48: 0.1, 3: 0.4, 4: 0.5},
+    },
+}
+_MIDLINE: dict[str, dict[str, _Site]] = {
+    "forehead": {
+        "foreheadLow": {21: 0.95, 22: 0.95, 27: -0.9},
+        "foreheadCentre": {20: 1.2, 23: 1.2, 38: -0.7, 43: -0.7},
+    },
+    "brow": {"glabella": {21: 0.42, 22: 0.42, 27: 0.16}},
+    "nose": {"noseRoot": {27: 1.0}, "noseBridge": {28: 0.5, 29: 0.5}, "noseTip": {30: 1.0}},
+    "upper lip": {"philtrum": {33: 0.5, 51: 0.5}, "lipUpper": {51: 0.88, 33: 0.12}},
+    "lower lip": {"lipLower": {57: 0.9, 8: 0.1}},
+    "chin": {"mentolabial": {57: 0.6, 8: 0.4}, "chin": {57: 0.25, 8: 0.75}},
+}
+# Directions from which a marker has to be seen by one camera at least, degrees of yaw.
+_VIEWS = (0.0, -55.0, 55.0)
+_FORWARD, _TOWARD = -0.2, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MakeupLayout:
+    """Markers on a face.
+
+    Args:
+        attachment: where they sit; labels name muscles or creases, ``L`` and ``R`` are the subject's sides.
+        regions: of each marker, in the attachment's order.
+        mirror: the row of each marker's mirror image, (M,); a marker on the midline names itself.
+    """
+
+    attachment: Attachment
+    regions: tuple[str, ...]
+    mirror: Tensor
+
+    def counts(self) -> dict[str, int]:
+        """How many markers each region has."""
+        return {region: self.regions.count(region) for region in dict.fromkeys(self.regions)}
+
+
+def makeup_layout(rig: BlendshapeRig) -> MakeupLayout:
+    """Markers as a make-up artist sets them for the facial action coding system, on any head.
+
+    Brows and the frontalis above them (action units 1, 2, 4), lids (5, 7, 45), the orbicularis beside and below the eye
+    (6), nose (9), nasolabial fold (10, 11, 12), the contour of both lips (15 to 28), chin (17), jaw line (26, 27, 29,
+    30), and few on forehead, temples and nasal root that hardly move, which tell the head's motion.
+
+    Args:
+        rig: with 68 iBUG landmarks in its annotations; without, they are found from shapes with ARKit's names.
+
+    Raises:
+        ValueRangeError: the rig has neither landmarks nor enough of ARKit's shapes.
+
+    Source: Ekman, Friesen 1978 for the action units; thesis 4.1.1.
+    """
+    points = _landmarks(rig)
+    names, regions, sites, partner = [], [], [], []
+    for region in _SIDE:
+        for name, weights in _MIDLINE.get(region, {}).items():
+            names.append(name)
+            partner.append(name)
+            regions.append(region)
+            sites.append(_row(weights))
+        for name, weights in _SIDE[region].items():
+            names += [f"{name}R", f"{name}L"]
+            partner += [f"{name}L", f"{name}R"]
+            regions += [region, region]
+            sites += [_row(weights), _row({_MIRROR[index]: weight for index, weight in weights.items()})]
+    attachment = _on_skin(rig.neutral, torch.stack(sites) @ points, names)
+    return MakeupLayout(attachment, tuple(regions), torch.tensor([names.index(name) for name in partner]))
+
+
+def _landmarks(rig: BlendshapeRig) -> Tensor:
+    annotations = rig.neutral.annotations
+    if annotations is not None and annotations.landmarks is not None and len(annotations.landmarks) == LANDMARKS:
+        return rig.vertices.detach().cpu().double()[annotations.landmarks.cpu()]
+    return landmarks_by_shape(rig)
+
+
+def _row(weights: _Site) -> Tensor:
+    row = torch.zeros(LANDMARKS, dtype=torch.float64)
+    row[list(weights)] = torch.tensor(list(weights.values()), dtype=torch.float64)
+    if abs(float(row.sum()) - 1) > 1e-9:
+        raise ValueRangeError(f"layout: found weights {weights} of sum {float(row.sum()):g}, expected 1")
+    return row
+
+
+def _on_skin(mesh: Mesh, points: Tensor, names: list[str]) -> Attachment:
+    """The nearest points of the skin that some camera sees."""
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    rows = _outer_skin(mesh)
+    found = SurfaceIndex(vertices, faces[rows]).nearest(points)
+    triangles, corner = rows[found.triangle], found.barycentric.float()
+    return Attachment(triangles, corner, tuple(names), fingerprint=mesh.fingerprint())
+
+
+def _outer_skin(mesh: Mesh) -> Tensor:
+    """Triangles of the largest connected part that face a camera which nothing hides; lid rims and lips' inside not."""
+    vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
+    part = components(faces, len(vertices))
+    skin = (part == part[faces.flatten()].mode().values)[faces[:, 0]]
+    if mesh.annotations is not None and mesh.annotations.contacts is not None:
+        touching = torch.zeros(len(vertices), dtype=torch.bool)
+        touching[mesh.annotations.contacts.flatten().cpu()] = True
+        skin &= ~touching[faces].any(1)
+    a, b, c = corners(vertices, faces)
+    middle = (a + b + c) / 3
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    skin &= normals[:, 2] > _FORWARD  # the inside of a lid looks back
+    caster = RayCaster(vertices, faces[part[faces[:, 0]] == part[faces.flatten()].mode().values])
+    seen = torch.zeros(len(faces), dtype=torch.bool)
+    for yaw in torch.deg2rad(torch.tensor(_VIEWS, dtype=torch.float64)):
+        toward = torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
+        free = ~caster.occluded(middle + 0.1 * normals, toward.expand_as(middle))
+        seen |= free & (normals @ toward > _TOWARD)
+    return (skin & seen).nonzero()[:, 0]

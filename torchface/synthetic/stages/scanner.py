@@ -1,0 +1,244 @@
+"""Raw scans of a synthetic head, as a hand-held scanner makes them: another topology, noise, holes, hair, collar."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files.whole_files import write_file
+from torchface.geometry.meshes.operators import components, corners
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.io.mesh_files import save_mesh
+from torchface.landmarks.scans.contours import evenly_spaced
+from torchface.landmarks.scans.landmark_pairs import template_features
+from torchface.landmarks.scans.scan_annotations import ScanAnnotation, save_annotations
+from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE, twelve_from_ibug
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse
+from torchface.synthetic.stages.hair_and_collar import Dress, dressed
+from torchface.synthetic.stages.scan_photographs import Photography, photographed
+from torchface.synthetic.stages.subdivision import finely_coloured
+
+_DISTANCE = 520.0
+_VIEWS = tuple((yaw, pitch) for pitch in (-14.0, 22.0) for yaw in (-100.0, -65.0, -32.0, 0.0, 32.0, 65.0, 100.0))
+_LINE_POINTS = 60
+_MENPO_GROUPS = (
+    ("chin", range(17)),
+    ("leyebrow", range(17, 22)),
+    ("reyebrow", range(22, 27)),
+    ("nose", range(27, 36)),
+    ("leye", range(36, 42)),
+    ("reye", range(42, 48)),
+    ("mouth", range(48, 68)),
+)
+
+
+@dataclass(frozen=True)
+class ScannerSettings:
+    """What the scanner does to a head; lengths in millimetres.
+
+    Args:
+        voxel: resolution of the fused surface; a scan has about 120,000 / voxel² vertices.
+        detail: the head is subdivided until its edges are about this long.
+        noise: of depth.
+        holes: how many are torn, with radii up to ``hole_radius``.
+        crumbs: loose bits floating about.
+        below_chin, behind_ears: where the scan is cut off, roughly; the cut is ragged.
+        dress: hair and collar.
+        tone: by which factor one standard deviation brightens the skin from scan to scan.
+        photography: of the texture; None makes a scan without one.
+        any_pose: turned any way; otherwise upright to within some 20 degrees.
+    """
+
+    voxel: float = 1.4
+    detail: float = 1.2
+    noise: DepthNoise = field(default_factory=DepthNoise)
+    holes: int = 5
+    hole_radius: float = 5.0
+    crumbs: int = 4
+    below_chin: float = 75.0
+    behind_ears: float = 60.0
+    dress: Dress = field(default_factory=Dress)
+    tone: float = 1.15
+    photography: Photography | None = field(default_factory=Photography)
+    any_pose: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class RawScan:
+    """A scan and the truth about it, all in the scan's space.
+
+    Args:
+        mesh: in millimetres, with a texture if one was taken.
+        ibug: the 68 landmarks, (68,3).
+        annotation: the twelve landmarks and the lip and lid lines.
+        rotation, translation: from the head's space to the scan's, (3,3) and (3,).
+    """
+
+    mesh: Mesh
+    ibug: Tensor
+    annotation: ScanAnnotation
+    rotation: Tensor
+    translation: Tensor
+
+
+def eyes_closed(rig: BlendshapeRig) -> Mesh:
+    """A performer as it sits before the scanner: neutral, both eyes shut.
+
+    Raises:
+        NameMismatchError: the rig has no ``eyeBlinkLeft`` or ``eyeBlinkRight``.
+    """
+    blinks = ("eyeBlinkLeft", "eyeBlinkRight")
+    missing = [name for name in blinks if name not in rig.names]
+    if missing:
+        raise NameMismatchError(f"rig: found no shape {missing[0]!r}, expected ARKit's names")
+    weights = torch.zeros(1, len(rig.names))
+    weights[0, [rig.names.index(name) for name in blinks]] = 1.0
+    return rig.neutral.with_vertices(rig(weights)[0])
+
+
+def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) -> RawScan:
+    """Scans a head.
+
+    Args:
+        head: in the head's space (y up, z forward, millimetres), eyes closed, mouth shut, with 68 annotated landmarks
+            and contact pairs; with colours or a texture if the scan shall have one.
+        seed: of everything random.
+        settings: what the scanner does.
+
+    Raises:
+        ValueRangeError: the head lacks landmarks or contacts.
+    """
+    settings = settings or ScannerSettings()
+    generator = torch.Generator().manual_seed(seed)
+    smooth = finely_coloured(head, settings.detail)
+    head = head.with_vertices(smooth.vertices[: len(head.vertices)])
+    landmarks = head.vertices[head.landmarks].double()
+    annotation = _truth(head, landmarks)
+    tone = settings.tone ** float(torch.randn(1, generator=generator))
+    smooth = replace(smooth, colors=None if smooth.colors is None else (smooth.colors * tone).clamp(0, 1))
+    subject = dressed(smooth, landmarks, settings.dress, generator)
+    centre = landmarks[[36, 45, 48, 54]].mean(0)
+    fused = Mesh(*fuse(subject, _eyes(centre), settings.voxel, settings.noise, generator))
+    fused = _torn(fused, landmarks, settings, generator)
+    if settings.photography is not None:
+        fused = photographed(fused, subject, centre, settings.photography)
+    rotation, translation = _pose(settings.any_pose, generator)
+
+    def moved(points: Tensor) -> Tensor:
+        return (points.double() - centre) @ rotation.T + translation
+
+    mesh = Mesh(moved(fused.vertices).float(), fused.faces, fused.uvs, fused.uv_faces, texture=fused.texture)
+    truth = ScanAnnotation(
+        {name: moved(point) for name, point in annotation.points.items()},
+        {name: moved(line) for name, line in annotation.lines.items()},
+    )
+    return RawScan(mesh, moved(landmarks), truth, rotation, translation - rotation @ centre)
+
+
+def write_scan(scan: RawScan, folder: str | Path, name: str) -> Path:
+    """Writes ``name.obj`` with its material and picture, and ``name.ljson`` with the 68 landmarks, as menpo does.
+
+    Returns:
+        The path of the OBJ file.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    groups = [{"label": label, "mask": list(rows)} for label, rows in _MENPO_GROUPS]
+    landmarks = {"points": scan.ibug.tolist(), "connectivity": []}
+    document = {"version": 2, "labels": groups, "landmarks": landmarks}
+    write_file(folder / f"{name}.ljson", json.dumps(document).encode())
+    save_mesh(scan.mesh, folder / f"{name}.obj")
+    return folder / f"{name}.obj"
+
+
+def write_scans(
+    heads: Iterable[Mesh], folder: str | Path, settings: ScannerSettings | None = None, seed: int = 0
+) -> list[Path]:
+    """Scans heads one by one into a folder: ``scan_000.obj`` and so on, and ``annotations.json`` with the truth.
+
+    Returns:
+        The paths of the OBJ files.
+    """
+    paths, annotations = [], {}
+    for i, head in enumerate(heads):
+        scan = scan_head(head, seed + i, settings)
+        paths.append(write_scan(scan, folder, f"scan_{i:03d}"))
+        annotations[paths[-1].name] = scan.annotation
+    save_annotations(annotations, Path(folder) / "annotations.json")
+    return paths
+
+
+def _truth(head: Mesh, landmarks: Tensor) -> ScanAnnotation:
+    """Twelve landmarks, cheeks laid onto the surface, and the lines where lids and lips meet."""
+    twelve = twelve_from_ibug(landmarks)
+    on_surface = SurfaceIndex(head.vertices, head.faces).nearest(twelve).points
+    points = dict(zip(TWELVE, on_surface, strict=True))
+    features = template_features(head)
+    lines = {}
+    for name, (left, right) in LINES.items():
+        if name not in features.lines:
+            raise ValueRangeError(f"head: found no contact pairs along the {name}, expected lids and lips that touch")
+        pairs = features.lines[name][0].view(-1, 2)
+        middle = head.vertices[pairs].double().mean(1)
+        path = torch.cat([points[left][None], middle, points[right][None]])
+        lines[name] = evenly_spaced(path, _LINE_POINTS)
+    return ScanAnnotation(points, lines)
+
+
+def _eyes(centre: Tensor) -> Tensor:
+    """Where the scanner stops on its way round the head, (E,3)."""
+    yaw, pitch = torch.deg2rad(torch.tensor(_VIEWS, dtype=torch.float64)).unbind(1)
+    way = torch.stack([yaw.sin() * pitch.cos(), pitch.sin(), yaw.cos() * pitch.cos()], dim=-1)
+    return centre + torch.tensor([0.0, 0.0, -70.0], dtype=torch.float64) + _DISTANCE * way
+
+
+def _torn(mesh: Mesh, landmarks: Tensor, settings: ScannerSettings, generator: torch.Generator) -> Mesh:
+    """Cut off raggedly at the neck and behind the ears, with holes, without most crumbs."""
+    middle = torch.stack(corners(mesh.vertices, mesh.faces)).mean(0)
+    ragged = _ragged(middle, generator)
+    keep = middle[:, 1] > landmarks[8, 1] - settings.below_chin + ragged
+    keep &= middle[:, 2] > landmarks[[0, 16], 2].mean() - settings.behind_ears + ragged
+    inside = middle[keep]
+    for _ in range(settings.holes):
+        at = inside[int(torch.randint(len(inside), (1,), generator=generator))]
+        radius = settings.hole_radius * float(torch.rand(1, generator=generator)) ** 0.5
+        keep &= (middle - at).norm(dim=-1) > radius * (1 + 0.3 * ragged / 6.0)
+    faces = mesh.faces[keep]
+    part = components(faces, len(mesh.vertices))[faces[:, 0]]
+    order = part.bincount().argsort(descending=True)[: 1 + settings.crumbs]
+    faces = faces[torch.isin(part, order)]
+    used, faces = faces.unique(return_inverse=True)
+    return Mesh(mesh.vertices[used], faces)
+
+
+def _ragged(points: Tensor, generator: torch.Generator) -> Tensor:
+    """Some millimetres more or less from place to place, (N,)."""
+    heading = torch.randn(6, 3, generator=generator, dtype=torch.float64) * 0.25
+    phase = torch.rand(6, generator=generator, dtype=torch.float64) * 2 * math.pi
+    return 2.0 * (points @ heading.T + phase).sin().sum(1)
+
+
+def _pose(any_pose: bool, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A random rotation (3,3) and translation (3,)."""
+    quaternion = torch.randn(4, generator=generator, dtype=torch.float64)
+    if not any_pose:
+        quaternion = quaternion * 0.1 + torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    w, x, y, z = (quaternion / quaternion.norm()).tolist()
+    rotation = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=torch.float64,
+    )
+    return rotation, 60.0 * torch.randn(3, generator=generator, dtype=torch.float64)

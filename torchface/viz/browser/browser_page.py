@@ -1,0 +1,130 @@
+"""A browser page that only this machine can open: viser bound to 127.0.0.1, with light, camera and background."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from torchface.files.extra_packages import import_extra
+from torchface.mesh import Mesh
+from torchface.viz.browser.origin_check import only_this_page
+
+if TYPE_CHECKING:
+    import viser
+
+HOST = "127.0.0.1"
+SCALE = 0.01
+"""Millimetres to the page's units: viser's clipping planes and controls suit things a few units large."""
+
+_FIELD_OF_VIEW = math.radians(26.0)
+_BACKGROUND_TOP, _BACKGROUND_BOTTOM = (0.93, 0.94, 0.95), (0.62, 0.66, 0.70)
+_BRAND = (46, 92, 138)
+
+
+def import_viser() -> Any:
+    """The ``viser`` package.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    return import_extra("viser", "viser", "viewer", "the viewer")
+
+
+def start_server(label: str, port: int = 8080) -> viser.ViserServer:
+    """A page on ``http://127.0.0.1:PORT``, or on the next port that is free.
+
+    Args:
+        label: heads the panel, and names the browser's tab.
+        port: the first to try; 0 takes any that is free.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+    """
+    viser = import_viser()
+    with _quiet(), only_this_page(f"{label} – torchface" if label != "torchface" else label):
+        server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
+    # Any page open in the browser could ask viser for a public tunnel to this one; there is none.
+    setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
+    server.scene.set_up_direction("+y")
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", brand_color=_BRAND)
+    server.gui.main_panel.dock_right()
+    server.scene.world_axes.visible = False
+    _light(server)
+    server.scene.set_background_image(_gradient(), format="png")
+    return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Closes the page and its port."""
+    with _quiet():
+        server.stop()
+
+
+def icon(name: str) -> Any:
+    """One of viser's icons, such as ``"PLAYER_PLAY"``."""
+    return getattr(import_viser().Icon, name)
+
+
+def frame_camera(server: viser.ViserServer, mesh: Mesh, width: float = 1.0) -> None:
+    """Sets the camera before a mesh, looking along -z: round its landmarks where annotated, else the whole of it.
+
+    Args:
+        server: the page.
+        mesh: at rest, millimetres.
+        width: how many times the mesh's own width must fit in, to its right.
+    """
+    points, room = mesh.vertices.double(), 1.12
+    if mesh.annotations is not None and mesh.annotations.landmarks is not None and width == 1.0:
+        points, room = points[mesh.annotations.landmarks], 2.1
+    low, high = points.amin(0), points.amax(0)
+    size, centre = high - low, (low + high) / 2
+    if room > 2:  # landmarks end at the brows: leave room for the forehead
+        centre = centre + torch.tensor([0.0, 0.14, 0.0]).to(centre) * size[1]
+    centre[0] += (width - 1) / 2 * size[0]
+    span = room * float(torch.maximum(size[1], size[0] * width))
+    distance = float(high[2] - centre[2]) + 0.5 * span / math.tan(_FIELD_OF_VIEW / 2)
+    position = centre + torch.tensor([0.0, 0.0, distance]).to(centre)
+    camera = server.initial_camera
+    camera.position = (position * SCALE).numpy()
+    camera.look_at = (centre * SCALE).numpy()
+    camera.up = (0.0, 1.0, 0.0)
+    camera.fov = _FIELD_OF_VIEW
+
+
+def _light(server: viser.ViserServer) -> None:
+    """Key from the viewer's upper left, weaker fill, rim from behind: form shows where flat light would hide it."""
+    scene = server.scene
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere("/light/sky", sky_color=(235, 240, 248), ground_color=(150, 140, 132), intensity=0.9)
+    for name, position, color, strength in (
+        ("key", (-3.0, 4.0, 5.0), (255, 247, 238), 2.2),
+        ("fill", (5.0, 0.5, 3.5), (225, 235, 250), 0.7),
+        ("rim", (2.0, 4.0, -5.0), (255, 255, 255), 1.2),
+    ):
+        scene.add_light_directional(f"/light/{name}", color=color, intensity=strength, position=position)
+
+
+def _gradient() -> np.ndarray:
+    height = 256
+    blend = np.linspace(0.0, 1.0, height)[:, None, None]
+    top, bottom = np.array(_BACKGROUND_TOP), np.array(_BACKGROUND_BOTTOM)
+    rows = np.broadcast_to(top * (1 - blend) + bottom * blend, (height, 4, 3))
+    return (rows * 255).round().astype(np.uint8)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """viser announces itself on standard output, which belongs to the command."""
+    console = importlib.import_module("rich").get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

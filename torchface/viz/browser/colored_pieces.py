@@ -1,0 +1,121 @@
+"""A head cut into pieces of one colour each, so that the page gets only the pieces that moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from torchface.io.gltf.region_materials import part_material
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import CLAY
+
+_MOST_COMPONENTS = 16
+_MOST_COLORS = 6
+_SAME_COLOR = 0.12
+_SMALLEST_SHARE = 0.004
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some triangles of a mesh in one colour.
+
+    Args:
+        vertex_ids: which vertices of the mesh, (V',) int64.
+        faces: triangles into those, (F',3) int64.
+        color: in [0,1].
+    """
+
+    vertex_ids: Tensor
+    faces: Tensor
+    color: tuple[float, float, float]
+
+
+def split_parts(mesh: Mesh) -> list[Part]:
+    """The mesh cut by connected component and by colour, largest piece first.
+
+    Colours are those of the texture, else of the vertices, else of what regions are named; few classes, for shapes in
+    motion. Every triangle lands in one part, but for those of clear shells over the eye and of lashes.
+    """
+    mesh = mesh.to("cpu")
+    colors, shown = _triangle_colors(mesh)
+    component = _components(mesh)
+    classes, palette = _color_classes(colors)
+    piece = torch.where(shown, component * len(palette) + classes, -1)
+    # A handful of triangles of a stray colour would cost a part of their own: they take their component's main one.
+    for number in component.unique().tolist():
+        members = (component == number) & shown
+        if not members.any():
+            continue
+        counts = torch.bincount(classes[members], minlength=len(palette))
+        stray = counts < _SMALLEST_SHARE * len(mesh.faces)
+        piece[members & stray[classes]] = number * len(palette) + int(counts.argmax())
+    parts = []
+    for label in piece.unique().tolist():
+        if label < 0:
+            continue
+        inside = piece == label
+        ids, local = mesh.faces[inside].unique(return_inverse=True)
+        red, green, blue = colors[inside].mean(0).tolist()
+        parts.append(Part(ids, local, (red, green, blue)))
+    return sorted(parts, key=lambda part: -len(part.faces))
+
+
+def triangle_texture(mesh: Mesh) -> Tensor:
+    """The texture's colour (F,3) in the middle of each triangle; the mesh has texture and UVs."""
+    assert mesh.texture is not None
+    assert mesh.uvs is not None
+    assert mesh.uv_faces is not None
+    height, width = mesh.texture.shape[1:]
+    middle = mesh.uvs[mesh.uv_faces].mean(1)
+    column = (middle[:, 0] * width).long().remainder(width)
+    row = ((1 - middle[:, 1]) * height).long().remainder(height)
+    return mesh.texture[:, row, column].T
+
+
+def _triangle_colors(mesh: Mesh) -> tuple[Tensor, Tensor]:
+    count = len(mesh.faces)
+    shown = torch.ones(count, dtype=torch.bool)
+    if mesh.texture is not None and mesh.uvs is not None:
+        return triangle_texture(mesh).float(), shown
+    if mesh.colors is not None:
+        return mesh.colors[mesh.faces].mean(1).float(), shown
+    colors = torch.tensor(CLAY).repeat(count, 1)
+    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    for name, mask in regions.items():
+        material, inside = part_material(name), mask[mesh.faces].all(1)
+        if material is not None and material.alpha == "BLEND":
+            shown &= ~inside  # clear shells over the eye, and lashes that are cards for a texture
+        elif material is not None:
+            colors[inside] = torch.tensor(material.color)
+    return colors, shown
+
+
+def _components(mesh: Mesh) -> Tensor:
+    """A number a triangle; the smaller components share the last."""
+    faces = mesh.faces.numpy()
+    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    links = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
+    label = torch.from_numpy(connected_components(links, directed=False)[1].astype(np.int64))[mesh.faces[:, 0]]
+    size = torch.bincount(label)
+    rank = torch.empty_like(size)
+    rank[size.argsort(descending=True, stable=True)] = torch.arange(len(size))
+    return rank[label].clamp(max=_MOST_COMPONENTS - 1)
+
+
+def _color_classes(colors: Tensor) -> tuple[Tensor, Tensor]:
+    """A class (F,) and the palette (K,3): k-means from colours that lie far from each other."""
+    points = colors.double().numpy()
+    centres = [points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]]
+    while len(centres) < _MOST_COLORS:
+        distance = np.min([np.linalg.norm(points - centre, axis=1) for centre in centres], axis=0)
+        if distance.max(initial=0.0) < _SAME_COLOR:
+            break
+        centres.append(points[distance.argmax()])
+    palette, label = kmeans2(points, np.stack(centres), minit="matrix", missing="warn")
+    return torch.from_numpy(label.astype(np.int64)), torch.from_numpy(palette)

@@ -1,0 +1,267 @@
+"""The rig viewer: a slider a shape, symmetric editing, playback of a take, saving what was edited."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io import save_take
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+from torchface.viz.browser.browser_page import HOST, frame_camera, icon, start_server, stop_server
+from torchface.viz.browser.head_mesh import HeadOnPage
+from torchface.viz.browser.html_lists import caption, shape_list
+from torchface.viz.browser.playback import Playback
+from torchface.viz.browser.shape_groups import grouped, label_of
+from torchface.viz.browser.shared_input import SharedInput
+from torchface.viz.browser.weight_editor import WeightEditor
+
+if TYPE_CHECKING:
+    import viser
+
+_TICK = 1 / 120
+_REST = 0.25
+_PANEL_INTERVAL = 0.12
+_SPEEDS = ("0.1", "0.25", "0.5", "1", "2")
+_OPEN_GROUPS = ("brows", "eyes", "jaw", "mouth")
+_SPREAD = 6
+
+
+class RigViewer:
+    """A rig in the browser.
+
+    Args:
+        rig: what moves.
+        take: weights to play and edit, mapped to the rig's names; one neutral pose if absent.
+        out: where *Save* writes; a path that the page shows and cannot change.
+        detail: wrinkle maps of the rig's shapes, shown while the head rests.
+        label: heads the panel.
+        port: the first to try, 0 for any.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+        ValueRangeError: the take holds no weights.
+        NameMismatchError: the take names no shape of the rig.
+    """
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        take: Take | None = None,
+        out: str | Path = "edited_weights.csv",
+        detail: DetailMaps | None = None,
+        label: str = "torchface",
+        port: int = 8080,
+    ) -> None:
+        if take is not None and take.weights is None:
+            raise ValueRangeError("take: found no weights, expected a weight take such as Live Link Face's")
+        weights = None if take is None or take.weights is None else rig.weights_from(take.weights)
+        self.rig, self.take, self.out = rig, take, Path(out)
+        self.editor = WeightEditor(rig.names, weights, spread=0 if weights is None else _SPREAD, symmetric=True)
+        self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps)
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self._moved_at = self._panel_at = float("-inf")
+        self._panel_due = False
+        self.server = start_server(label, port)
+        self._detail, self._wrinkled = detail, detail is not None
+        self.head = HeadOnPage(self.server, self._posed(), "head", wrinkles=self._wrinkles if detail else None)
+        frame_camera(self.server, rig.neutral)
+        if self.take is not None:
+            self._add_timeline()
+        self._add_editing()
+        with self.server.gui.add_folder("Active shapes"):
+            self._active = self.server.gui.add_html("")
+        self.sliders = self._add_sliders()
+        self._refresh_panel()
+        self._thread = threading.Thread(target=self._run, name="torchface-viewer", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Closes the page."""
+        self._stopped.set()
+        self._thread.join(timeout=5)
+        stop_server(self.server)
+
+    def wait(self) -> None:
+        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
+        self._stopped.wait()
+
+    def show_frame(self, frame: int) -> int:
+        """Brings a frame into view; returns how many pieces of the head were sent."""
+        with self._lock:
+            self.editor.frame = frame
+            return self._show()
+
+    def set_weight(self, name: str, value: float) -> int:
+        """Moves a shape in the frame in view, with symmetric editing its twin too; returns the pieces sent."""
+        with self._lock:
+            if self.playback.playing:
+                self._pause()
+            self.editor.set(name, value)
+            return self._show()
+
+    def save(self) -> Path:
+        """Writes the weights as they stand now."""
+        with self._lock:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            save_take(self.editor.to_take(self.take), self.out)
+        return self.out
+
+    def _posed(self) -> Mesh:
+        return self.rig.neutral.with_vertices(self._vertices())
+
+    def _vertices(self) -> Tensor:
+        return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
+
+    def _wrinkles(self) -> Tensor | None:
+        if self._detail is None or not self._wrinkled:
+            return None
+        return self._detail.blend(self.rig.names, self.editor.pose)
+
+    def _show_wrinkles(self, shown: bool) -> None:
+        self._wrinkled = bool(shown)
+        self.head.refresh_skin()
+
+    def _show(self) -> int:
+        sent = self.head.show(self._vertices())
+        if sent:
+            self._moved_at = time.monotonic()
+        self._panel_due = True
+        return sent
+
+    def _run(self) -> None:
+        """Plays, keeps the panel up to date at a rate that a browser likes, and puts the skin on at rest."""
+        while not self._stopped.wait(_TICK):
+            with self._lock:
+                now = time.monotonic()
+                if self.playback.playing:
+                    due = self.playback.frame(now)
+                    if due != self.editor.frame:
+                        self.show_frame(due)
+                    if self.playback.ended(now):
+                        self._pause()
+                if self._panel_due and now - self._panel_at > _PANEL_INTERVAL:
+                    self._refresh_panel()
+                    self._panel_at, self._panel_due = now, False
+                if not self.head.settled and now - self._moved_at > _REST:
+                    self.head.settle()
+
+    def _refresh_panel(self) -> None:
+        pose = self.editor.pose.tolist()
+        with self.server.atomic():
+            self._active.content = shape_list(self.editor.active())
+            for name, value in zip(self.rig.names, pose, strict=True):
+                self.sliders[name].push(round(value, 3))
+            if self.take is not None:
+                self._frame.push(self.editor.frame)
+                self._time.content = _time_line(self.editor.frame, len(self.editor), self.take)
+
+    def _add_timeline(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Timeline"):
+            self._play = gui.add_button("Play", icon=icon("PLAYER_PLAY"))
+            frame = gui.add_slider("Frame", 0, max(len(self.editor) - 1, 1), 1, 0)
+            self._time = gui.add_html("")
+            speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
+            loop = gui.add_checkbox("Loop", True)
+        self._play.on_click(lambda _: self._toggle_play())
+        self._frame = self._shared(frame, self._seek)
+        self._shared(speed, lambda value: self._pace(speed=float(value)))
+        self._shared(loop, lambda value: self._pace(loop=bool(value)))
+
+    def _add_editing(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Editing"):
+            symmetric = gui.add_checkbox("Symmetric", True, hint="A slider moves its mirror twin too")
+            self._shared(symmetric, lambda value: setattr(self.editor, "symmetric", bool(value)))
+            if self.take is not None:
+                spread = gui.add_slider("Spread", 0, 60, 1, _SPREAD, hint="Frames beside that an edit takes along")
+                self._shared(spread, lambda value: setattr(self.editor, "spread", int(value)))
+            if self.head.has_skin:
+                skin = gui.add_checkbox("Texture at rest", True, hint="In motion the head shows in plain colours")
+                self._shared(skin, self.head.wear_skin)
+            if self._detail is not None:
+                self._shared(gui.add_checkbox("Wrinkles", True), self._show_wrinkles)
+            actions: dict[str, Callable[[], None]] = {"Reset": self.editor.reset}
+            if self.take is not None:
+                actions = {"Neutral": self.editor.rest, "Reset frame": self.editor.reset_frame}
+                actions["Reset all"] = self.editor.reset
+            buttons: Any = gui.add_button_group("Pose", tuple(actions))
+            buttons.on_click(lambda event: self._edit(actions[event.target.value]))
+            save = gui.add_button("Save weights", icon=icon("DEVICE_FLOPPY"), hint=f"Writes {self.out}")
+            save.on_click(self._save_clicked)
+
+    def _add_sliders(self) -> dict[str, SharedInput]:
+        gui, editor = self.server.gui, self.editor
+        low, high = editor.low.tolist(), editor.high.tolist()
+        sliders: dict[str, SharedInput] = {}
+        for group, rows in grouped(self.rig.names).items():
+            with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS):
+                for row in rows:
+                    name = self.rig.names[row]
+                    slider = gui.add_slider(label_of(name), low[row], high[row], 0.01, 0.0, hint=name)
+                    slider.precision = 3
+                    sliders[name] = self._shared(slider, partial(self._set, name))
+        return sliders
+
+    def _set(self, name: str, value: float) -> None:
+        self.set_weight(name, float(value))
+
+    def _shared(self, handle: Any, act: Callable[[Any], Any]) -> SharedInput:
+        return SharedInput(handle, self._lock, act)
+
+    def _toggle_play(self) -> None:
+        with self._lock:
+            if self.playback.playing:
+                self._pause()
+            else:
+                self.playback = self.playback.play(time.monotonic())
+                self._play.label = "Pause"
+
+    def _pause(self) -> None:
+        self.playback = self.playback.pause(time.monotonic())
+        self._play.label = "Play"
+
+    def _pace(self, **change: Any) -> None:
+        self.playback = self.playback.paced(time.monotonic(), **change)
+
+    def _seek(self, frame: int) -> None:
+        if self.playback.playing:
+            self._pause()
+        self.playback = self.playback.seek(frame, time.monotonic())
+        self.show_frame(self.playback.origin)
+
+    def _edit(self, action: Callable[[], None]) -> None:
+        with self._lock:
+            if self.playback.playing:
+                self._pause()
+            action()
+            self._show()
+
+    def _save_clicked(self, event: viser.GuiEvent) -> None:
+        assert event.client is not None
+        try:
+            path = self.save()
+            event.client.add_notification("Saved", str(path), auto_close_seconds=5.0, color="teal")
+        except (TorchfaceError, OSError) as error:
+            event.client.add_notification("Not saved", str(error), color="red")
+
+
+def _time_line(frame: int, frames: int, take: Take) -> str:
+    code = "" if take.timecode is None else f" · {take.timecode[frame]}"
+    return caption(f"{frame} of {frames - 1} · {frame / take.fps:.2f} s{code}")

@@ -1,0 +1,1 @@
+"""Images and curves: faces with errors as heat maps, markers, models, motion."""

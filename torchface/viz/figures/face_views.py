@@ -1,0 +1,74 @@
+"""Views of a face as a modeller would want them: front, three-quarter, profile, with an error as a heat map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, render
+from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
+from torchface.viz.figures.region_colors import as_seen
+
+FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
+
+
+def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
+    """What to look at, (3,), and how many millimetres a picture of ``aspect`` (width over height) is to be high.
+
+    Round the landmarks or the ``face`` region where annotated, else the whole mesh.
+    """
+    points, room, shift = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
+    if mesh.annotations is not None and mesh.annotations.landmarks is not None:
+        # Landmarks end at the brows: leave room for the forehead, and turn about a point inside the head.
+        points, room, shift = mesh.vertices[mesh.annotations.landmarks], 1.9, (0.0, 0.12, -0.35)
+    elif mesh.annotations is not None and "face" in mesh.annotations.regions:
+        points, room = mesh.vertices[mesh.annotations.regions["face"]], 1.2
+    low, high = points.amin(0), points.amax(0)
+    centre = (low + high) / 2 + torch.tensor(shift).to(low) * float(high[1] - low[1])
+    return centre, room * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+
+
+def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
+    """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh."""
+    centre, span = framing(mesh, width / height)
+    return look_at(centre, yaw, pitch, span=span, width=width, height=height)
+
+
+def face_views(
+    mesh: Mesh,
+    yaws: Sequence[float] = (FRONT, THREE_QUARTER, PROFILE),
+    colors: Tensor | None = None,
+    title: str | None = None,
+    width: int = 400,
+    height: int = 500,
+    samples: int = 2,
+    framed_by: Mesh | None = None,
+    lighting: Lighting = DEFAULT_LIGHTING,
+) -> Tensor:
+    """The mesh from several sides in one row, (3,H,W); ``framed_by`` keeps the framing of another pose."""
+    cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
+    seen = as_seen(mesh)
+    row = sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
+    return row if title is None else caption(row, title)
+
+
+def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int = 400, height: int = 500) -> Tensor:
+    """Per-vertex values (V,) painted on three views, with a colour bar from 0 to ``maximum``; (3,H,W)."""
+    row = face_views(mesh, colors=heat_colors(values, maximum), width=width, height=height)
+    figure = Figure(figsize=(1.1, row.shape[1] / 100), dpi=100)
+    axes = figure.add_axes((0.12, 0.08, 0.2, 0.84))
+    mappable = ScalarMappable(Normalize(0, maximum), "turbo")
+    figure.colorbar(mappable, cax=axes, label=label)
+    return sheet([row, from_figure(figure)], 2)
+
+
+def clay_colors(mesh: Mesh) -> Tensor:
+    """One plain colour (V,3), which shows form where texture would hide it."""
+    return torch.tensor(CLAY).expand(len(mesh.vertices), 3)

@@ -1,0 +1,81 @@
+"""Errors as the thesis shows them: green where a face is right, red where it is not, beside the face itself."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchface.mesh import Mesh
+from torchface.rendering.compositing import caption, from_figure, headed, heat_colors, sheet
+from torchface.viz.figures.face_views import clay_colors, face_views
+
+GREEN_TO_RED = "RdYlGn_r"
+"""The colour map, as matplotlib calls it."""
+NOT_COMPARED = (0.75, 0.75, 0.75)
+
+_STEPS = (1.0, 2.0, 5.0, 10.0)
+
+
+def error_colors(errors: Tensor, maximum: float) -> Tensor:
+    """Colours (V,3): green at 0 to red at ``maximum`` and beyond; grey where the error (V,) is NaN."""
+    colors = heat_colors(errors.nan_to_num(0.0).float(), maximum, GREEN_TO_RED)
+    colors[errors.isnan()] = torch.tensor(NOT_COMPARED)
+    return colors
+
+
+def round_maximum(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten, for the end of a scale.
+
+    Example:
+        >>> round_maximum(0.31), round_maximum(5.0)
+        (0.5, 5.0)
+    """
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in _STEPS if step * power >= value * (1 - 1e-9))
+
+
+def error_views(mesh: Mesh, errors: Tensor, maximum: float, title: str, height: int = 400) -> Tensor:
+    """Errors (V,), millimetres, on a mesh from front, three quarters and profile, with the scale beside; (3,H,W)."""
+    row = face_views(mesh, colors=error_colors(errors, maximum), width=height * 4 // 5, height=height)
+    return headed(sheet([row, _scale(maximum, row.shape[1])], 2), title)
+
+
+def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, title: str, height: int = 290) -> Tensor:
+    """One frame: what came back, what was, and the error between them, a row each, from three sides; (3,H,W).
+
+    Args:
+        found, true: of one topology.
+        errors: (V,), millimetres; NaN is grey.
+        maximum: of the scale, millimetres.
+        title: over it all.
+        height: of each picture, pixels.
+
+    Source: thesis, figures 81 to 94.
+    """
+    width = height * 4 // 5
+    rows = [
+        caption(face_views(true, colors=clay_colors(true), width=width, height=height, framed_by=true), "truth"),
+        caption(face_views(found, colors=clay_colors(found), width=width, height=height, framed_by=true), "result"),
+        caption(
+            face_views(found, colors=error_colors(errors, maximum), width=width, height=height, framed_by=true),
+            "error",
+        ),
+    ]
+    page = sheet(rows, 1)
+    return headed(sheet([page, _scale(maximum, page.shape[1])], 2), title)
+
+
+def _scale(maximum: float, height: int) -> Tensor:
+    figure = Figure(figsize=(1.1, height / 100), dpi=100)
+    share = min(0.84, 3.4 / (height / 100))
+    axes = figure.add_axes((0.12, 0.5 - share / 2, 0.2, share))
+    mappable = ScalarMappable(Normalize(0, maximum), GREEN_TO_RED)
+    figure.colorbar(mappable, cax=axes, label=f"mm ({GREEN_TO_RED})", extend="max")
+    return from_figure(figure)

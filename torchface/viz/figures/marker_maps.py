@@ -1,0 +1,94 @@
+"""Markers on a face, coloured by their error or by the region that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
+from torchface.rendering.compositing import from_figure, heat_colors, sheet
+from torchface.viz.figures.face_views import FRONT, clay_colors, frame_face
+from torchface.viz.figures.region_colors import as_seen
+from torchface.viz.figures.site_views import facing
+
+SIDE = 55.0
+_WIDTH, _HEIGHT = 520, 650
+_NOT_KNOWN = (0.55, 0.55, 0.55)
+
+
+def marker_map(
+    mesh: Mesh, points: Tensor, errors: Tensor, maximum: float, labels: Sequence[str], named: int = 8
+) -> Tensor:
+    """Errors of markers (M,), millimetres, at their points (M,3) on a mesh, the worst by name; (3,H,W).
+
+    Grey is a marker without an error (NaN), for which none was seen.
+    """
+    colors = heat_colors(errors.nan_to_num(0.0), maximum).numpy()
+    colors[errors.isnan().numpy()] = _NOT_KNOWN
+    worst = set(errors.nan_to_num(-1.0).argsort(descending=True)[:named].tolist())
+    shown = ["" if i not in worst or errors.isnan()[i] else label for i, label in enumerate(labels)]
+    views = _views(mesh, points, colors, shown)
+    figure = Figure(figsize=(1.1, _HEIGHT / 100), dpi=100)
+    axes = figure.add_axes((0.12, 0.2, 0.2, 0.6))
+    figure.colorbar(
+        ScalarMappable(Normalize(0, maximum), "turbo"), cax=axes, label="mm, root mean square", extend="max"
+    )
+    return sheet([*views, from_figure(figure)], len(views) + 1)
+
+
+def marker_regions(mesh: Mesh, points: Tensor, regions: Sequence[str]) -> Tensor:
+    """Markers at points (M,3) of a mesh, a colour a region, with a legend; (3,H,W)."""
+    names = list(dict.fromkeys(regions))
+    table = np.asarray(colormaps["tab20"](np.arange(20)))[:, :3]
+    colors = np.stack([table[names.index(region) % 20] for region in regions])
+    views = _views(mesh, points, colors, [""] * len(regions))
+    figure = Figure(figsize=(1.7, _HEIGHT / 100), dpi=100)
+    for i, name in enumerate(names):
+        figure.text(0.12, 0.78 - 0.05 * i, "●", color=table[i % 20], fontsize=14, va="center")
+        figure.text(0.26, 0.78 - 0.05 * i, f"{name}, {regions.count(name)}", fontsize=10, va="center")
+    return sheet([*views, from_figure(figure)], len(views) + 1)
+
+
+def _paint(mesh: Mesh) -> Tensor | None:
+    """Clay where a texture or colours would hide the markers; regions of a bare mesh keep theirs."""
+    return None if mesh.texture is None and mesh.colors is None else clay_colors(mesh)
+
+
+def _views(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str]) -> list[Tensor]:
+    return [_view(mesh, points, colors, labels, yaw) for yaw in (FRONT, SIDE)]
+
+
+def _view(mesh: Mesh, points: Tensor, colors: np.ndarray, labels: Sequence[str], yaw: float) -> Tensor:
+    camera = frame_face(mesh, yaw, width=_WIDTH, height=_HEIGHT)
+    image = render(as_seen(mesh), camera, _paint(mesh), replace(DEFAULT_LIGHTING, occlusion_rays=4), samples=1)
+    figure = Figure(figsize=(_WIDTH / 100, _HEIGHT / 100), dpi=100)
+    axes: Axes = figure.add_axes((0, 0, 1, 1))
+    axes.imshow(image.permute(1, 2, 0).numpy())
+    shown = facing(mesh, points, yaw)
+    at = camera.project(points.double())
+    x, y = at[shown].T
+    axes.scatter(x, y, s=34, c=colors[shown.numpy()], edgecolors="black", linewidths=0.6)
+    for i in shown.nonzero()[:, 0].tolist():
+        if labels[i]:
+            left = float(at[i, 0]) < _WIDTH / 2
+            axes.annotate(
+                labels[i],
+                (float(at[i, 0]), float(at[i, 1])),
+                xytext=(-6 if left else 6, 6),
+                textcoords="offset points",
+                ha="right" if left else "left",
+                fontsize=7.5,
+                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+            )
+    axes.set(xlim=(0, _WIDTH), ylim=(_HEIGHT, 0))
+    axes.axis("off")
+    return from_figure(figure)

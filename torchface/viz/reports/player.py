@@ -1,0 +1,211 @@
+"""What the player in a page plays, as scripts that a page opened from disk may load."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+from torchface.files.whole_files import write_file
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import vertex_openness
+from torchface.rendering.compositing import heat_colors, to_pillow
+from torchface.rig import BlendshapeRig
+from torchface.viz.figures.face_views import clay_colors, framing
+from torchface.viz.figures.region_colors import as_seen
+
+_MOST_FRAMES, _FASTEST = 6000, 60.0
+# A hundredth of a millimetre: markers as 16-bit numbers, and the shortest move that is worth a number.
+_MARKER_UNIT, _SHORTEST = 0.01, 0.01
+_NOT_SEEN = -32768
+# What lies behind lips and lids at rest would stay black when they open.
+_LEAST_OPEN = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A rig and the weights (T,N) that move it, with the name that the page gives it."""
+
+    title: str
+    rig: BlendshapeRig
+    weights: Tensor
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One of the faces side by side.
+
+    Args:
+        title: under it.
+        take: which of the player's; the one that the viewer of the page has chosen if absent.
+        error: coloured by the distance to the first take's face.
+        markers: with the markers on it.
+        yaw: from where it is seen, degrees.
+    """
+
+    title: str
+    take: int | None = None
+    error: bool = False
+    markers: bool = False
+    yaw: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """Markers over a face: points (T,M,3), NaN for not seen; coloured by errors (T,M) up to ``maximum``, if given."""
+
+    points: Tensor
+    errors: Tensor | None = None
+    maximum: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """What is played.
+
+    Args:
+        takes: rigs of one mesh, with weights of as many frames and shapes of the same names.
+        panels: from left to right.
+        fps: frames a second.
+        choices: rows of ``takes`` between which the viewer of the page chooses; the first to begin with.
+        reference: row of ``takes`` whose curves lie under the others'.
+        curves: shapes whose curves are drawn.
+        markers: over the panels that ask for them.
+        maximum: distance at the end of the colours, millimetres.
+        start: the frame to begin with.
+    """
+
+    takes: Sequence[Played]
+    panels: Sequence[Panel]
+    fps: float
+    choices: Sequence[int] = (0,)
+    reference: int | None = None
+    curves: Sequence[str] = ()
+    markers: Markers | None = None
+    maximum: float = 2.0
+    start: int = 0
+
+
+def write_player(player: Player, folder: Path, name: str = "performance") -> str:
+    """Writes ``player.js`` and the data as ``NAME.js`` into a folder.
+
+    Long takes and high frame rates are thinned to 60 frames a second and 6,000 frames.
+
+    Returns:
+        HTML that plays it in a page of this folder, for ``Section.markup``.
+
+    Raises:
+        ShapeError: the takes differ in frames, vertices or shapes.
+    """
+    first = player.takes[0]
+    for take in player.takes:
+        if take.weights.shape != first.weights.shape or take.rig.deltas.shape != first.rig.deltas.shape:
+            raise ShapeError(
+                f"player: found weights {tuple(take.weights.shape)} of deltas {tuple(take.rig.deltas.shape)}, expected "
+                f"{tuple(first.weights.shape)} and {tuple(first.rig.deltas.shape)} as in the first take"
+            )
+    frames = len(first.weights)
+    step = max(1, round(player.fps / _FASTEST), math.ceil(frames / _MOST_FRAMES))
+    rigs = list({id(take.rig): take.rig for take in player.takes}.values())
+    kept = [take.weights[::step] for take in player.takes]
+    data: dict[str, Any] = {
+        "fps": player.fps / step,
+        "step": step,
+        "frames": len(kept[0]),
+        "start": player.start // step,
+        "shapes": first.rig.names,
+        "curves": [first.rig.names.index(shape) for shape in player.curves],
+        "rigs": [_rig(rig) for rig in rigs],
+        "takes": [
+            {
+                "title": take.title,
+                "rig": next(i for i, rig in enumerate(rigs) if rig is take.rig),
+                "weights": _packed((weights.clamp(0, 1) * 65535).round(), np.uint16),
+            }
+            for take, weights in zip(player.takes, kept, strict=True)
+        ],
+        "panels": [vars(panel) for panel in player.panels],
+        "choices": list(player.choices),
+        "chosen": player.choices[0],
+        "reference": player.reference,
+        "error_maximum": player.maximum,
+        "heat": _packed(255 * heat_colors(torch.arange(256) / 255, 1.0), np.uint8),
+        "markers": None if player.markers is None else _markers(player.markers, step),
+        **_looks(first.rig.neutral),
+    }
+    script = files("torchface.viz.reports").joinpath("player.js").read_bytes()
+    write_file(folder / "player.js", script)
+    write_file(folder / f"{name}.js", f'torchfacePlayer("{name}",{json.dumps(data, allow_nan=False)});\n'.encode())
+    return f'<div id="{name}"></div>\n<script src="player.js"></script>\n<script src="{name}.js"></script>\n'
+
+
+def _rig(rig: BlendshapeRig) -> dict[str, Any]:
+    """Rest and moves; of a shape only the vertices that it moves."""
+    deltas = rig.deltas.detach().cpu().float()
+    scale = max(float(deltas.abs().max()), 1e-6) / 32767
+    moved = deltas.norm(dim=-1) > _SHORTEST
+    shape, vertex = moved.nonzero().unbind(1)
+    return {
+        "vertices": _packed(rig.vertices.detach().cpu(), np.float32),
+        "starts": _packed(torch.nn.functional.pad(moved.sum(1).cumsum(0), (1, 0)), np.uint32),
+        "ids": _packed(vertex, np.uint32),
+        "deltas": _packed((deltas[shape, vertex] / scale).round(), np.int16),
+        "scale": scale,
+    }
+
+
+def _markers(markers: Markers, step: int) -> dict[str, Any]:
+    points = (markers.points[::step].detach().cpu().double() / _MARKER_UNIT).round().clamp(_NOT_SEEN + 1, 32767)
+    errors = None if markers.errors is None else markers.errors[::step].nan_to_num(0.0) / markers.maximum
+    return {
+        "points": _packed(points.nan_to_num(_NOT_SEEN), np.int16),
+        "heat": None if errors is None else _packed((255 * errors.clamp(0, 1)).round(), np.uint8),
+        "count": points.shape[1],
+        "scale": _MARKER_UNIT,
+        "maximum": markers.maximum,
+    }
+
+
+def _looks(mesh: Mesh) -> dict[str, Any]:
+    """The framing, and what covers the mesh: texture with a corner a pair of vertex and texture point, or colours."""
+    mesh = as_seen(mesh)
+    faces = mesh.faces.cpu()
+    vertex, corners, uvs, texture = torch.arange(len(mesh.vertices)), faces, None, None
+    if mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None:
+        pairs, inverse = torch.stack([faces.flatten(), mesh.uv_faces.cpu().flatten()], 1).unique(
+            dim=0, return_inverse=True
+        )
+        vertex, corners = pairs[:, 0], inverse.reshape(-1, 3)
+        uvs = _packed(mesh.uvs.cpu()[pairs[:, 1]], np.float32)
+        content = BytesIO()
+        to_pillow(mesh.texture).save(content, "JPEG", quality=88)
+        texture = "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
+    colors = clay_colors(mesh) if mesh.colors is None else mesh.colors
+    openness = vertex_openness(mesh)
+    centre, span = framing(mesh)
+    return {
+        "faces": _packed(faces, np.uint32),
+        "corner_vertex": _packed(vertex, np.uint32),
+        "corner_faces": _packed(corners, np.uint32),
+        "uvs": uvs,
+        "texture": texture,
+        "colors": _packed((255 * colors.clamp(0, 1)).round(), np.uint8),
+        "openness": _packed((255 * openness.clamp(min=_LEAST_OPEN)).round(), np.uint8),
+        "centre": centre.tolist(),
+        "span": span,
+    }
+
+
+def _packed(values: Tensor, kind: type[np.generic]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values.numpy().astype(kind)).tobytes()).decode()

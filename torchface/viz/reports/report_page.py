@@ -1,0 +1,84 @@
+"""A report as one HTML page with pictures beside it; opens in any browser, from disk, without a network."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from torchface.files.whole_files import make_folder, write_file
+from torchface.rendering.compositing import save_picture
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222 }
+h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+img { max-width: 100%; height: auto; display: block; margin: .6rem 0 }
+table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .15rem .8rem .15rem 0; text-align: left }
+td + td { font-variant-numeric: tabular-nums; text-align: right } th + th { text-align: right }
+summary { cursor: pointer; color: #1f5fa8 }
+thead { border-bottom: 1px solid #999 } tbody tr:nth-child(even) { background: #f6f6f6 }
+p { max-width: 60rem } td + td.long { text-align: left; max-width: 60rem }
+"""
+# Characters beyond which a cell is text, not a figure.
+_LONG = 60
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under a heading row; with a ``summary`` that alone shows until it is opened."""
+
+    heading: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    summary: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A heading, a paragraph, ready-made HTML, then tables and pictures (3,H,W) by file name, in this order."""
+
+    title: str
+    text: str = ""
+    tables: Sequence[Table] = ()
+    pictures: Sequence[tuple[str, Tensor]] = ()
+    markup: str = ""
+
+
+def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
+    """Writes ``index.html`` and its pictures into a folder; the page appears last, complete.
+
+    Returns:
+        The page's path.
+    """
+    folder = make_folder(folder)
+    parts = [
+        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"
+    ]
+    for section in sections:
+        parts.append(f"<h2>{html.escape(section.title)}</h2>\n")
+        if section.text:
+            parts.append(f"<p>{html.escape(section.text)}</p>\n")
+        parts.append(section.markup)
+        parts.extend(_table(table) for table in section.tables)
+        for name, picture in section.pictures:
+            save_picture(picture, folder / name)
+            size = f'width="{picture.shape[2]}" height="{picture.shape[1]}"'
+            parts.append(f'<img src="{html.escape(name)}" alt="{html.escape(section.title)}" {size}>\n')
+    page = folder / "index.html"
+    write_file(page, "".join(parts).encode())
+    return page
+
+
+def _table(table: Table) -> str:
+    def row(cells: Sequence[str], tag: str) -> str:
+        tags = [f'{tag} class="long"' if len(cell) > _LONG else tag for cell in cells]
+        return (
+            "<tr>" + "".join(f"<{a}>{html.escape(cell)}</{tag}>" for a, cell in zip(tags, cells, strict=True)) + "</tr>"
+        )
+
+    body = "\n".join(row(cells, "td") for cells in table.rows)
+    text = f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"
+    return f"<details><summary>{html.escape(table.summary)}</summary>\n{text}</details>\n" if table.summary else text

@@ -1,0 +1,185 @@
+"""Frames of a video to be annotated: tracked, chosen so that they span what the face does, kept for a resumed run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.whole_files import read_file, write_file
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io.video import VideoFile, open_video
+from torchface.landmarks.images.annotated_frames import AnnotatedFrame, save_annotated_frame
+from torchface.landmarks.images.frame_choice import choose_frames
+
+PROPOSALS = "proposals.json"
+_FORMAT = "torchface proposals"
+_LARGEST_FILE = 16 * 2**20
+_MOST = 1000
+Tracker = Callable[[VideoFile], tuple[Tensor, Tensor | None]]
+"""Landmarks (T,68,2) of a video, NaN where lost, and how sure each is, (T,68) in [0,1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Annotation:
+    """Frames to be annotated.
+
+    Args:
+        frames: pictures, with the user's landmarks where there are some already, else those proposed.
+        saved: names of those with the user's own.
+        folder: where files go.
+    """
+
+    frames: list[AnnotatedFrame]
+    saved: list[str]
+    folder: Path
+
+
+def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 15) -> Annotation:
+    """Tracks a video, or remembers that it was, and gives the frames to annotate.
+
+    What is proposed lies in the folder's ``proposals.json``; with the same video and count nothing is tracked anew.
+    More frames asked for later hold the earlier ones.
+
+    Args:
+        video: the file.
+        folder: made if missing.
+        track: finds the landmarks; called only where it must be.
+        count: how many frames.
+
+    Raises:
+        FileFormatError: the video cannot be decoded, or the folder holds proposals for another one.
+        ValueRangeError: the face was never found, or the count makes no sense.
+    """
+    if not 1 <= count <= _MOST:
+        raise ValueRangeError(f"count: found {count}, expected 1 to {_MOST}")
+    film = open_video(video)
+    known = _read(folder / PROPOSALS, film)
+    if known is None or known.asked < count:
+        landmarks, confidence = track(film)
+        chosen = choose_frames(landmarks, count, confidence)
+        known = _Proposals(count, {int(i): landmarks[i].double() for i in chosen})
+        _write(folder, film, known)
+    wanted = list(known.landmarks)[:count]
+    wanted += [number for number in known.landmarks if number not in wanted and _points(folder, film, number).is_file()]
+    pictures = _pictures(film, wanted)
+    frames, saved = [], []
+    for number in wanted:
+        name, points = _name(film, number), known.landmarks[number]
+        if _points(folder, film, number).is_file():
+            points = load_landmark_points(_points(folder, film, number)).ibug()[:, :2]
+            saved.append(name)
+        frames.append(AnnotatedFrame(name, pictures[number], points))
+    return Annotation(frames, saved, folder)
+
+
+def write_proposals(annotation: Annotation) -> list[Path]:
+    """Writes every frame with its proposed landmarks, to be edited elsewhere; the user's own are kept.
+
+    Returns:
+        The files with landmarks, new and old.
+
+    Raises:
+        FileFormatError: the folder cannot be written to.
+    """
+    paths = []
+    for frame in annotation.frames:
+        path = annotation.folder / f"{frame.name}.pts"
+        paths.append(path if frame.name in annotation.saved else save_annotated_frame(frame, annotation.folder))
+    return paths
+
+
+@dataclass(frozen=True, eq=False)
+class _Proposals:
+    """How many frames were asked for, and landmarks (68,2) by frame number in the order of choice."""
+
+    asked: int
+    landmarks: dict[int, Tensor]
+
+
+def _name(film: VideoFile, number: int) -> str:
+    return f"{film.path.stem}_{number:06d}"
+
+
+def _points(folder: Path, film: VideoFile, number: int) -> Path:
+    return folder / f"{_name(film, number)}.pts"
+
+
+def _pictures(film: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
+    """Frames (3,H,W) in [0,1] by number, in one pass: codecs seek wrongly too often."""
+    wanted, found = set(numbers), {}
+    for number, frame in enumerate(film.color_frames()):
+        if number in wanted:
+            found[number] = frame.float() / 255
+            if len(found) == len(wanted):
+                break
+    missing = wanted - set(found)
+    if missing:
+        raise FileFormatError(f"{film.path}: found no frame {min(missing)}, expected the video that was tracked")
+    return found
+
+
+def _identity(film: VideoFile) -> dict[str, Any]:
+    return {"video": film.path.name, "frames": film.count, "width": film.width, "height": film.height}
+
+
+def _write(folder: Path, film: VideoFile, proposals: _Proposals) -> None:
+    document = {
+        "format": _FORMAT,
+        **_identity(film),
+        "asked": proposals.asked,
+        "proposals": [
+            {"frame": number, "landmarks": [[round(x, 3) for x in row] for row in points.tolist()]}
+            for number, points in proposals.landmarks.items()
+        ],
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
+    write_file(folder / PROPOSALS, json.dumps(document).encode())
+
+
+def _read(path: Path, film: VideoFile) -> _Proposals | None:
+    if not path.exists():
+        return None
+    try:
+        document = json.loads(read_file(path, _LARGEST_FILE))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not JSON ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise FileFormatError(f'{path}: found no "format" of {_FORMAT!r}, expected one')
+    found = {key: document.get(key) for key in _identity(film)}
+    if found != _identity(film):
+        raise FileFormatError(
+            f"{path}: found proposals for {found['video']!r} ({found['frames']} frames of {found['width']} x "
+            f"{found['height']}), expected {film.path.name!r} ({film.count} of {film.width} x {film.height}): name "
+            "another folder, or remove this file"
+        )
+    asked, rows = document.get("asked"), document.get("proposals")
+    if type(asked) is not int or not isinstance(rows, list) or not 1 <= len(rows) <= _MOST:
+        raise FileFormatError(f"{path}: found no numbers of frames, expected those proposed")
+    landmarks = {}
+    for row in rows:
+        number, points = (row.get("frame"), row.get("landmarks")) if isinstance(row, dict) else (None, None)
+        if type(number) is not int or not 0 <= number < film.count:
+            raise FileFormatError(f"{path}: found the frame {number!r}, expected 0 to {film.count - 1}")
+        landmarks[number] = _checked(path, points)
+    return _Proposals(asked, landmarks)
+
+
+def _checked(path: Path, points: Any) -> Tensor:
+    """68 finite points."""
+    try:
+        found = torch.tensor(points, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise FileFormatError(f"{path}: found landmarks that are no points ({error})") from error
+    if found.shape != (68, 2) or not bool(torch.isfinite(found).all()):
+        raise FileFormatError(f"{path}: found landmarks of {tuple(found.shape)}, expected 68 finite points")
+    return found

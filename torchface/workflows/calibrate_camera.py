@@ -1,0 +1,335 @@
+"""From pictures of a checkerboard to a camera's calibration on disk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io.camera_files import save_calibration
+from torchface.io.images.image_files import load_image
+from torchface.io.video import open_video
+from torchface.rendering.compositing import caption, save_picture, sheet
+
+_VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
+_FEWEST_VIEWS, _MOST_FRAMES = 5, 60
+_DETECTED_AT = 1920  # pixels of the longer side; larger pictures are searched smaller and refined at full size
+_ALIKE = 0.01  # of the width: views whose corners move less tell nothing new
+_LEAST_TILT = 10.0  # degrees between the boards of some two views
+_FAR_OFF = 3.0  # times the median error of the views
+_LARGEST_DOUBT = 0.02  # of the focal length, one standard deviation
+_SHOWN, _CELL = 6, 420
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard.
+
+    Args:
+        columns, rows: of inner corners, where four squares meet.
+        square: a square's side, millimetres.
+
+    Raises:
+        ValueRangeError: fewer than three corners a side, or a side that is not positive.
+    """
+
+    columns: int = 9
+    rows: int = 6
+    square: float = 25.0
+
+    def __post_init__(self) -> None:
+        if not (3 <= self.columns <= 100 and 3 <= self.rows <= 100 and 0 < self.square < math.inf):
+            raise ValueRangeError(
+                f"checkerboard: found {self.columns} x {self.rows} corners and squares of {self.square} mm, expected "
+                "3 to 100 inner corners a side and positive millimetres"
+            )
+
+    @property
+    def points(self) -> Tensor:
+        """The inner corners on the board, (N,3), millimetres."""
+        y, x = torch.meshgrid(torch.arange(self.rows), torch.arange(self.columns), indexing="ij")
+        return self.square * torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3).float()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture in which the whole board was found.
+
+    Args:
+        name: of the file, or the number of the video's frame.
+        image: uint8 (H,W).
+        corners: (N,2), pixels.
+    """
+
+    name: str
+    image: Tensor
+    corners: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationReport:
+    """A camera, and what it rests on.
+
+    Args:
+        calibration: the camera.
+        used: names of the pictures used.
+        errors: reprojection of each, root mean square, (M,), pixels.
+        left_out: names of the others, and why.
+        doubt: deviation of the focal length, as a share of it.
+        tilt: the largest angle between the boards of two views, degrees.
+        picture: the overlay written.
+    """
+
+    calibration: CameraCalibration
+    used: tuple[str, ...]
+    errors: Tensor
+    left_out: tuple[tuple[str, str], ...]
+    doubt: float
+    tilt: float
+    picture: Path | None = None
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        camera = self.calibration
+        K, bend = camera.intrinsics.tolist(), camera.distortion.tolist()
+        lines = [
+            f"{len(self.used)} of {len(self.used) + len(self.left_out)} views used, {camera.width} x {camera.height} "
+            f"pixels, boards tilted by up to {self.tilt:.0f} degrees to each other",
+            f"reprojection error {camera.error:.3f} pixels root mean square (views: {float(self.errors.min()):.3f} to "
+            f"{float(self.errors.max()):.3f})",
+            f"focal length {K[0][0]:.1f}, {K[1][1]:.1f} pixels (+- {self.doubt:.2%}), centre {K[0][2]:.1f}, "
+            f"{K[1][2]:.1f}; {camera.field_of_view:.1f} degrees across",
+            "distortion "
+            + ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), bend, strict=True)),
+        ]
+        return lines + [f"  left out {name}: {reason}" for name, reason in self.left_out]
+
+
+def calibrate(
+    paths: Sequence[Path], board: Board, out: Path, progress: Callable[[str], None] | None = None
+) -> CalibrationReport:
+    """Calibrates a camera from pictures, or a video, of a checkerboard held at various angles, and writes it.
+
+    Args:
+        paths: image files of one size, or one video.
+        board: the checkerboard.
+        out: the ``.toml`` to write; beside it a picture of the corners found, and of views without distortion.
+        progress: called with a line before each step.
+
+    Raises:
+        FileFormatError: ``out`` is no ``.toml``, or a file is broken.
+        ShapeError: the pictures differ in size.
+        AlignmentError: the board is found in fewer than five views, or they do not tell the focal length.
+
+    Source: Zhang 2000; thesis 4.2.4.
+    """
+    say = progress or (lambda line: None)
+    if out.suffix.lower() != ".toml":
+        raise FileFormatError(f"{out}: found the ending {out.suffix!r}, expected .toml")
+    if not out.parent.is_dir():
+        raise FileFormatError(f"{out}: found no folder {out.parent}, expected an existing one")
+    if not paths:
+        raise FileFormatError("calibrate: found no picture, expected some of a checkerboard, or a video")
+    views, left_out = find_boards(_pictures(paths), board, say)
+    say(f"calibrating from {len(views)} views")
+    report = calibrate_views(views, board, left_out)
+    say("writing the calibration and the overlay")
+    picture = out.with_suffix(".png")
+    save_calibration(report.calibration, out)
+    save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), picture)
+    return CalibrationReport(**{**vars(report), "picture": picture})
+
+
+def find_boards(
+    pictures: Iterator[tuple[str, Tensor]], board: Board, progress: Callable[[str], None]
+) -> tuple[list[View], list[tuple[str, str]]]:
+    """The views with the whole board, and the names of the other pictures with the reason why not.
+
+    Args:
+        pictures: names and images, uint8 (H,W), of one size.
+        board: the checkerboard.
+        progress: called with a line before each picture.
+
+    Raises:
+        ShapeError: the pictures differ in size.
+    """
+    views: list[View] = []
+    left_out: list[tuple[str, str]] = []
+    first: tuple[str, torch.Size] | None = None
+    for name, image in pictures:  # OpenCV searches one picture at a time
+        progress(f"looking for the board: {name}")
+        first = first or (name, image.shape)
+        if image.shape != first[1]:
+            raise ShapeError(
+                f"calibrate: found {name} with {image.shape[1]} x {image.shape[0]} pixels and {first[0]} with "
+                f"{first[1][1]} x {first[1][0]}, expected pictures of one camera at one size"
+            )
+        corners = find_corners(image, board)
+        if corners is None:
+            left_out.append((name, f"no board of {board.columns} x {board.rows} inner corners"))
+            continue
+        near = _ALIKE * image.shape[1]
+        twin = next((view for view in views if float((view.corners - corners).norm(dim=1).mean()) < near), None)
+        if twin is None:
+            views.append(View(name, image, corners))
+        else:
+            left_out.append((name, f"the board stands as in {twin.name}"))
+    return views, left_out
+
+
+def find_corners(image: Tensor, board: Board) -> Tensor | None:
+    """The inner corners (N,2) float32 of the board in a picture uint8 (H,W), row by row; None if not all are seen."""
+    grey = image.numpy()
+    scale = min(1.0, _DETECTED_AT / max(grey.shape))
+    small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    good, found = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
+    if not good or found is None or len(found) != board.columns * board.rows:
+        return None
+    corners = (found.reshape(-1, 1, 2) + 0.5) / scale - 0.5
+    if scale < 1.0:
+        grid = corners.reshape(board.rows, board.columns, 2)
+        gap = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
+        half = max(2, int(gap / 4))
+        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+        corners = cv2.cornerSubPix(grey, corners.astype(np.float32), (half, half), (-1, -1), stop)
+    return torch.from_numpy(np.ascontiguousarray(corners.reshape(-1, 2), dtype=np.float32))
+
+
+def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tuple[str, str]] = ()) -> CalibrationReport:
+    """The camera that explains where the boards' corners are seen.
+
+    Views whose corners are far more off than those of the others are left out; k3 is estimated only where the views
+    tell it from none.
+
+    Args:
+        views: with the board, of one size.
+        board: the checkerboard.
+        left_out: pictures without it, and why; those left out here are added.
+
+    Raises:
+        AlignmentError: fewer than five views, views that are all parallel, or ones that leave the focal length open.
+    """
+    left = list(left_out)
+    _check_count(views, left)
+    fit = _fit(views, board)
+    far = [i for i, error in enumerate(fit.errors) if error > max(0.5, _FAR_OFF * float(np.median(fit.errors)))]
+    if far:
+        left += [(views[i].name, f"its corners are {fit.errors[i]:.1f} pixels off") for i in far]
+        views = [view for i, view in enumerate(views) if i not in far]
+        _check_count(views, left)
+        fit = _fit(views, board)
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in fit.turns])
+    tilt = math.degrees(math.acos(float(np.clip((normals @ normals.T).min(), -1, 1))))
+    if tilt < _LEAST_TILT:
+        raise AlignmentError(
+            f"calibrate: found {len(views)} views in which the board is tilted by at most {tilt:.1f} degrees from one "
+            f"to another, expected {_LEAST_TILT:.0f} at least: hold it at various angles to the camera"
+        )
+    doubt = float(fit.deviations[:2].max() / fit.K[0, 0])
+    if not doubt < _LARGEST_DOUBT:
+        raise AlignmentError(
+            f"calibrate: found views that leave the focal length open by {doubt:.1%}, expected at most "
+            f"{_LARGEST_DOUBT:.0%}: add views with the board tilted more, and nearer to the image's corners"
+        )
+    height, width = views[0].image.shape
+    camera = CameraCalibration(torch.from_numpy(fit.K), torch.from_numpy(fit.bend), int(width), int(height), fit.error)
+    names = tuple(view.name for view in views)
+    return CalibrationReport(camera, names, torch.from_numpy(fit.errors), tuple(left), doubt, tilt)
+
+
+def overlay(views: Sequence[View], calibration: CameraCalibration, board: Board) -> Tensor:
+    """Views with the corners found, and the same without distortion, as one picture (3,H,W).
+
+    The board's lines are drawn between corners: through the undistorted views they are straight.
+    """
+    K, bend = calibration.intrinsics.numpy(), calibration.distortion.numpy()
+    seen, straight = [], []
+    for view in views[:: max(1, len(views) // _SHOWN)][:_SHOWN]:  # a picture a view
+        flat = cv2.undistort(view.image.numpy(), K, bend)
+        moved = cv2.undistortPoints(view.corners.numpy().reshape(-1, 1, 2), K, bend, P=K).reshape(-1, 2)
+        seen.append(caption(_drawn(view.image.numpy(), view.corners.numpy(), board), view.name))
+        straight.append(caption(_drawn(flat, moved, board), "undistorted"))
+    return sheet([*seen, *straight], columns=len(seen))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    K: np.ndarray
+    bend: np.ndarray
+    turns: Sequence[np.ndarray]
+    errors: np.ndarray
+    deviations: np.ndarray
+    error: float
+
+
+def _fit(views: Sequence[View], board: Board) -> _Fit:
+    height, width = views[0].image.shape
+    corners = [view.corners.numpy().reshape(-1, 1, 2) for view in views]
+    points = [board.points.numpy()] * len(views)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
+    best = None
+    for flags in (cv2.CALIB_FIX_K3, 0):
+        try:
+            error, K, bend, turns, _, deviations, _, errors = cv2.calibrateCameraExtended(
+                points, corners, (int(width), int(height)), np.eye(3), np.zeros(5), flags=flags, criteria=stop
+            )
+        except cv2.error as wrong:
+            raise AlignmentError(
+                f"calibrate: no camera explains the {len(views)} views ({' '.join(str(wrong).split())[:120]}); "
+                "expected boards at various angles"
+            ) from wrong
+        bend, deviations = bend.ravel()[:5].astype(np.float64), deviations.ravel()
+        # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2, k3.
+        if best is None or abs(bend[4]) > 3 * deviations[8]:
+            best = _Fit(K, bend, turns, errors.ravel(), deviations, float(error))
+    assert best is not None
+    return best
+
+
+def _check_count(views: Sequence[View], left_out: Sequence[tuple[str, str]]) -> None:
+    if len(views) >= _FEWEST_VIEWS:
+        return
+    why = "; ".join(f"{name}: {reason}" for name, reason in left_out[:8])
+    raise AlignmentError(
+        f"calibrate: found the board in {len(views)} views, expected {_FEWEST_VIEWS} at least that differ"
+        + (f" ({why})" if why else "")
+    )
+
+
+def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
+    videos = [path for path in paths if path.suffix.lower() in _VIDEOS]
+    if videos and len(paths) > 1:
+        raise FileFormatError(f"{videos[0]}: found a video beside {len(paths) - 1} files, expected it alone, or images")
+    if not videos:
+        for path in paths:
+            image = load_image(path)
+            grey = image.new_tensor([0.299, 0.587, 0.114]) @ image.flatten(1)
+            yield path.name, (255 * grey).round().to(torch.uint8).reshape(image.shape[1:])
+        return
+    video = open_video(videos[0])
+    step = max(1, -(-video.count // _MOST_FRAMES))
+    for number, frame in enumerate(video.frames()):
+        if number % step == 0:
+            yield f"frame {number}", frame
+
+
+def _drawn(image: np.ndarray, corners: np.ndarray, board: Board) -> Tensor:
+    """A grey picture, reduced, with the rows of corners drawn over it."""
+    scale = _CELL / image.shape[1]
+    small = cv2.resize(image, (_CELL, max(1, round(image.shape[0] * scale))), interpolation=cv2.INTER_AREA)
+    canvas = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
+    grid = ((corners.reshape(board.rows, board.columns, 2) + 0.5) * scale - 0.5) * 16
+    lines = [np.ascontiguousarray(line.round(), np.int32) for line in (*grid, *grid.transpose(1, 0, 2))]
+    cv2.polylines(canvas, lines, False, (40, 200, 90), 1, cv2.LINE_AA, shift=4)
+    for x, y in grid.reshape(-1, 2).round().astype(np.int32):  # OpenCV draws one circle at a time
+        cv2.circle(canvas, (int(x), int(y)), 40, (255, 60, 40), 1, cv2.LINE_AA, shift=4)
+    return torch.from_numpy(canvas).permute(2, 0, 1).float().div(255)

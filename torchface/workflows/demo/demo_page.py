@@ -1,0 +1,297 @@
+"""The demo's report: what was true and what came back, as a performance that plays, in pictures, curves and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import DEFAULT_LIGHTING
+from torchface.rendering.compositing import caption, headed, sheet
+from torchface.shape_names import ARKIT, mapping
+from torchface.viz.figures.curves import compared_curves, error_curve, named_bars
+from torchface.viz.figures.face_views import FRONT, THREE_QUARTER, face_views, heat_map
+from torchface.viz.figures.marker_maps import marker_regions
+from torchface.viz.figures.marker_scatter import marker_views
+from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
+from torchface.viz.reports.report_page import Section, Table, write_page
+from torchface.workflows.demo.main_job import FLAWS, DemoResult, Solved
+
+_POSES: dict[str, dict[str, float]] = {
+    "neutral": {},
+    "eyes closed": {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
+    "smile": {"mouthSmileLeft": 1.0, "mouthSmileRight": 1.0},
+    "jaw open": {"jawOpen": 1.0},
+    "pucker": {"mouthPucker": 1.0},
+}
+_ACTIVE = 8
+_CURVE_SECONDS = 8.0
+_HEAT_MAXIMUM = 2.0
+# Ten heads in small: few rays show form as well.
+_FEW_RAYS = replace(DEFAULT_LIGHTING, occlusion_rays=3)
+
+
+def result_rows(result: DemoResult) -> list[tuple[str, str, str]]:
+    """The figures of a demo, one a row: what, of the take solved at once, frame by frame."""
+    names = result.rig.names
+    told = _told_apart(result)
+    solves = (result.solved, result.frame_by_frame)
+
+    def row(what: str, value: Callable[[Solved], str]) -> tuple[str, str, str]:
+        return (what, value(solves[0]), value(solves[1]))
+
+    def worst(solved: Solved) -> str:
+        shape = int(told[solved.weight_error.mean[told].argmax()])
+        return f"{float(solved.weight_error.mean[shape]):.3f} ({names[shape]})"
+
+    def median(values: Tensor) -> str:
+        return f"{float(values[torch.isfinite(values)].median()):.3f}"
+
+    return [
+        row("mesh error, mean over face and take", lambda s: f"{s.mesh_error.mean:.3f} mm"),
+        row("mesh error as a share of the motion", lambda s: f"{100 * s.mesh_error.relative:.1f} %"),
+        row("mesh error, worst vertex of any frame", lambda s: f"{float(s.mesh_error.vertex_largest.max()):.2f} mm"),
+        row("jitter of the curves, times the true ones'", lambda s: f"{s.jitter:.1f}"),
+        row("correlation with the true curve, median shape", lambda s: f"{s.correlation:.3f}"),
+        row("the same of the shapes told apart", lambda s: median(s.weight_error.correlation[told])),
+        row("weight error, mean", lambda s: f"{float(s.weight_error.mean.mean()):.4f}"),
+        row("weight error of the shapes told apart, mean", lambda s: f"{float(s.weight_error.mean[told].mean()):.4f}"),
+        row("weight error of those, worst shape", worst),
+        row("marker RMSE, median frame", lambda s: f"{float(s.marker_rmse.nanmedian()):.3f} mm"),
+    ]
+
+
+def scene_rows(result: DemoResult) -> list[tuple[str, str]]:
+    """What was played, one a row: what, value."""
+    markers = result.recording.take.markers
+    assert markers is not None
+    missing = 1 - float(torch.isfinite(markers.values).all(-1).float().mean())
+    scene = result.scene
+    return [
+        ("frames", f"{len(scene.weights):,} at {scene.fps:g} a second"),
+        ("shapes, vertices", f"{len(result.rig.names)}, {len(scene.head.vertices):,}"),
+        ("markers, share of samples missing", f"{len(markers.names)}, {100 * missing:.1f} %"),
+        ("marker noise, RMSE that it alone makes", f"{FLAWS.noise:g} mm a coordinate, {(3**0.5) * FLAWS.noise:.2f} mm"),
+        ("shapes that these markers tell apart", f"{len(_told_apart(result))} of {len(result.rig.names)}"),
+        ("the solve of the whole take", f"{result.seconds:.1f} s"),
+    ]
+
+
+def _told_apart(result: DemoResult) -> Tensor:
+    """Rows of the shapes that the markers see and do not confuse with others, (K,); all where they confuse all."""
+    lost = {*result.seen.unseen, *result.seen.ambiguous}
+    told = [i for i, name in enumerate(result.rig.names) if name not in lost]
+    return torch.tensor(told or list(range(len(result.rig.names))))
+
+
+def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], None] | None = None) -> Path:
+    """Renders the report of a demo into a folder and returns the page's path."""
+    say = progress or (lambda line: None)
+    scene = result.scene
+    names, told = result.rig.names, _told_apart(result)
+    telling = _telling_frame(result)
+    active = scene.weights[:, told].std(0).argsort(descending=True)[:_ACTIVE]
+    active = told[active]
+    say("writing the performance for the page")
+    markup = _player(result, out, telling, [names[i] for i in active.tolist()])
+    say("rendering the rig")
+    rig_picture = _rig_picture(result)
+    frame_picture = _frame_picture(result, telling)
+    say("drawing curves and markers")
+    solved, single = result.solved, result.frame_by_frame
+    first = _busiest(scene.weights[:, active], round(_CURVE_SECONDS * scene.fps))
+    curves = compared_curves(
+        scene.weights[:, active],
+        solved.weights[:, active],
+        single.weights[:, active],
+        [names[i] for i in active.tolist()],
+        scene.fps,
+        first,
+        first + round(_CURVE_SECONDS * scene.fps),
+    )
+    markers = result.recording.take.markers
+    assert markers is not None
+    on_mesh = result.attachment.on(scene.head.faces, result.rig(solved.weights[telling : telling + 1]))[0]
+    sections = [
+        Section("The performance", _story(result), markup=markup),
+        Section(
+            "One frame",
+            "The true and the solved face, and the distance between them. No marker tells where eyes look.",
+            pictures=[("frame_1.png", frame_picture)],
+        ),
+        Section(
+            "How close it came",
+            "weights.csv and animation.glb hold the take solved at once; torchface solve --frame-by-frame gives the "
+            "other, which trembles with the markers' noise.",
+            [
+                Table(("against the truth", "whole take", "frame by frame"), result_rows(result)),
+                Table(("what was played", ""), scene_rows(result)),
+            ],
+        ),
+        Section(
+            "Curves",
+            f"{_CURVE_SECONDS:g} s of the {len(active)} most active shapes that the markers tell apart.",
+            pictures=[("curves.png", curves)],
+        ),
+        Section(
+            "Markers",
+            _layout_text(result),
+            [Table(("the markers", "shapes"), _seen_rows(result))],
+            _layout_pictures(result),
+        ),
+        Section(
+            "Markers against the solved face",
+            f"Their distance; noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
+            pictures=[
+                ("markers.png", marker_views(markers.values[telling], on_mesh, f"frame {telling},")),
+                ("marker_rmse.png", error_curve(solved.marker_rmse, scene.fps)),
+            ],
+        ),
+        Section(
+            "The rig",
+            "Above the template, below the same shapes transferred to the new head.",
+            pictures=[("rig.png", rig_picture)],
+        ),
+        Section(
+            "Error of each shape",
+            "Of the shapes that the markers tell apart.",
+            pictures=[
+                (
+                    "weight_error.png",
+                    named_bars(solved.weight_error.mean[told], [names[i] for i in told], "mean absolute error"),
+                )
+            ],
+        ),
+        Section(
+            "Files",
+            tables=[
+                Table(("what it is", "file"), [(purpose, path.name) for purpose, path in result.files.items()]),
+                Table(("solver.onnx", ""), result.solver.rows()),
+            ],
+        ),
+    ]
+    return write_page(out, scene.title, sections)
+
+
+def _story(result: DemoResult) -> str:
+    """The demo in one sentence."""
+    mesh, markers = result.solved.mesh_error, len(result.attachment.triangles)
+    length = len(result.scene.weights) / result.scene.fps
+    return (
+        f"A head that nobody had rigged was given the template's {len(result.rig.names)} shapes and {markers} markers, "
+        f"and what it played in {length:.0f} s came back from the noisy markers, gaps and all, on average "
+        f"{mesh.mean:.2f} mm from the truth: {100 * mesh.relative:.0f} % of how far the face moved."
+    )
+
+
+def _player(result: DemoResult, out: Path, start: int, curves: Sequence[str]) -> str:
+    markers = result.recording.take.markers
+    assert markers is not None
+    scene = result.scene
+    takes = [
+        Played("true", scene.truth, scene.weights),
+        Played("whole take", result.rig, result.solved.weights),
+        Played("frame by frame", result.rig, result.frame_by_frame.weights),
+    ]
+    panels = [Panel("true, with its markers", 0, markers=True), Panel("solved"), Panel("distance", error=True)]
+    filmed = Markers(markers.select(result.attachment.labels or ()).values)
+    return write_player(Player(takes, panels, scene.fps, (1, 2), 0, curves, filmed, _HEAT_MAXIMUM, start), out)
+
+
+def _layout_text(result: DemoResult) -> str:
+    if result.layout is None:
+        return "Spread over the skin that moves: the rig has neither 68 landmarks nor ARKit's names to go by."
+    return "Set by muscles, as a make-up artist sets them for facial action coding; attachment.json has their names."
+
+
+def _layout_pictures(result: DemoResult) -> list[tuple[str, Tensor]]:
+    points = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices)
+    regions = ("markers",) * len(points) if result.layout is None else result.layout.regions
+    return [("layout.png", marker_regions(result.scene.head, points, regions))]
+
+
+def _seen_rows(result: DemoResult) -> list[tuple[str, str]]:
+    """What the markers see, what they mix up, what they do not see."""
+    seen = result.seen
+    told = [name for name in result.rig.names if name not in {*seen.unseen, *seen.ambiguous}]
+    rows = [("tell apart", told), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
+    return [(what, f"{len(shapes)}: {_both_sides(shapes)}") for what, shapes in rows if shapes]
+
+
+def _both_sides(names: Sequence[str]) -> str:
+    """Names in a row, those of both sides once."""
+    short = []
+    for name in names:
+        bare = name
+        for left, right in (("Left", "Right"), ("_L", "_R")):
+            for side, other in ((left, right), (right, left)):
+                if name.endswith(side) and name.removesuffix(side) + other in names:
+                    bare = name.removesuffix(side)
+        bare = name if bare.islower() else bare  # mouthLeft is no side of a shape called mouth
+        if bare not in short:
+            short.append(bare)
+    return ", ".join(short)
+
+
+def _busiest(weights: Tensor, frames: int) -> int:
+    """Where a window of so many frames begins in which the weights (T,N) vary most."""
+    if len(weights) <= frames:
+        return 0
+    return int(weights.unfold(0, frames, 1).std(-1).sum(1).argmax())
+
+
+def _posed(result: DemoResult, weights: dict[str, float]) -> tuple[Mesh, Mesh]:
+    """Template and transferred rig in one pose."""
+    arkit = torch.zeros(len(ARKIT))
+    for name, value in weights.items():
+        arkit[ARKIT.index(name)] = value
+    pair = []
+    for rig in (result.scene.template, result.rig):
+        row = mapping(ARKIT, rig.names) @ arkit
+        pair.append(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]))
+    return pair[0], pair[1]
+
+
+def _rig_picture(result: DemoResult) -> Tensor:
+    upper, lower = [], []
+    for title, weights in _POSES.items():
+        template, actor = _posed(result, weights)
+        upper.append(
+            face_views(
+                template,
+                (THREE_QUARTER,),
+                width=236,
+                height=300,
+                framed_by=result.scene.template.neutral,
+                lighting=_FEW_RAYS,
+            )
+        )
+        actor_view = face_views(
+            actor, (THREE_QUARTER,), width=236, height=300, framed_by=result.scene.head, lighting=_FEW_RAYS
+        )
+        lower.append(caption(actor_view, title))
+    return sheet([*upper, *lower], len(upper))
+
+
+def _telling_frame(result: DemoResult) -> int:
+    """The frame in which the markers are farthest from rest."""
+    rest = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices).flatten()
+    return int((result.recording.markers.flatten(1) - rest).norm(dim=1).argmax())
+
+
+def _frame_picture(result: DemoResult, frame: int) -> Tensor:
+    head = result.scene.head
+    true = head.with_vertices(result.scene.truth(result.scene.weights[frame : frame + 1])[0])
+    solved = head.with_vertices(result.rig(result.solved.weights[frame : frame + 1].to(result.rig.deltas))[0])
+    error = (true.vertices - solved.vertices).norm(dim=1)
+    views = (FRONT, THREE_QUARTER)
+    row = [
+        headed(face_views(true, views, width=240, height=300, framed_by=head), f"true, frame {frame}"),
+        headed(face_views(solved, views, width=240, height=300, framed_by=head), "solved"),
+    ]
+    heat = heat_map(solved, error, _HEAT_MAXIMUM, "distance, mm", width=240, height=300)
+    return sheet([sheet(row, 2), headed(heat, "distance between them")], 1)

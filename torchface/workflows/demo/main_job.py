@@ -1,0 +1,297 @@
+"""The main job from end to end, with the truth known: rig, take, solve, files, a report.
+
+A template rig is transferred to a new head; that head's true rig plays a performance on the marker stage; the take goes
+to disk as C3D, comes back, is solved with the transferred rig, and what came back is compared with what was.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture import MarkerSolver, WholeTakeSolver
+from torchface.capture.markers import Observability, observability
+from torchface.errors import TopologyError, ValueRangeError
+from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error, weight_jitter
+from torchface.io import (
+    IdentityModes,
+    load_identity_modes,
+    load_mesh,
+    load_rig,
+    load_take,
+    save_animation,
+    save_mesh,
+    save_rig,
+    save_take,
+)
+from torchface.io.rigs.ict_facekit import is_ict_folder
+from torchface.io.weights.live_link_csv import save_live_link
+from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.mesh import Mesh
+from torchface.modeling.rigging.transfer import TransferReport, transfer_with_report
+from torchface.onnx import SolverReport, export_solver
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+from torchface.synthetic import draw_identities, performer
+from torchface.synthetic.stages.makeup_layout import MakeupLayout, makeup_layout
+from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
+from torchface.synthetic.stages.weight_curves import perform
+from torchface.take import Take
+
+Progress = Callable[[str], None]
+
+FLAWS = StageFlaws(noise=0.3, missing=0.02, gaps=1.0, gap_seconds=0.4)
+"""What a well run stage leaves: 0.3 mm noise, one sample in fifty lost, a short gap a marker and minute."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the demo plays: a template, a head that nobody has rigged, its true rig, and the weights that move it.
+
+    Args:
+        title: for the report.
+        template: the rig to transfer.
+        head: the new neutral.
+        truth: the rig that really is the new head's.
+        weights: (T,N), in the order of ``truth.names``.
+        fps: frames a second.
+    """
+
+    title: str
+    template: BlendshapeRig
+    head: Mesh
+    truth: BlendshapeRig
+    weights: Tensor
+    fps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Weights beside the true ones.
+
+    Args:
+        weights: (T,N).
+        weight_error, mesh_error: against the truth; the mesh's over the face.
+        marker_rmse: (T,), millimetres, against the markers as seen.
+        jitter: how many times as much as the true weights they tremble; see ``torchface.evaluation.weight_jitter``.
+    """
+
+    weights: Tensor
+    weight_error: WeightError
+    mesh_error: MeshError
+    marker_rmse: Tensor
+    jitter: float
+
+    @property
+    def correlation(self) -> float:
+        """Pearson's, of the median curve with the true one; of those that move at all."""
+        known = self.weight_error.correlation
+        return float(known[torch.isfinite(known)].median())
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """What came out, beside what was true.
+
+    Args:
+        scene: what was played.
+        rig: the template transferred to the head.
+        transfer: how that went.
+        attachment: where the markers sat.
+        layout: the make-up artist's, which has names for it; none where the rig has too little for one.
+        recording: the take with its truth.
+        solved: the take solved at once, which is what the files hold.
+        frame_by_frame: every frame on its own.
+        seconds: what the solve at once took.
+        face: mask (V,) of the vertices that the mesh errors are about.
+        seen: what the markers can tell of the rig.
+        solver: how the exported solver compares.
+        files: what was written, by purpose.
+    """
+
+    scene: Scene
+    rig: BlendshapeRig
+    transfer: TransferReport
+    attachment: Attachment
+    layout: MakeupLayout | None
+    recording: Recording
+    solved: Solved
+    frame_by_frame: Solved
+    seconds: float
+    face: Tensor
+    seen: Observability
+    solver: SolverReport
+    files: dict[str, Path]
+
+
+def embedded_scene(seed: int, frames: int = 1800) -> Scene:
+    """The mean performer's rig, a performer drawn at random, and a made-up performance."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = performer(draw_identities(1, generator)[0])
+    weights = perform(frames, generator)
+    assert weights.weights is not None
+    return Scene(
+        f"The embedded performer, head {seed}",
+        performer(),
+        truth.neutral,
+        truth,
+        truth.weights_from(weights.weights),
+        weights.fps,
+    )
+
+
+def scene_from(template: Path | None, take: Path | None, target: Path | None, seed: int) -> Scene:
+    """A scene of the user's own parts; what is not given, the embedded performer gives.
+
+    Args:
+        template: a rig. ICT-FaceKit's folder brings identity modes, and the head is drawn from them.
+        take: a weight take, such as a Live Link Face CSV.
+        target: a neutral of the template's topology; its true rig is then the template's deltas on it.
+        seed: decides the head and whatever else is drawn.
+
+    Raises:
+        ValueRangeError: a template that has no identity modes needs a target; a take must hold weights.
+        TopologyError: the target has other triangles than the template.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if template is None:
+        scene = embedded_scene(seed)
+    else:
+        rig = load_rig(template)
+        if target is not None:
+            head = load_mesh(target)
+            title = f"{template.name} on {target.name}"
+        elif is_ict_folder(template):
+            modes: IdentityModes = load_identity_modes(template)
+            head = modes.random_head(generator)
+            title = f"{template.name}, random head {seed} of {len(modes.names)} identity modes"
+        else:
+            raise ValueRangeError(
+                f"{template}: found no identity modes to draw a head from; expected a target (--target NEUTRAL)"
+            )
+        if head.fingerprint() != rig.neutral.fingerprint():
+            raise TopologyError(f"target: found {head}, expected the triangles of {rig.neutral}")
+        head = rig.neutral.with_vertices(head.vertices)
+        truth = BlendshapeRig(head, rig.deltas, rig.names)
+        made_up = perform(1800, generator)
+        assert made_up.weights is not None
+        scene = Scene(title, rig, head, truth, truth.weights_from(made_up.weights), made_up.fps)
+    if take is None:
+        return scene
+    played = load_take(take)
+    if played.weights is None:
+        raise ValueRangeError(
+            f"{take}: found no weights, expected a take of blendshape weights such as Live Link Face's"
+        )
+    weights = scene.truth.weights_from(played.weights).float().clamp(0, 1)
+    return Scene(f"{scene.title}, {take.name}", scene.template, scene.head, scene.truth, weights, played.fps)
+
+
+def run_demo(
+    scene: Scene,
+    out: Path,
+    seed: int = 0,
+    flaws: StageFlaws = FLAWS,
+    progress: Progress | None = None,
+) -> DemoResult:
+    """Plays a scene and writes every file of the main job into a folder.
+
+    Args:
+        scene: see ``embedded_scene`` and ``scene_from``.
+        out: the folder; made if absent.
+        seed: of noise and gaps.
+        flaws: of the stage.
+        progress: called with a line before each step.
+
+    Returns:
+        A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.
+    """
+    say = progress or (lambda line: None)
+    out.mkdir(parents=True, exist_ok=True)
+    files = {
+        "template rig": out / "template.glb",
+        "new head": out / "neutral.obj",
+        "transferred rig": out / "actor.glb",
+        "marker sites": out / "attachment.json",
+        "marker take": out / "take.c3d",
+        "solved weights": out / "weights.csv",
+        "animated rig": out / "animation.glb",
+        "solver for applications": out / "solver.onnx",
+    }
+    say("transferring the template's shapes to the new head")
+    transferred = transfer_with_report(scene.template, scene.head)
+    rig = transferred.rig
+    save_rig(scene.template, files["template rig"])
+    save_mesh(replace(scene.head, texture=None), files["new head"])
+    save_rig(rig, files["transferred rig"])
+    say("filming the markers")
+    layout = _layout(scene.truth)
+    attachment = place_markers(scene.truth) if layout is None else layout.attachment
+    attachment.save(files["marker sites"])
+    generator = torch.Generator().manual_seed(seed)
+    recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
+    save_take(recording.take, files["marker take"])
+    say("solving the take")
+    marker_solver = MarkerSolver(rig, attachment)
+    filmed = load_take(files["marker take"])
+    started = time.perf_counter()
+    solved = WholeTakeSolver(marker_solver).solve_take(filmed)
+    seconds = time.perf_counter() - started
+    single = marker_solver.solve_take(filmed)
+    say("writing weights, animation and solver")
+    live = bool(mapping(rig.names, ARKIT).any())
+    (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
+    save_animation(rig, solved, files["animated rig"])
+    some = recording.markers[:: max(1, len(recording.markers) // 300)]
+    seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
+    solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
+    say("comparing with the truth")
+    face = face_mask(scene.head)
+
+    def compared(take: Take) -> Solved:
+        assert take.weights is not None
+        assert recording.take.markers is not None
+        weights = take.weights.values[..., 0].float()
+        return Solved(
+            weights,
+            weight_error(weights, scene.weights),
+            mesh_error(rig, weights, scene.truth, scene.weights, face),
+            marker_rmse(rig, attachment, weights, recording.take.markers.values),
+            weight_jitter(weights) / max(weight_jitter(scene.weights), 1e-12),
+        )
+
+    return DemoResult(
+        scene,
+        rig,
+        transferred.report,
+        attachment,
+        layout,
+        recording,
+        compared(solved),
+        compared(single),
+        seconds,
+        face,
+        observability(marker_solver),
+        solver,
+        files,
+    )
+
+
+def _layout(rig: BlendshapeRig) -> MakeupLayout | None:
+    try:
+        return makeup_layout(rig)
+    except ValueRangeError:  # neither landmarks nor names to go by
+        return None
+
+
+def face_mask(mesh: Mesh) -> Tensor:
+    """The annotated region ``face`` (V,), or every vertex where there is none."""
+    if mesh.annotations is not None and "face" in mesh.annotations.regions:
+        return mesh.annotations.regions["face"]
+    return torch.ones(len(mesh.vertices), dtype=torch.bool)

@@ -1,0 +1,156 @@
+"""What a file holds, in rows for people to read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnx
+import torch
+
+from torchface.attachment import Attachment
+from torchface.capture.markers import MarkerSolver, observability
+from torchface.errors import FileFormatError
+from torchface.files.whole_files import read_file
+from torchface.io import load_mesh, load_rig, load_take
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+
+Rows = list[tuple[str, str]]
+
+_LONGEST_VALUE = 240
+_MOST_NAMED = 8
+
+
+def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
+    """Rows (what, value) about a mesh, rig, take, attachment or solver.
+
+    Args:
+        path: the file or folder.
+        attachment: report which shapes of the rig its markers tell apart.
+        part: look at this region of the rig only.
+
+    Raises:
+        FileFormatError: nothing that torchface reads.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in {".glb", ".gltf"}:
+        try:
+            rig = load_rig(path, part=part)
+        except FileFormatError:
+            if path.is_dir():
+                raise
+            if attachment is not None:
+                raise
+            return _mesh_rows(load_mesh(path))
+        rows = [*_rig_rows(rig), *_animation_rows(path)]
+        if attachment is not None:
+            where = Attachment.load(attachment)
+            where.check(rig.neutral, attachment, path)
+            seen = observability(MarkerSolver(rig, where))
+            rows += [("what the markers see", str(seen))]
+        return rows
+    if attachment is not None:
+        raise FileFormatError(f"{path}: found no rig, expected one to say what the markers of {attachment} tell apart")
+    if suffix in {".obj", ".ply", ".stl"}:
+        return _mesh_rows(load_mesh(path))
+    if suffix in {".c3d", ".trc", ".csv"}:
+        return _take_rows(load_take(path))
+    if suffix == ".json":
+        return _attachment_rows(Attachment.load(path))
+    if suffix == ".onnx":
+        return _graph_rows(path)
+    raise FileFormatError(
+        f"{path}: found the ending {suffix!r}, expected .glb .obj .ply .stl .c3d .trc .csv .json .onnx"
+    )
+
+
+def _mesh_rows(mesh: Mesh) -> Rows:
+    low, high = mesh.vertices.amin(0).tolist(), mesh.vertices.amax(0).tolist()
+    extent = " x ".join(f"{b - a:.1f}" for a, b in zip(low, high, strict=True))
+    rows = [
+        ("vertices", f"{len(mesh.vertices):,}"),
+        ("triangles", f"{len(mesh.faces):,}"),
+        ("polygons", "triangles only" if mesh.polygons is None else f"{len(mesh.polygons):,}"),
+        ("extent, mm", extent),
+        ("texture coordinates", "none" if mesh.uvs is None else f"{len(mesh.uvs):,}"),
+        ("texture", "none" if mesh.texture is None else "x".join(str(n) for n in mesh.texture.shape[:0:-1])),
+    ]
+    if mesh.annotations is not None:
+        notes = mesh.annotations
+        rows += [
+            ("landmarks", "none" if notes.landmarks is None else str(len(notes.landmarks))),
+            ("regions", ", ".join(notes.regions) or "none"),
+            ("mirror map", "no" if notes.mirror is None else "yes"),
+            ("contact pairs", "none" if notes.contacts is None else str(len(notes.contacts))),
+        ]
+    return rows
+
+
+def _rig_rows(rig: BlendshapeRig) -> Rows:
+    reach = rig.deltas.norm(dim=-1).amax(1)
+    shapes = ", ".join(f"{name} {float(r):.1f}" for name, r in zip(rig.names, reach, strict=True))
+    return [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("farthest move, mm", shapes)]
+
+
+def _animation_rows(path: Path) -> Rows:
+    """What moves a glTF file's shapes, and how far."""
+    take = None if path.is_dir() else read_gltf_weights(path)
+    if take is None or take.weights is None:
+        return []
+    peaks = take.weights.values[..., 0].amax(0)
+    order = peaks.argsort(descending=True)[:_MOST_NAMED].tolist()
+    peak = ", ".join(f"{take.weights.names[row]} {float(peaks[row]):.2f}" for row in order if peaks[row] > 0)
+    return [
+        ("animation", f"{len(take)} frames at {take.fps:g} a second, {len(take) / take.fps:.1f} s"),
+        ("largest weights", peak or "none above 0"),
+    ]
+
+
+def _take_rows(take: Take) -> Rows:
+    rows = [("frames", f"{len(take)} at {take.fps:g} a second, {len(take) / take.fps:.1f} s")]
+    if take.timecode:
+        rows.append(("timecode", f"{take.timecode[0]} to {take.timecode[-1]}"))
+    for kind in ("markers", "landmarks", "weights"):
+        track = getattr(take, kind)
+        if track is None:
+            continue
+        seen = torch.isfinite(track.values).all(-1).float()
+        rows += [
+            (kind, f"{len(track.names)}: {', '.join(track.names)}"),
+            (f"{kind} seen", f"{100 * float(seen.mean()):.2f} %, {int((seen.sum(1) == 0).sum())} frames without any"),
+        ]
+    if take.extras:
+        rows.append(("kept besides", ", ".join(map(str, take.extras))))
+    return rows
+
+
+def _attachment_rows(attachment: Attachment) -> Rows:
+    return [
+        ("markers", f"{len(attachment.triangles)}: {', '.join(attachment.labels or ())}"),
+        ("made for topology", attachment.fingerprint or "not recorded"),
+    ]
+
+
+def _graph_rows(path: Path) -> Rows:
+    data = read_file(path, 2**28)
+    try:
+        model = onnx.load_model_from_string(data)
+    except Exception as error:  # protobuf raises its own kinds, which are not part of onnx's interface
+        raise FileFormatError(f"{path}: not an ONNX file ({error})") from error
+
+    def shape(value: onnx.ValueInfoProto) -> str:
+        return f"{value.name} ({','.join(d.dim_param or str(d.dim_value) for d in value.type.tensor_type.shape.dim)})"
+
+    return [
+        ("inputs", ", ".join(map(shape, model.graph.input))),
+        ("outputs", ", ".join(map(shape, model.graph.output))),
+        ("operators", f"{len(model.graph.node)}: {', '.join(sorted({node.op_type for node in model.graph.node}))}"),
+        ("size", f"{len(data):,} bytes"),
+        *((entry.key, _shortened(entry.value)) for entry in model.metadata_props),
+    ]
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ... ({len(text):,} characters)"

@@ -1,0 +1,178 @@
+"""Meshes over time from whatever file they lie in: weights with their rig, an animated rig, a mesh sequence, meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.io import MeshSequence, load_mesh, load_rig, load_take
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.rigs.ict_facekit import region
+from torchface.mesh import Mesh, submesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Track
+
+MESH_ENDINGS = (".obj", ".ply", ".stl")
+_GLTF = (".glb", ".gltf")
+_FORMS = "weights as .csv, an animated .glb, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
+
+
+@dataclass(frozen=True, eq=False)
+class AnimatedMesh:
+    """A mesh that moves.
+
+    Args:
+        path: where it came from.
+        neutral: its topology and annotations; at rest where it came with a rig, else as in its first frame.
+        count: of frames.
+        read: vertices (t,V,3) of the frames from one number up to another, without it; NaN where a frame has none.
+        fps: frames a second, where that is told.
+        weights: what moves it, where that is told.
+        rig: of its topology, where one came with it.
+    """
+
+    path: Path
+    neutral: Mesh
+    count: int
+    read: Callable[[int, int], Tensor]
+    fps: float | None = None
+    weights: Track | None = None
+    rig: BlendshapeRig | None = None
+
+    def require_topology_of(self, other: AnimatedMesh, hint: str = "") -> None:
+        """Checks that both have the same vertices and triangles.
+
+        Raises:
+            TopologyError: they do not; ``hint`` ends the message.
+        """
+        own, theirs = self.neutral, other.neutral
+        if len(own.vertices) != len(theirs.vertices) or not torch.equal(own.faces, theirs.faces):
+            same = "other triangles" if own.faces.shape == theirs.faces.shape else f"{len(theirs.faces)} triangles"
+            raise TopologyError(
+                f"{self.path}: found {len(own.vertices)} vertices and {len(own.faces)} triangles, expected those of "
+                f"{other.path}, {len(theirs.vertices)} vertices and {same}{hint}"
+            )
+
+
+def load_animated(path: Path, rig: Path | None = None, part: str | None = None) -> AnimatedMesh:
+    """Reads meshes over time.
+
+    Args:
+        path: weights as ``.csv`` (of which the rig makes meshes); a ``.glb`` or ``.gltf`` with an animation of its
+            shapes, or without, which is one frame; a mesh sequence as ``.safetensors``
+            (:class:`torchface.io.MeshSequence`); a mesh; or a folder of meshes, a frame each, in the order of their
+            names.
+        rig: what weights move, or the rig whose topology the meshes have.
+        part: keep this annotated region only, such as ``face``.
+
+    Raises:
+        FileFormatError: the file is none of these, or broken.
+        NameMismatchError: weights without a rig, or for other shapes; or no such part.
+        TopologyError: the meshes of a folder differ in topology, or have another one than the rig.
+    """
+    loaded = None if rig is None else load_rig(rig)
+    ending = path.suffix.lower()
+    if path.is_dir():
+        found = _of_folder(path, loaded)
+    elif ending == ".csv":
+        found = _of_weights(path, loaded)
+    elif ending == ".safetensors":
+        found = _of_sequence(path, loaded)
+    elif ending in _GLTF:
+        found = _of_gltf(path, loaded)
+    elif ending in MESH_ENDINGS:
+        found = _of_meshes(path, [path], loaded)
+    else:
+        raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
+    return found if part is None else _kept(found, region(found.neutral, part))
+
+
+def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+    if rig is None:
+        raise NameMismatchError(f"{path}: found weights without a rig, expected the rig that they move (--rig)")
+    take = load_take(path)
+    if take.weights is None:
+        raise ValueRangeError(f"{path}: found no weights, expected a take of them")
+    return _moved(path, rig, take.weights, take.fps)
+
+
+def _moved(path: Path, rig: BlendshapeRig, track: Track, fps: float) -> AnimatedMesh:
+    try:
+        weights = rig.weights_from(track).to(rig.deltas)
+    except NameMismatchError as error:
+        raise NameMismatchError(f"{path}: {error}") from error
+
+    def read(begin: int, end: int) -> Tensor:
+        with torch.no_grad():
+            return rig(weights[begin:end])
+
+    own = Track(rig.names, weights[..., None])
+    return AnimatedMesh(path, rig.neutral, len(weights), read, fps, own, rig)
+
+
+def _of_gltf(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+    take = read_gltf_weights(path)
+    if take is None or take.weights is None:
+        return _of_meshes(path, [path], rig)
+    return _moved(path, load_rig(path), take.weights, take.fps)
+
+
+def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+    sequence = MeshSequence(path)
+    if sequence.shape[2] != 3:
+        raise FileFormatError(f"{path}: found {sequence.shape[2]} numbers a vertex, expected 3, positions")
+    first = sequence.read(0, 1)[0].nan_to_num(0.0)
+    neutral = _at_rest(path, Mesh(first, sequence.faces), rig)
+    return AnimatedMesh(path, neutral, len(sequence), sequence.read, rig=rig)
+
+
+def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *_GLTF))
+    if not files:
+        raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
+    return _of_meshes(folder, files, rig)
+
+
+def _of_meshes(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:
+    first = load_mesh(files[0])
+
+    def one(file: Path) -> Tensor:
+        mesh = load_mesh(file)
+        if len(mesh.vertices) != len(first.vertices) or not torch.equal(mesh.faces, first.faces):
+            raise TopologyError(
+                f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of "
+                f"{files[0].name}, {len(first.vertices)} and {len(first.faces)}"
+            )
+        return mesh.vertices
+
+    def read(begin: int, end: int) -> Tensor:
+        return torch.stack([one(file) for file in files[begin:end]])  # a file a frame
+
+    return AnimatedMesh(path, _at_rest(path, first, rig), len(files), read, rig=rig)
+
+
+def _at_rest(path: Path, mesh: Mesh, rig: BlendshapeRig | None) -> Mesh:
+    """The rig's neutral where there is a rig; it must have the mesh's topology."""
+    if rig is None:
+        return mesh
+    if len(rig.vertices) != len(mesh.vertices) or not torch.equal(rig.neutral.faces, mesh.faces):
+        raise TopologyError(
+            f"{path}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of the rig, "
+            f"{len(rig.vertices)} and {len(rig.neutral.faces)}"
+        )
+    return rig.neutral
+
+
+def _kept(whole: AnimatedMesh, keep: Tensor) -> AnimatedMesh:
+    piece = submesh(whole.neutral, keep)
+    rig = None if whole.rig is None else whole.rig.part(keep)
+
+    def read(begin: int, end: int) -> Tensor:
+        return whole.read(begin, end)[:, piece.vertex_ids]
+
+    return AnimatedMesh(whole.path, piece.mesh, whole.count, read, whole.fps, whole.weights, rig)

@@ -1,0 +1,221 @@
+"""From a result and the truth on disk to how far they are apart: figures, tables, heat maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.evaluation import (
+    ShapeErrors,
+    error_figures,
+    region_figures,
+    rigidly_aligned,
+    shape_errors,
+    vertex_errors,
+)
+from torchface.shape_names import mapping
+from torchface.viz.figures.heat_maps import round_maximum
+from torchface.workflows.evaluate.animated_meshes import AnimatedMesh, load_animated
+from torchface.workflows.evaluate.compared_regions import compared_regions
+from torchface.workflows.evaluate.evaluate_tables import write_tables
+from torchface.workflows.evaluate.evaluation_result import ALL, Compared, Evaluation
+from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
+
+_CHUNK = 32
+_MOST_DISTANCES = 2**29
+_SAME_RATE = 0.002
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is compared how.
+
+    Args:
+        rig: moves the result's weights, is the template of scans, and annotates meshes of its topology.
+        truth_rig: moves the truth's weights; ``rig`` if absent.
+        part: keep this annotated region only.
+        frames: frames of the result that the truth's are, in order, from 0; all if absent.
+        scans: the truth is raw scans, which are registered first.
+        landmarks: a folder of the scans' landmark files.
+        unit: of the scans' files; each format's own if absent.
+        align: lay each frame of the result rigidly on the truth; if absent, on scans only, which have a space of
+            their own.
+        maximum: of the heat maps' scale, millimetres; the 95th percentile, rounded up, if absent.
+    """
+
+    rig: Path | None = None
+    truth_rig: Path | None = None
+    part: str | None = None
+    frames: tuple[int, ...] | None = None
+    scans: bool = False
+    landmarks: Path | None = None
+    unit: str | None = None
+    align: bool | None = None
+    maximum: float | None = None
+
+
+def evaluate(
+    result: Path,
+    truth: Sequence[Path],
+    out: Path,
+    settings: EvaluationSettings = EvaluationSettings(),
+    progress: Callable[[str], None] | None = None,
+) -> Evaluation:
+    """Reads, compares and writes tables and a summary; see ``torchface evaluate --help`` for the arguments.
+
+    Writes ``regions.csv``, ``frames.csv``, ``shapes.csv`` where both have weights, and ``summary.json``;
+    :func:`torchface.workflows.evaluate.evaluate_page.write_evaluation_page` makes the report. Scans are registered into
+    ``out/registered``, and those that are there from an earlier run are taken as they are.
+
+    Raises:
+        TopologyError: result and truth have not the same vertices and triangles.
+        ShapeError: they have not the same number of frames.
+        ValueRangeError: there is nothing to compare, or too much.
+        TorchfaceError: any file is broken.
+    """
+    say = progress or (lambda line: None)
+    say("reading")
+    found = load_animated(result, settings.rig, settings.part)
+    scans: ScanTruth | None = None
+    if settings.scans:
+        scans = scan_truth(found, truth, out / "registered", settings.landmarks, settings.unit, say)
+        true = scans.animated
+    else:
+        if len(truth) != 1:
+            raise ValueRangeError(f"truth: found {len(truth)} files, expected one, or a folder; or scans (--scans)")
+        true = load_animated(truth[0], settings.truth_rig or settings.rig, settings.part)
+        true.require_topology_of(found, "; raw scans need --scans, other rigs --truth-rig")
+    say("comparing")
+    evaluation = compare(found, true, settings, scans)
+    say("writing")
+    out.mkdir(parents=True, exist_ok=True)
+    write_tables(evaluation, out)
+    return evaluation
+
+
+def compare(
+    found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings, scans: ScanTruth | None = None
+) -> Evaluation:
+    """Compares frame by frame.
+
+    Args:
+        found: the result.
+        true: of its topology.
+        settings: which frames, and how.
+        scans: the truth's scans, where it was registered to such.
+
+    Raises:
+        ShapeError: the frames do not fit.
+        ValueRangeError: there is nothing to compare, or too much.
+    """
+    frames = _frames(found, true, settings.frames)
+    aligned = scans is not None if settings.align is None else settings.align
+    notes = [] if scans is None else list(scans.notes)
+    if found.fps is not None and true.fps is not None and abs(found.fps / true.fps - 1) > _SAME_RATE:
+        notes.append(f"found {found.fps:g} and {true.fps:g} frames a second; frames were compared by their number")
+    if len(frames) * len(found.neutral.vertices) > _MOST_DISTANCES:
+        raise ValueRangeError(
+            f"{found.path}: found {len(frames)} frames of {len(found.neutral.vertices)} vertices, more than "
+            f"{_MOST_DISTANCES} distances; expected fewer (--part face, or --frames)"
+        )
+    errors, turned, moved, surface = [], [], [], []
+    for begin in range(0, len(frames), _CHUNK):  # some frames at a time: all of a take's vertices fill the memory
+        rows = frames[begin : begin + _CHUNK]
+        a, b, motion = _pair(found, true, rows, begin, aligned)
+        errors.append(vertex_errors(a, b))
+        if motion is not None:
+            turned.append(motion[0])
+            moved.append(motion[1])
+        if scans is not None:
+            surface.append(scans.surface_errors(begin, scans.settled(begin, a) if aligned else a))
+    distances = torch.cat(errors)
+    empty = ~torch.isfinite(distances).any(1)
+    if empty.all():
+        raise ValueRangeError(f"{found.path}: found NaN in every frame of it or of {true.path}, expected vertices")
+    if empty.any():
+        first = int(frames[empty][0])
+        notes.append(f"{int(empty.sum())} of {len(frames)} frames are NaN (the first {first}) and were left out")
+    maximum = settings.maximum
+    if maximum is not None and not 0 < maximum < float("inf"):
+        raise ValueRangeError(f"scale: found {maximum}, expected a positive number of millimetres")
+    regions = {ALL: torch.ones(distances.shape[1], dtype=torch.bool), **compared_regions(found.neutral)}
+    figures = region_figures(distances, regions)
+    return Evaluation(
+        found.path.name,
+        true.path.name,
+        found.neutral,
+        frames,
+        found.fps or true.fps,
+        distances,
+        figures,
+        _shapes(found, true, frames),
+        aligned,
+        torch.cat(turned) if turned else None,
+        torch.cat(moved) if moved else None,
+        tuple(_shown(found, true, frames, distances, aligned)),
+        round_maximum(figures[ALL].percentile_95) if maximum is None else maximum,
+        tuple(notes),
+        error_figures(torch.cat(surface)) if surface else None,
+    )
+
+
+def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | None) -> Tensor:
+    if chosen is None:
+        if found.count != true.count:
+            raise ShapeError(
+                f"{found.path}: found {found.count} frames, expected the {true.count} of {true.path}; or say which "
+                "of the result's frames they are (--frames)"
+            )
+        return torch.arange(found.count)
+    wrong = [frame for frame in chosen if not 0 <= frame < found.count]
+    if wrong or len(chosen) != true.count:
+        what = f"frame {wrong[0]}" if wrong else f"{len(chosen)} frames"
+        raise ShapeError(
+            f"frames: found {what}, expected one of 0 to {found.count - 1} for each of the {true.count} of {true.path}"
+        )
+    return torch.tensor(chosen)
+
+
+def _pair(
+    found: AnimatedMesh, true: AnimatedMesh, rows: Tensor, begin: int, aligned: bool
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
+    """Vertices (t,V,3) of the result's frames and of the truth's, and by how much the former were turned and moved."""
+    first, last = int(rows.min()), int(rows.max()) + 1
+    together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
+    a = found.read(first, last) if together else torch.cat([found.read(r, r + 1) for r in rows.tolist()])
+    b = true.read(begin, begin + len(rows)).to(a)
+    if not aligned:
+        return a, b, None
+    usable = (torch.isfinite(a) & torch.isfinite(b)).all(2).sum(1) >= 3
+    laid, turned, moved = a.clone(), torch.full((len(a),), torch.nan), torch.full((len(a),), torch.nan)
+    if usable.any():
+        motion = rigidly_aligned(a[usable], b[usable])
+        laid[usable], turned[usable] = motion.vertices, motion.degrees.to(turned)
+        moved[usable] = (motion.vertices - a[usable]).nanmean(1).norm(dim=-1).to(moved)
+    laid[~usable] = torch.nan
+    return laid, b, (turned, moved)
+
+
+def _shown(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, errors: Tensor, aligned: bool) -> list[Compared]:
+    """The frame of median error and the worst one."""
+    mean = errors.nanmean(1)
+    order = mean.nan_to_num(-1.0).argsort()
+    order = order[torch.isfinite(mean[order])]
+    picked = dict.fromkeys([int(order[(len(order) - 1) // 2]), int(order[-1])])
+    shown = []
+    for row in picked:
+        a, b, _ = _pair(found, true, frames[row : row + 1], row, aligned)
+        shown.append(Compared(int(frames[row]), a[0], b[0], errors[row]))
+    return shown
+
+
+def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor) -> ShapeErrors | None:
+    if found.weights is None or true.weights is None or not mapping(found.weights.names, true.weights.names).any():
+        return None
+    solved, actual = found.weights.values[frames, :, 0], true.weights.values[..., 0]
+    return shape_errors(solved, found.weights.names, actual, true.weights.names)

@@ -1,0 +1,158 @@
+"""Raw scans as the truth: each registered to the result's topology, and kept to measure the distance to its surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, TopologyError
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.rotations import rotation_matrix
+from torchface.io import load_mesh
+from torchface.mesh import Mesh
+from torchface.registration import register_corpus
+from torchface.workflows.evaluate.animated_meshes import AnimatedMesh
+
+NEAR = 2.0
+"""Millimetres; a vertex that came to lie further from the scan, or on its border, only followed its neighbours."""
+_FEWEST, _ROUNDS = 12, 20
+
+
+@dataclass(frozen=True, eq=False)
+class ScanTruth:
+    """Scans, and the meshes registered to them.
+
+    Args:
+        animated: the registered meshes, a frame each; NaN where the scan does not show a vertex.
+        scans: their files.
+        unit: of the files.
+        notes: what there is to say of each.
+    """
+
+    animated: AnimatedMesh
+    scans: tuple[Path, ...]
+    unit: str | None
+    notes: tuple[str, ...]
+
+    def surface_errors(self, begin: int, vertices: Tensor) -> Tensor:
+        """Distances (t,V) from vertices (t,V,3) of the frames from ``begin`` on to the scans' surfaces; NaN where the
+        scan does not show the vertex."""
+        found = torch.full(vertices.shape[:2], torch.nan)
+        for row, (usable, surface) in enumerate(self._surfaces(begin, vertices)):
+            found[row, usable] = surface.nearest(vertices[row, usable]).distance.to(found)
+        return found
+
+    def settled(self, begin: int, vertices: Tensor) -> Tensor:
+        """Vertices (t,V,3) of the frames from ``begin`` on, moved rigidly to where they lie best on the scans'
+        surfaces, by iterated closest points from where they are.
+
+        A registered mesh tells where a vertex is along the surface only as well as registration does; this asks
+        nothing of it.
+        """
+        moved = vertices.clone()
+        for row, (usable, surface) in enumerate(self._surfaces(begin, vertices)):
+            if int(usable.sum()) >= _FEWEST:
+                moved[row] = settled_on(surface, vertices[row], usable)
+        return moved
+
+    def _surfaces(self, begin: int, vertices: Tensor) -> Iterator[tuple[Tensor, SurfaceIndex]]:
+        shown = torch.isfinite(self.animated.read(begin, begin + len(vertices))).all(2)
+        for row, file in enumerate(self.scans[begin : begin + len(vertices)]):  # a surface of its own each
+            scan = load_mesh(file, self.unit)
+            yield shown[row] & torch.isfinite(vertices[row]).all(1), SurfaceIndex(scan.vertices, scan.faces)
+
+
+def settled_on(surface: SurfaceIndex, vertices: Tensor, usable: Tensor) -> Tensor:
+    r"""Vertices (V,3) moved rigidly to where those of a mask (V,) lie best on a surface.
+
+    .. math:: \min_{R,t} \sum_i \left( n_i \cdot (R x_i + t - y_i) \right)^2
+
+    over the nearest points :math:`y_i` and their normals :math:`n_i`, found anew in each round.
+
+    Source: Chen and Medioni 1992.
+    """
+    moved = vertices.double()
+    for _ in range(_ROUNDS):  # each round looks for other nearest points
+        points = moved[usable]
+        nearest = surface.nearest(points)
+        normals = surface.normals_at(nearest)
+        centre = points.mean(0)
+        # Small turns about the points' centre: n · (r × x) = r · (x × n).
+        system = torch.cat([torch.linalg.cross(points - centre, normals), normals], dim=1)
+        wanted = ((nearest.points - points) * normals).sum(1)
+        # Where the surface leaves a motion open (a sphere may turn), none is made.
+        step = torch.linalg.lstsq(system, wanted, driver="gelsd", rcond=1e-6).solution
+        moved = (moved - centre) @ rotation_matrix(step[:3]).T + centre + step[3:]
+        if float(step[:3].norm()) < 1e-6 and float(step[3:].norm()) < 1e-4:
+            break
+    return moved.to(vertices)
+
+
+def surface_distances(points: Tensor, surface: Mesh) -> Tensor:
+    """How far points (Q,3) are from a mesh's surface, (Q,), float64, millimetres."""
+    return SurfaceIndex(surface.vertices, surface.faces).nearest(points).distance
+
+
+def scan_truth(
+    result: AnimatedMesh,
+    scans: Sequence[Path],
+    out: Path,
+    landmarks: Path | None = None,
+    unit: str | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ScanTruth:
+    """Registers scans; those that ``out`` holds from an earlier run are taken as they are.
+
+    Args:
+        result: what they are the truth of; its face at rest is what is bent.
+        scans: files, or folders of them; in the order of their names a frame each.
+        out: the folder of registered meshes and their records.
+        landmarks: a folder of landmark files named as the scans.
+        unit: of the scans; each format's own if absent.
+        progress: told which scan is registered.
+
+    Raises:
+        TopologyError: the result is meshes without a rig.
+        AlignmentError: a scan could not be registered.
+        FileFormatError: there is no scan.
+    """
+    say = progress or (lambda line: None)
+    if result.rig is None:
+        raise TopologyError(
+            f"{result.path}: found meshes without a rig, expected the rig whose neutral is laid on the scans (--rig)"
+        )
+    say("registering the scans")
+    report = register_corpus(
+        result.neutral,
+        scans,
+        out,
+        progress=lambda done, count, entry: say(f"registering the scans, {done} of {count}"),
+        landmarks=landmarks,
+        unit=unit,
+        texture_size=0,
+    )
+    lost = report.skipped
+    if lost:
+        raise AlignmentError(f"{lost[0].scan}: could not be registered ({lost[0].error}), expected a scan of the face")
+    frames, notes = [], []
+    for entry in report.entries:  # a surface of its own each
+        assert entry.result is not None
+        found = load_mesh(entry.result).vertices
+        scan = load_mesh(entry.scan, unit)
+        index = SurfaceIndex(scan.vertices, scan.faces)
+        nearest = index.nearest(found)
+        shown = (nearest.distance <= NEAR) & ~index.on_border(nearest)
+        frames.append(torch.where(shown[:, None], found, torch.nan))
+        known = "" if not entry.reused else ", known from an earlier run"
+        notes.append(
+            f"{entry.name}: registered by {entry.start}, median {entry.median_distance:.3f} mm from the scan, which "
+            f"shows {float(shown.float().mean()):.0%} of the vertices{known}"
+        )
+    stacked = torch.stack(frames)
+    name = scans[0] if len(scans) == 1 else out
+    animated = AnimatedMesh(Path(name), result.neutral, len(frames), lambda begin, end: stacked[begin:end])
+    return ScanTruth(animated, tuple(entry.scan for entry in report.entries), unit, tuple(notes))

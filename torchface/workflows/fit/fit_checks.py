@@ -1,0 +1,128 @@
+"""What speaks against a fit: landmarks that do not fit, photographs that do not show one person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError
+from torchface.landmarks import NoFaceError
+from torchface.modeling import ImageFit
+from torchface.modeling.photographs.one_person import same_person
+from torchface.workflows.fit.found_landmarks import FoundLandmarks, find_in_photographs
+
+MISFIT = 0.045
+"""Of the eyes' distance: given landmarks that lie further from the fit are remarked on."""
+
+ONE_PERSON, OTHERS = 3.0, -3.0
+"""Logarithms of odds (20 to 1): photographs above the first show one person, below the second they do not.
+
+Of 39 pairs of photographs of one person each all were above 3.8 (68 landmarks, the modes of ICT-FaceKit), of 1,042
+pairs of two people a quarter below -3 and half below 1.6.
+"""
+
+_NEAR = 0.5
+
+BareFit = Callable[[Tensor, list[int]], ImageFit]
+"""Fits the template's shapes to landmarks (J,68,2) of photographs by their numbers, and lays no skin."""
+
+
+def eyes_distances(landmarks: Tensor) -> Tensor:
+    """Between the outer corners of the eyes, (I,), of landmarks (I,68,2)."""
+    return (landmarks[:, 36] - landmarks[:, 45]).norm(dim=-1)
+
+
+def misfits(fit: ImageFit) -> Tensor:
+    """The fit's errors in the eyes' distances, (I,)."""
+    return fit.errors / eyes_distances(fit.landmarks)
+
+
+def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, insist: bool = False) -> list[str]:
+    """Whether photographs that were fitted together show one person, for people to read; nothing if they do.
+
+    Args:
+        photographs: the files, I of them.
+        marks: their landmarks, (I,68,2).
+        bare: see there.
+        insist: say it only.
+
+    Raises:
+        AlignmentError: they do not, and nobody insists.
+    """
+    if len(photographs) < 2:
+        return []
+    alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
+    odds = same_person(alone)
+    worst = int(odds.argmin())
+    if float(odds[worst]) >= ONE_PERSON:
+        return []
+    joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
+    each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
+    told = ", ".join(f"{path.name} {value:+.1f}" for path, value in zip(photographs, odds.tolist(), strict=True))
+    figures = (
+        f"logarithm of the odds that each shows the head of the others: {told}, expected above {ONE_PERSON:+.0f}; "
+        f"landmarks {joint:.1%} of the eyes' distance off together, {each:.1%} alone"
+    )
+    if float(odds[worst]) < OTHERS and not insist:
+        raise AlignmentError(
+            f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
+            "fit it alone, or say --insist if they are one person"
+        )
+    return [f"WARNING: these photographs may show different people; their mean would be nobody ({figures})"]
+
+
+def landmark_lines(
+    photographs: Sequence[Path],
+    images: Sequence[Tensor],
+    marks: Tensor,
+    fit: ImageFit,
+    finder: str | Path,
+    bare: BareFit,
+) -> list[str]:
+    """Which given landmarks do not fit, and how those that are found do, for people to read.
+
+    Args:
+        photographs: the files, I of them.
+        images: they, (3,H,W).
+        marks: the landmarks given, (I,68,2).
+        fit: to them.
+        finder: finds landmarks; by name or folder.
+        bare: see there.
+    """
+    lines = []
+    for i, off in enumerate(misfits(fit).tolist()):  # photographs, the few that are off
+        if off < MISFIT:
+            continue
+        name = photographs[i].name
+        said = f"{name}: the given landmarks do not fit well, {off:.1%} of the eyes' distance off"
+        found = _found_there(photographs[i], images[i], marks[i], finder)
+        if found is None:
+            lines.append(
+                f"{said}; {finder} finds no face there to compare with; look at them in the picture of the fit"
+            )
+            continue
+        other = float(misfits(bare(found.trusted[None], [i]))[0])
+        lines.append(
+            f"{said}; those that {finder} finds are {other:.1%} off; look at both in the pictures of the fit"
+            + (", and leave --landmarks away to take the found ones" if other < off else "")
+        )
+    return lines
+
+
+def _found_there(photograph: Path, image: Tensor, marks: Tensor, finder: str | Path) -> FoundLandmarks | None:
+    """Found landmarks of the face that has given ones."""
+    seen = marks[torch.isfinite(marks).all(-1)]
+    middle, size = seen.mean(0), (seen.amax(0) - seen.amin(0)).amax()
+    try:
+        first = find_in_photographs([photograph], [image], finder)[0]
+        centres = first.boxes[:, :2] + first.boxes[:, 2:] / 2
+        away = (centres.double() - middle).norm(dim=1)
+        if float(away.min()) > _NEAR * float(size):
+            return None
+        number = int(away.argmin())
+        return first if number == first.number else find_in_photographs([photograph], [image], finder, number)[0]
+    except NoFaceError:
+        return None

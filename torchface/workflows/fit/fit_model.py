@@ -1,0 +1,68 @@
+"""The head model that photographs are fitted with, and the rig of its topology."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from torchface import zoo
+from torchface.errors import NameMismatchError, TopologyError
+from torchface.io import load_rig
+from torchface.io.rigs.ict_facekit import region
+from torchface.modeling import HeadModel
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+
+def load_head_model(name_or_path: str | Path) -> HeadModel:
+    """A head model by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    found = zoo.get_model(name_or_path)
+    if not isinstance(found, HeadModel):
+        raise NameMismatchError(f"model: found {name_or_path}, a {type(found).__name__}, expected a HeadModel")
+    return found
+
+
+def matching(
+    model: HeadModel, template: Path | None = None, part: str | None = None
+) -> tuple[HeadModel, BlendshapeRig]:
+    """A model, and the rig whose shapes its heads are to have, of one topology.
+
+    Args:
+        model: of heads.
+        template: a rig; the one that travels with the model if absent, else the embedded performer.
+        part: an annotated region, such as ``"face"``, that both are cut to; a model of that part alone stays as it is.
+
+    Raises:
+        TopologyError: the rig has another topology than the model.
+        NameMismatchError: no such part.
+    """
+    source, rig = "the model's own rig", model.rig
+    if template is not None:
+        source, rig = str(template), load_rig(template)
+    elif rig is None:
+        source, rig = "the embedded performer", performer()
+    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
+    if part is not None:
+        keep = region(rig.neutral, part)
+        if same_topology(model, rig):
+            model = model.part(keep)
+        rig = rig.part(keep)
+    if same_topology(model, rig):
+        return model, rig
+    count = len(model.shape.mean)
+    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
+    hint = "; name a rig with --template whose topology is the model's" if template is None else ""
+    raise TopologyError(
+        f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
+        f"{count} and {len(model.faces)}" + (f"; try --part {fitting[0]}" if fitting else hint)
+    )
+
+
+def same_topology(model: HeadModel, rig: BlendshapeRig) -> bool:
+    """Whether a model's heads have the rig's triangles."""
+    return len(rig.vertices) == len(model.shape.mean) and torch.equal(rig.neutral.faces, model.faces.cpu())

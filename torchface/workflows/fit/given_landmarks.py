@@ -1,0 +1,80 @@
+"""Landmarks that files give of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.landmarks import find_faces
+from torchface.modeling.photographs.landmark_view import LANDMARKS
+
+
+def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int | None = None) -> list[Tensor]:
+    """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them.
+
+    Args:
+        photographs: image files.
+        files: of landmarks.
+        face: which of several in an XML, from 0, numbered as where no file is given: as they are detected, the largest
+            first; after them those that are not detected.
+
+    Raises:
+        NameMismatchError: another number of files than of photographs, or an XML that does not tell which face.
+        FileFormatError: a broken file, or points that are no pixels.
+        ShapeError: not 68 landmarks.
+    """
+    if not photographs:
+        raise NameMismatchError("fit: found no photograph, expected one at least")
+    if len(files) == 1 and files[0].suffix.lower() == ".xml":
+        return [_face_in(files[0], path, face) for path in photographs]
+    if len(files) != len(photographs):
+        raise NameMismatchError(
+            f"landmarks: found {len(files)} files for {len(photographs)} photographs, expected one each, or one .xml"
+        )
+    return [
+        _face_in(file, photograph, face) if file.suffix.lower() == ".xml" else _pixels(file)
+        for file, photograph in zip(files, photographs, strict=True)
+    ]
+
+
+def _pixels(file: Path) -> Tensor:
+    points = load_landmark_points(file).ibug()
+    if points.shape[1] != 2:
+        raise FileFormatError(f"{file}: found points in space, three numbers each; expected pixels of a photograph")
+    return points.double()
+
+
+def _face_in(file: Path, photograph: Path, face: int | None) -> Tensor:
+    faces = [one for one in load_dlib_faces(file) if Path(one.image.replace("\\", "/")).name == photograph.name]
+    if not faces:
+        raise NameMismatchError(f"{file}: found no face in {photograph.name}, expected one")
+    if len(faces) > 1:
+        faces = _as_detected(faces, photograph)
+    if face is None and len(faces) > 1:
+        places = ", ".join(f"{k}: at ({int(one.box[0])}, {int(one.box[1])})" for k, one in enumerate(faces[:20]))
+        raise NameMismatchError(f"{file}: found {len(faces)} faces in {photograph.name}, choose one of --face {places}")
+    number = face or 0
+    if not 0 <= number < len(faces):
+        raise NameMismatchError(f"{file}: found {len(faces)} faces in {photograph.name}, expected more than {number}")
+    points = faces[number].points
+    if points.shape != (LANDMARKS, 2):
+        raise ShapeError(f"{file}: found {len(points)} landmarks in {photograph.name}, expected {LANDMARKS}")
+    return points
+
+
+def _as_detected(faces: list[LabelledFace], photograph: Path) -> list[LabelledFace]:
+    """Faces in the order in which ``find_in_photographs`` numbers them."""
+    boxes = find_faces((load_image(photograph)[:3].clamp(0, 1) * 255).round().to(torch.uint8)).boxes.double()
+    middle = torch.stack([face.box[:2] + face.box[2:] / 2 for face in faces]).double()
+    inside = (middle[:, None] >= boxes[None, :, :2]) & (middle[:, None] <= boxes[None, :, :2] + boxes[None, :, 2:])
+    numbers = torch.where(inside.all(-1), torch.arange(len(boxes)), len(boxes))
+    rank = torch.cat([numbers, torch.full((len(faces), 1), len(boxes))], dim=1).amin(1).tolist()
+    size = torch.stack([face.box[2:].prod() for face in faces]).tolist()
+    return [faces[k] for k in sorted(range(len(faces)), key=lambda k: (rank[k], -size[k]))]

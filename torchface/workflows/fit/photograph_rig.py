@@ -1,0 +1,166 @@
+"""From photographs and a head model on disk to a personal rig on disk, with the fit drawn over each photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io import save_calibration, save_rig
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.landmark_points import save_pts
+from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
+from torchface.modeling.photographs.landmark_view import JAW
+from torchface.rendering.compositing import save_picture
+from torchface.rig import BlendshapeRig
+from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
+from torchface.workflows.fit.fit_model import load_head_model, matching
+from torchface.workflows.fit.fit_overlay import overlay
+from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
+from torchface.workflows.fit.given_landmarks import landmarks_of
+from torchface.workflows.hidden_parts import dressed_as, hidden_parts
+from torchface.workflows.rig.actor_rig import check_out
+from torchface.workflows.rig_names import Naming, renamed
+
+
+@dataclass(frozen=True, eq=False)
+class FittedHead:
+    """What was made, and how near it comes to the photographs.
+
+    Args:
+        rig: the person's.
+        fit: see ``ImageFit``.
+        pictures: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
+        transfer_summary: on triangles without area; empty where there are none.
+        found: the landmarks that no file gave; empty where files gave them.
+        remarks: what speaks against the fit.
+    """
+
+    rig: BlendshapeRig
+    fit: ImageFit
+    pictures: tuple[Path, ...]
+    transfer_summary: str
+    found: tuple[FoundLandmarks, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def lines(self, photographs: Sequence[Path]) -> list[str]:
+        """For people to read."""
+        fit = self.fit
+        lines = [line for one in self.found for line in one.lines()]
+        for i, (path, camera, error) in enumerate(zip(photographs, fit.cameras, fit.errors.tolist(), strict=True)):
+            eyes = float(eyes_distances(fit.landmarks)[i])
+            inner = float(fit.residuals[i, JAW:].square().sum(-1).nanmean().sqrt())
+            lines.append(
+                f"{path.name}: landmarks {error:.2f} pixels off ({error / eyes:.1%} of the eyes' distance; "
+                f"{inner / eyes:.1%} without the contour), focal length {float(camera.intrinsics[0, 0]):.0f}"
+            )
+        lines += self.remarks
+        lines.append(f"identity: largest coefficient {float(fit.coefficients.abs().max()):.2f} standard deviations")
+        strongest = fit.weights.argsort(descending=True)[:5].tolist()
+        shown = [f"{self.rig.names[k]} {float(fit.weights[k]):.2f}" for k in strongest if float(fit.weights[k]) > 0.05]
+        lines.append(f"expression: {', '.join(shown) or 'none'}")
+        if fit.color is not None:
+            lines.append(f"colour model: {float(fit.color.error.mean()):.3f} off, of 1 a channel")
+        lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
+        return lines + ([f"  note: {self.transfer_summary}"] if self.transfer_summary else [])
+
+
+def fit_photographs(
+    photographs: Sequence[Path],
+    landmarks: Sequence[Path],
+    model: str | Path,
+    out: Path,
+    template: Path | None = None,
+    focal: float | None = None,
+    settings: FitSettings | None = None,
+    face: int | None = None,
+    texture_size: int = 1024,
+    progress: Callable[[str], None] | None = None,
+    landmark_model: str | Path = DEFAULT_LANDMARKS,
+    names: Naming | None = None,
+    part: str | None = None,
+    everything: bool = False,
+    insist: bool = False,
+) -> FittedHead:
+    """Fits a head to photographs of one person with one expression and writes it as a rig.
+
+    Args:
+        photographs: image files.
+        landmarks: 68 in iBUG's order for each photograph, in files (.pts, .ljson) or in one of dlib's XML for all;
+            where there are none they are found, and written as .pts beside ``out``.
+        model: a head model by name or folder; see ``zoo.get_model``.
+        out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
+        template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
+            topology is the model's.
+        focal: length in pixels where it is known.
+        settings: how landmarks are trusted.
+        face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
+        texture_size: texels a side; 0 makes no texture.
+        progress: called with a line before each step.
+        landmark_model: finds landmarks where no file gives them; by name or folder.
+        names: of the written shapes; see ``rig_names.renamed``.
+        part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
+        everything: lay also hair, clothes and what stands behind on the head, not skin and features alone.
+        insist: also where photographs do not seem to show one person.
+
+    Raises:
+        AlignmentError: photographs show different people.
+        NoFaceError: landmarks are to be found where no face is.
+        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
+        NameMismatchError: landmarks do not tell which photograph or face they are of.
+        TorchfaceError: landmarks or model are of no use; see ``fit_images``.
+    """
+    say = progress or (lambda line: None)
+    check_out(out)
+    say("reading the model")
+    heads, rig = matching(load_head_model(model), template, part)
+    say(f"reading {len(photographs)} photographs")
+    images = [load_image(path) for path in photographs]
+    found: list[FoundLandmarks] = []
+    if landmarks or not photographs:
+        marks = torch.stack(landmarks_of(photographs, landmarks, face))
+    else:
+        say(f"finding the landmarks of {len(photographs)} photographs")
+        found = find_in_photographs(photographs, images, landmark_model, face)
+        marks = torch.stack([one.trusted for one in found])
+    sizes = [(image.shape[2], image.shape[1]) for image in images]
+
+    def bare(points: Tensor, rows: list[int]) -> ImageFit:
+        some = [sizes[row] for row in rows]
+        return fit_images(heads, rig, points, some, camera=focal, settings=settings, transfers=0)
+
+    remarks = one_person_lines(photographs, marks, bare, insist)
+    fit = fit_images(
+        heads,
+        rig,
+        marks,
+        sizes,
+        images,
+        camera=focal,
+        settings=settings,
+        texture_size=texture_size,
+        masked=not everything,
+        progress=say,
+    )
+    if not found:
+        remarks += landmark_lines(photographs, images, marks, fit, landmark_model, bare)
+    say(f"transferring {len(rig.names)} shapes")
+    # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
+    unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
+    worn = dressed_as(fit.mesh, rig.neutral, unseen)
+    transferred = transfer_with_report(rig, worn)
+    say("writing the rig and the overlays")
+    save_rig(renamed(transferred.rig, names), out)
+    pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
+    for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn
+        save_picture(overlay(fit, i, image, marks[i]), path)
+    for picture, camera, (width, height), error in zip(pictures, fit.cameras, sizes, fit.errors.tolist(), strict=True):
+        calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
+        save_calibration(calibration, picture.with_suffix(".toml"))
+    for picture, one in zip(pictures, found, strict=False):  # to be corrected and given as --landmarks
+        save_pts(one.face.landmarks, picture.with_suffix(".pts"))
+    return FittedHead(transferred.rig, fit, pictures, transferred.report.summary(), tuple(found), tuple(remarks))

@@ -1,0 +1,1 @@
+"""A face before a camera, solved and sent on as it moves."""

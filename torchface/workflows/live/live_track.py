@@ -1,0 +1,177 @@
+"""A face before a camera, solved frame by frame as it moves, and sent on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.video import VideoState
+from torchface.capture.video.head_pose import PoseTracker
+from torchface.capture.video.landmark_smoothing import LandmarkFilter
+from torchface.errors import ValueRangeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import undistort
+from torchface.io.weights.live_link_stream import LiveLinkSender, parse_address
+from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.workflows.live.live_frames import Camera, PlayedVideo
+from torchface.workflows.track.head_rotations import head_angles, rotation_columns
+from torchface.workflows.track.track_files import save_curves
+from torchface.workflows.track.track_models import TrackModels, load_track_models
+from torchface.workflows.track.track_video import TrackSettings, camera_of, load_actor, solver_for
+
+_FEWEST = 6
+_EYES = 6
+_DEFAULT = TrackSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One frame as it was solved.
+
+    Args:
+        weights: (N,).
+        rotation: of the head, rig to camera, (3,3).
+        landmarks: (68,2), pixels; NaN where the face is lost.
+    """
+
+    weights: Tensor
+    rotation: Tensor
+    landmarks: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class LiveReport:
+    """What was sent.
+
+    Args:
+        weights: (T,N).
+        found: frames with a face, (T,) bool.
+        latency: from a frame's arrival to its packet on the way, (T,), milliseconds.
+        dropped: frames that came while another was solved.
+        fps: frames a second, as they came.
+        path: of the curves, where they were kept.
+    """
+
+    weights: Tensor
+    found: Tensor
+    latency: Tensor
+    dropped: int
+    fps: float
+    path: Path | None = None
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        count = len(self.weights)
+        return [
+            f"{count} frames sent at {self.fps:.1f} a second, a face in {int(self.found.sum())}",
+            f"{float(self.latency.median()):.1f} ms from frame to packet (99th percentile "
+            f"{float(self.latency.quantile(0.99)):.1f} ms), {self.dropped} frames came too early and were left out",
+        ]
+
+
+class LiveSolver:
+    """Landmarks, pose and weights one frame at a time.
+
+    Args:
+        rig: the actor's, with its 68 landmarks.
+        models: what tracks and solves.
+        calibration: of the camera.
+        face: which of several, the largest first.
+    """
+
+    def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
+        self.names = rig.names
+        self._tracker = LandmarkTracker(models.trees, models.appearance, face=face)
+        self._calibration, self._filter = calibration, LandmarkFilter()
+        self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
+        self._solver = solver_for(rig, models, calibration)
+        self._state: VideoState | None = None
+
+    def step(self, frame: Tensor) -> LiveFrame:
+        """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0."""
+        seen = self._tracker.step(frame)
+        landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
+        pose = self._poses.step(landmarks, seen.confidence)
+        enough = int(torch.isfinite(landmarks).all(1).sum()) >= _FEWEST
+        if self._state is None and not enough:
+            return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
+        before = self._state or self._solver.start()
+        self._state = self._solver.step(
+            before, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
+        )
+        weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
+        return LiveFrame(weights, rotation, seen.landmarks)
+
+
+def track_live(
+    camera: str,
+    rig: Path,
+    address: str,
+    out: Path | None = None,
+    settings: TrackSettings = _DEFAULT,
+    seconds: float | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> LiveReport:
+    """Solves what a camera sees and sends it in Live Link Face's packets, until it ends or is interrupted.
+
+    Args:
+        camera: a device's number, or a video file, which is played in its own time.
+        rig: the actor's.
+        address: ``udp://HOST:PORT``.
+        out: a folder for the curves of what was sent; none are kept without.
+        settings: models, calibration, face.
+        seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
+        progress: told how many frames are sent, and how many a second.
+
+    Raises:
+        ValueRangeError: the address is none, the rig lacks landmarks, or no frame came.
+        FileFormatError: the camera or the video cannot be opened.
+    """
+    parse_address(address)
+    actor = load_actor(rig, settings.part)
+    source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
+    with source:
+        models = load_track_models(
+            actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.film.fps
+        )
+        calibration = camera_of(source.film, settings.camera)
+        solver = LiveSolver(actor, models, calibration, settings.face)
+        rows: list[LiveFrame] = []
+        latency: list[float] = []
+        begin = time.perf_counter()
+        with LiveLinkSender(address, actor.names, source.film.fps) as sender:
+            try:
+                for came, frame in source.frames():
+                    solved = solver.step(frame)
+                    angles = head_angles(solved.rotation.double()).nan_to_num(0.0)
+                    sender.send(solved.weights, torch.cat([angles, angles.new_zeros(_EYES)]))
+                    now = time.perf_counter()
+                    latency.append(1000 * (now - came))
+                    rows.append(solved)
+                    if progress is not None:
+                        progress(len(rows), len(rows) / max(now - begin, 1e-9))
+                    if seconds is not None and now - begin >= seconds:
+                        break
+            except KeyboardInterrupt:  # how people end what has no end of its own
+                pass
+        took = time.perf_counter() - begin
+    if not rows:
+        raise ValueRangeError(f"camera {camera}: found no frame, expected at least one")
+    weights = torch.stack([row.weights for row in rows]).float()
+    found = torch.stack([torch.isfinite(row.landmarks).all(1).any() for row in rows])
+    path = None
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        turned = torch.stack([row.rotation for row in rows])
+        still = torch.where(torch.isfinite(turned), turned, torch.eye(3).to(turned) * turned.new_tensor([1.0, -1, -1]))
+        fps = source.film.fps
+        take = Take(fps, weights=Track(actor.names, weights[..., None]), extras={"columns": rotation_columns(still)})
+        path = save_curves(take, out)["weights"]
+    return LiveReport(weights, found, torch.tensor(latency), source.dropped, len(rows) / took, path)

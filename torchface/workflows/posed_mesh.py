@@ -1,0 +1,95 @@
+"""A mesh or a posed rig from whatever file it lies in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.io import load_mesh, load_rig, load_take
+from torchface.io.rigs.ict_facekit import region
+from torchface.mesh import Mesh, submesh
+from torchface.shape_names import mapping
+
+_MESH_ONLY = {".obj", ".ply", ".stl"}
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A mesh in a pose, and the same at rest (the mesh itself where it came without shapes)."""
+
+    mesh: Mesh
+    neutral: Mesh
+
+
+def pose_weights(words: Sequence[str]) -> dict[str, float]:
+    """``["jawOpen=0.5"]`` as a dictionary.
+
+    Raises:
+        ValueRangeError: a word is not NAME=NUMBER.
+    """
+    weights = {}
+    for word in words:
+        name, equals, number = word.partition("=")
+        try:
+            weights[name] = float(number)
+        except ValueError:
+            raise ValueRangeError(f"weights: found {word!r}, expected NAME=NUMBER such as jawOpen=0.5") from None
+        if not equals or not name or not abs(weights[name]) <= 10:
+            raise ValueRangeError(f"weights: found {word!r}, expected NAME=NUMBER with a number from -10 to 10")
+    return weights
+
+
+def load_posed(
+    path: Path, weights: dict[str, float], take: Path | None = None, frame: int = 0, part: str | None = None
+) -> Posed:
+    """Reads a mesh or a rig and poses it.
+
+    Args:
+        path: a mesh file, a rig file or a rig's folder.
+        weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` knows.
+        take: the pose from a frame of a weight take instead.
+        frame: which.
+        part: keep this annotated region only.
+
+    Raises:
+        NameMismatchError: a mesh without shapes cannot be posed, or a name means no shape of the rig.
+        ValueRangeError: the take holds no weights, or has no such frame.
+    """
+    if path.suffix.lower() in _MESH_ONLY:
+        if weights or take is not None:
+            raise NameMismatchError(f"{path}: found a mesh without shapes; a pose needs a rig (.glb or a folder)")
+        return _at_rest(path, part)
+    try:
+        rig = load_rig(path, part=part)
+    except FileFormatError:
+        if path.is_dir() or weights or take is not None:
+            raise
+        return _at_rest(path, part)  # a .glb without shapes is a mesh; what is no mesh either raises its own error
+    if take is None:
+        names = tuple(weights)
+        matrix = mapping(names, rig.names)
+        unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
+        if unknown:
+            near = sorted({close for name in unknown for close in get_close_matches(name, rig.names, 2)})
+            known = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(rig.names[:8])}, ..."
+            raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {known}")
+        row = matrix @ torch.tensor([weights[name] for name in names])
+    else:
+        track = load_take(take).weights
+        if track is None:
+            raise ValueRangeError(f"{take}: found no weights, expected a weight take such as Live Link Face's")
+        if not 0 <= frame < len(track):
+            raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
+        row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
+    return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
+
+
+def _at_rest(path: Path, part: str | None) -> Posed:
+    mesh = load_mesh(path)
+    mesh = mesh if part is None else submesh(mesh, region(mesh, part)).mesh
+    return Posed(mesh, mesh)

@@ -1,0 +1,1 @@
+"""An actor's own rig from raw scans."""

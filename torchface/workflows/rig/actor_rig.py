@@ -1,0 +1,343 @@
+"""From raw scans of an actor and a template rig on disk to the actor's own rig on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface import zoo
+from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
+from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io import load_mesh, load_rig, save_rig
+from torchface.landmarks.scans.detector_files import load_detector
+from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
+from torchface.mesh import Mesh
+from torchface.modeling import (
+    ExampleRig,
+    HeadModel,
+    MorphableModel,
+    NormalMap,
+    bake_normal_map,
+    clear_parts,
+    detail_maps,
+    inner_parts,
+    open_eyes,
+    place_parts,
+    rig_from_examples,
+    transfer_with_report,
+)
+from torchface.modeling.rigging.example_rigging import RiggingSchedule
+from torchface.modeling.rigging.scanned_examples import seen_example
+from torchface.registration import Registration, register
+from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.rendering.compositing import save_picture
+from torchface.rig import BlendshapeRig
+from torchface.viz.figures.registration_views import registration_sheet
+from torchface.workflows.hidden_parts import dressed_as, hidden_parts
+from torchface.workflows.register_scans import in_place_of, load_shape_model
+from torchface.workflows.rig.expression_scans import LAYOUT, Expression, expressions_in, neutral_in, weights_row
+from torchface.workflows.rig.penetration_report import Penetration, penetration
+from torchface.workflows.rig_names import Naming, renamed, renamed_detail
+
+PICTURE = "_registration.png"
+"""Ends the name of the picture that lies beside a rig."""
+_FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
+# Registered scans are noisier than shapes are a person's own, and what they show is known roughly.
+_SCANNED = RiggingSchedule(beta=(0.5, 0.1), gamma=(25.0, 25.0))
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """How the files are read and what is made of them.
+
+    Args:
+        part: keep this region of the template only.
+        unit: of all scans, where it is not each format's own.
+        pose: what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened
+            again by deformation transfer.
+        detector: of landmarks, by name or folder, for scans without landmarks.
+        model: of heads in the template's topology, by name or folder; the neutral's registration starts from it.
+        texture_size: of the actor's texture, texels a side.
+        detail_size: of each normal map, texels a side.
+        names: of the written shapes; see ``rig_names.renamed``.
+    """
+
+    part: str | None = None
+    unit: str | None = None
+    pose: dict[str, float] = field(default_factory=dict)
+    detector: str | Path | None = None
+    model: str | Path | None = None
+    texture_size: int = 2048
+    detail_size: int = 2048
+    names: Naming | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ActorReport:
+    """What was made, and how near it comes to the scans.
+
+    Args:
+        rig: the actor's, in the template's place.
+        neutral: the neutral scan's registration.
+        transfer_summary: on triangles without area; empty where there are none.
+        examples: what the examples taught; None without any.
+        example_names: the examples used, in the order of ``examples.errors``.
+        maps: the baked normal maps by name, the neutral's first.
+        skipped: lines on scans that could not be used.
+        picture: of the registration: scan, face, distances and lines.
+        penetration: how far teeth, gums and eyes stand out of the skin.
+    """
+
+    rig: BlendshapeRig
+    neutral: Registration
+    transfer_summary: str
+    examples: ExampleRig | None
+    example_names: tuple[str, ...]
+    maps: dict[str, NormalMap]
+    skipped: tuple[str, ...]
+    picture: Path
+    penetration: Penetration | None = None
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        record = self.neutral.record
+        lines = [f"neutral: laid on the scan by {record.start}; {record.figures()}"]
+        lines += [f"  note: {note}" for note in record.notes]
+        lines.append(f"  picture: {self.picture}")
+        lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
+        lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
+        lines += [] if self.penetration is None else [self.penetration.line()]
+        if self.examples is not None:
+            errors = self.examples.errors
+            lines.append(
+                f"examples: {len(self.example_names)}, from {float(errors[0].mean()):.2f} mm (transferred shapes) to "
+                f"{float(errors[-1].mean()):.2f} mm root mean square; the shapes turned by up to "
+                f"{float(self.examples.angles.max()):.0f}°"
+            )
+            lines += [
+                f"  {name}: {float(before):.2f} to {float(after):.2f} mm"
+                for name, before, after in zip(self.example_names, errors[0], errors[-1], strict=True)
+            ]
+        if self.maps:
+            lines.append(f"normal maps: {len(self.maps)}")
+            lines += [
+                f"  {name}: {baked.statistics.hit_share:.0%} of the texels found the scan, median "
+                f"{baked.statistics.median_distance:.2f} mm away"
+                for name, baked in self.maps.items()
+            ]
+        return lines + [f"skipped: {line}" for line in self.skipped]
+
+
+def rig_actor(
+    scan: Path,
+    template: Path,
+    out: Path,
+    landmarks: Path | None = None,
+    examples: Path | None = None,
+    detail: Path | None = None,
+    options: RigOptions | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ActorReport:
+    """Registers the neutral scan, transfers the shapes, learns from examples, bakes normal maps, writes the rig.
+
+    Beside the rig lies a picture of the registration, ``NAME_registration.png``: the scan, the face, its distances to
+    the scan, its mesh.
+
+    Args:
+        scan: the actor at rest, any topology and pose.
+        template: a rig.
+        out: the ``.glb`` or folder to write; see ``save_rig``.
+        landmarks: of the scan; see ``load_scan_landmarks``. Found by shape alone if absent.
+        examples: a folder of scans of expressions; see ``expressions_in``. Landmark files named as the scans may lie
+            beside them.
+        detail: a folder of high-resolution scans, named for the one shape that each shows at full strength, and
+            ``neutral``.
+        options: how the files are read and what is made of them.
+        progress: called with a line before each step.
+
+    Raises:
+        FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
+        AlignmentError: not one example, or not one scan of details, could be used.
+        TorchfaceError: neutral scan, template or an option is of no use.
+    """
+    options, say = options or RigOptions(), progress or (lambda line: None)
+    check_out(out)
+    say("reading the template")
+    rig = load_rig(template, part=options.part)
+    shown = weights_row(options.pose, rig.names, "pose") if options.pose else torch.zeros(len(rig.names))
+    expressions = [] if examples is None else expressions_in(examples, rig.names)
+    if examples is not None and not expressions:
+        raise FileFormatError(f"{examples}: found no scan of an expression, expected {LAYOUT}")
+    fine = [] if detail is None else _detail_scans(detail, rig)
+    job = _Actor(rig, options, say)
+    say("registering the neutral scan")
+    model = None if options.model is None else load_shape_model(options.model)
+    if model is not None and bool(shown.any()):
+        raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
+    registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
+    neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
+    parts = inner_parts(rig)
+    neutral = place_parts(rig, neutral, parts)
+    neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
+    say(f"transferring {len(rig.names)} shapes")
+    transferred = transfer_with_report(rig, neutral)
+    actor: BlendshapeRig = transferred.rig
+    learned: ExampleRig | None = None
+    used: tuple[str, ...] = ()
+    if expressions:
+        learned, used = job.learned(actor, neutral, registration.matched, expressions)
+        actor = clear_parts(learned.rig, parts)
+    maps = job.baked(actor, fine)
+    say("writing the rig")
+    save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
+    say("drawing the registration")
+    picture = out.with_name(f"{out.stem}{PICTURE}")
+    save_picture(registration_sheet(load_mesh(scan, options.unit), registration), picture)
+    names = {label: baked for label, (_, baked) in maps.items()}
+    return ActorReport(
+        actor,
+        registration,
+        transferred.report.summary(),
+        learned,
+        used,
+        names,
+        tuple(job.skipped),
+        picture,
+        penetration(actor, parts),
+    )
+
+
+class _Actor:
+    """The steps, and what had to be skipped on the way."""
+
+    def __init__(self, template: BlendshapeRig, options: RigOptions, say: Callable[[str], None]) -> None:
+        self.template, self.options, self.say = template, options, say
+        self.skipped: list[str] = []
+
+    @staticmethod
+    def posed(rig: BlendshapeRig, weights: Tensor) -> Mesh:
+        return rig.neutral.with_vertices(rig(weights[None].to(rig.deltas))[0])
+
+    def registered(
+        self,
+        mesh: Mesh,
+        scan: Path,
+        landmarks: Path | None,
+        texture_size: int,
+        model: MorphableModel | HeadModel | None = None,
+    ) -> Registration:
+        options = self.options
+        read = load_mesh(scan, options.unit)
+        marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
+        detector = None
+        if marks is None and options.detector is not None:
+            detector = AutomaticLandmarks(load_detector(zoo.find(options.detector)), mesh)
+        return register(mesh, read, marks, model=model, detector=detector, texture_size=texture_size)
+
+    def learned(
+        self, actor: BlendshapeRig, neutral: Mesh, matched: Tensor, expressions: list[Expression]
+    ) -> tuple[ExampleRig, tuple[str, ...]]:
+        """The rig from the examples that could be registered, and their names."""
+        vertices, weights, used = [], [], []
+        for number, expression in enumerate(expressions, 1):
+            self.say(f"registering example {number} of {len(expressions)}, {expression.name}")
+            # The transferred rig in that expression is nearer to the scan than the actor at rest.
+            guess = self.posed(actor, expression.weights)
+            try:
+                marks = landmark_file(expression.path.parent, expression.path)
+                found = self.registered(guess, expression.path, marks, texture_size=0)
+            except TorchfaceError as error:
+                self.skipped.append(f"example {expression.path.name}: {error}")
+                continue
+            moved = (guess.vertices - neutral.vertices).norm(dim=-1)
+            steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
+            laid = in_place_of(found.mesh, guess, steady.double())
+            vertices.append(seen_example(laid, guess.vertices, found.matched & matched))
+            weights.append(expression.weights)
+            used.append(expression.name)
+        if not used:
+            raise AlignmentError(f"examples: none of {len(expressions)} could be used; {self.skipped[0]}")
+        self.say(f"learning from {len(used)} examples")
+        rig = rig_from_examples(self.template, neutral, torch.stack(vertices), torch.stack(weights), _SCANNED)
+        return rig, tuple(used)
+
+    def baked(self, actor: BlendshapeRig, fine: list[Expression]) -> dict[str, tuple[tuple[str, ...], NormalMap]]:
+        """For each scan of details the shapes that it shows (none: the neutral) and the map."""
+        maps: dict[str, tuple[tuple[str, ...], NormalMap]] = {}
+        for number, one in enumerate(fine, 1):
+            self.say(f"baking normal map {number} of {len(fine)}, {one.name}")
+            shapes = tuple(actor.names[i] for i in one.weights.nonzero()[:, 0].tolist())
+            try:
+                scan = load_mesh(one.path, self.options.unit)
+                maps[one.name] = shapes, bake_normal_map(self.posed(actor, one.weights), scan, self.options.detail_size)
+            except TorchfaceError as error:
+                self.skipped.append(f"details {one.path.name}: {error}")
+        if fine and not maps:
+            raise AlignmentError(f"detail: none of {len(fine)} scans could be used; {self.skipped[-1]}")
+        return maps
+
+
+def _upright(registration: Registration, template: Mesh) -> Mesh:
+    """The registered face, turned and moved to where the template looks, in its own size."""
+    return in_place_of(registration.mesh, template, registration.matched.double())
+
+
+def _at_rest(rig: BlendshapeRig, weights: Tensor, found: Mesh) -> Mesh:
+    """The face at rest of a scan that shows some of the template's shapes."""
+    shown = [rig.names[i] for i in weights.nonzero()[:, 0].tolist()]
+    if not shown:
+        return found
+    # What opens closed eyes takes any shapes back; these are as strong as the scan shows them.
+    as_shown = BlendshapeRig(rig.neutral, rig.deltas * weights.to(rig.deltas)[:, None, None], rig.names)
+    return open_eyes(as_shown, found, shown)
+
+
+def _detail_scans(folder: Path, rig: BlendshapeRig) -> list[Expression]:
+    """The neutral first (weights of zero), then those of one shape each."""
+    neutral = neutral_in(folder) if folder.is_dir() else None
+    rest = [] if neutral is None else [Expression(neutral, torch.zeros(len(rig.names)))]
+    shapes = expressions_in(folder, rig.names)
+    if not rest and not shapes:
+        raise FileFormatError(f"{folder}: found no scan, expected neutral.obj and shapes such as jawOpen.obj")
+    taken: dict[int, Expression] = {}
+    for one in shapes:
+        if bool(((one.weights != 0) & (one.weights != 1)).any()):
+            raise ValueRangeError(f"{one.path}: found weights below 1, expected one shape at full strength a scan")
+        for shape in one.weights.nonzero()[:, 0].tolist():
+            if shape in taken:
+                raise ValueRangeError(
+                    f"{one.path}: found a second scan for {rig.names[shape]} beside {taken[shape].path.name}, expected "
+                    "one a shape"
+                )
+            taken[shape] = one
+    return rest + shapes
+
+
+def _detail(maps: dict[str, tuple[tuple[str, ...], NormalMap]]) -> DetailMaps | None:
+    if not maps:
+        return None
+    neutral = next((baked for shapes, baked in maps.values() if not shapes), None)
+    named = [(shape, baked) for shapes, baked in maps.values() for shape in shapes]
+    if not named:
+        assert neutral is not None
+        return DetailMaps((), torch.zeros(0, *neutral.normals.shape), neutral.normals)
+    return detail_maps([shape for shape, _ in named], [baked for _, baked in named], neutral)
+
+
+def check_out(out: Path) -> None:
+    """Refuses what a rig cannot be written to, before any work is done: a ``.glb``, or a folder without an ending."""
+    if out.suffix.lower() not in (".glb", ""):
+        raise FileFormatError(
+            f"{out}: found the ending {out.suffix!r}, expected .glb, or none for a folder of OBJ files"
+        )
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        trial = out.resolve().parent / f".{out.resolve().name}.writable"
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise FileFormatError(f"{out}: cannot be written ({error.strerror})") from error

@@ -1,0 +1,1 @@
+"""Markers in, weights out."""

@@ -1,0 +1,198 @@
+"""The report of a solve: the face as it plays, marker errors on it and in a table, what was wrong, every curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.markers import Cleanup, Defect
+from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
+from torchface.rendering.compositing import caption, sheet
+from torchface.rig import BlendshapeRig
+from torchface.viz.figures.curves import error_curve, weight_curves
+from torchface.viz.figures.face_views import frame_face
+from torchface.viz.figures.heat_maps import round_maximum
+from torchface.viz.figures.helmet_motion import motion_curves
+from torchface.viz.figures.marker_maps import marker_map
+from torchface.viz.figures.region_colors import as_seen
+from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
+from torchface.viz.reports.report_page import Section, Table, write_page
+from torchface.workflows.solve.solution import Solution, SolveReport
+
+_CURVES_A_PICTURE = 13
+_ACTIVE, _SHOWN_FRAMES, _SIDE = 8, 8, 55.0
+_WORST_MARKERS = 12
+_KINDS = {
+    "swap": "Swapped labels",
+    "displaced": "Markers that drift, fell off or carry another's label",
+    "spike": "Spikes",
+}
+_HEADING = ("markers", "frames", "seconds", "off by", "done")
+_MOST_ROWS = 60
+
+
+def write_solve_page(folder: Path, title: str, report: SolveReport, rig: BlendshapeRig, solution: Solution) -> Path:
+    """Writes the report's page and pictures into a folder.
+
+    Args:
+        folder: where to; made if absent.
+        title: what was solved.
+        report: of the solve.
+        rig: whose face it is.
+        solution: the markers as the solve used them, and their sites.
+
+    Returns:
+        The page's path.
+    """
+    take = report.take
+    assert take.weights is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    weights, names = take.weights.values[..., 0].float(), take.weights.names
+    offsets = _offsets(rig, solution, weights)
+    errors = offsets.norm(dim=-1)
+    done = "; ".join(line for line in report.lines() if not line.startswith(("  ", "warning:")))
+    sections = [
+        Section(
+            "The performance",
+            "The solved face with the markers as the solve used them, coloured by their distance from their sites.",
+            pictures=[("frames.png", _strip(rig, weights))],
+            markup=_player(folder, rig, solution, weights, errors, take.fps),
+        ),
+        Section("What was done", done),
+        *_marker_sections(rig, solution, offsets, report.rmse, take.fps),
+    ]
+    if report.warnings:
+        sections.insert(0, Section("Warnings", "; ".join(report.warnings)))
+    if report.cleanup is not None:
+        sections.append(_defects(report.cleanup, take.fps))
+    if report.motion is not None:
+        curves = motion_curves(report.motion.translation, report.motion.degrees(), take.fps)
+        text = "How the helmet moved against the head, in rig space; none of it is in the weights."
+        sections.append(Section("Helmet", text, pictures=[("helmet.png", curves)]))
+    order = weights.amax(0).argsort(descending=True).tolist()
+    pictures = []
+    for number, first in enumerate(range(0, len(order), _CURVES_A_PICTURE)):
+        rows_of_page = order[first : first + _CURVES_A_PICTURE]
+        part = weights[:, rows_of_page]
+        label = [names[i] for i in rows_of_page]
+        pictures.append((f"weights{number + 1}.png", weight_curves(part, None, label, take.fps, len(label))))
+    sections.append(Section("Weights", "Every shape's curve, the strongest first.", pictures=pictures))
+    return write_page(folder, f"Solve of {title}", sections)
+
+
+def _offsets(rig: BlendshapeRig, solution: Solution, weights: Tensor) -> Tensor:
+    """From each marker's site on the solved face to the marker, (T,M,3), millimetres; NaN where not seen."""
+    sites, faces = solution.attachment, rig.neutral.faces
+    rest = sites.on(faces, rig.vertices)
+    if sites.residual is not None:
+        rest = rest + sites.residual.to(rest)
+    basis = sites.on(faces, rig.deltas)
+    return solution.markers.float() - rest - torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
+
+
+def _player(folder: Path, rig: BlendshapeRig, solution: Solution, weights: Tensor, errors: Tensor, fps: float) -> str:
+    active = weights.std(0).argsort(descending=True)[:_ACTIVE].tolist()
+    markers = Markers(solution.markers.float(), errors, _scale(errors))
+    panels = [Panel("solved", 0, markers=True), Panel("from the side", 0, markers=True, yaw=_SIDE)]
+    curves = tuple(rig.names[i] for i in active)
+    played = Played("solved", rig, weights)
+    return write_player(Player([played], panels, fps, curves=curves, markers=markers), folder)
+
+
+def _scale(errors: Tensor) -> float:
+    """Where the colours of marker errors end: such that the best half stays below their middle."""
+    known = errors[torch.isfinite(errors)]
+    return round_maximum(2 * float(known.median())) if len(known) else 1.0
+
+
+def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
+    """The frames that differ most from each other, in the order of time, (3,H,W)."""
+    chosen = [int((weights.square().sum(1)).argmax())]
+    while len(chosen) < min(_SHOWN_FRAMES, len(weights)):  # each choice depends on the one before
+        chosen.append(int(torch.cdist(weights, weights[chosen]).amin(1).argmax()))
+    camera = frame_face(rig.neutral, width=150, height=188)
+    lighting, seen = replace(DEFAULT_LIGHTING, occlusion_rays=4), as_seen(rig.neutral)
+
+    def picture(frame: int) -> Tensor:
+        moved = rig(weights[frame : frame + 1].to(rig.deltas))[0]
+        return caption(render(seen.with_vertices(moved), camera, lighting=lighting), f"frame {frame}", 12)
+
+    return sheet([picture(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
+
+
+def _marker_sections(
+    rig: BlendshapeRig, solution: Solution, offsets: Tensor, rmse: Tensor, fps: float
+) -> list[Section]:
+    labels = solution.attachment.labels or ()
+    errors = offsets.norm(dim=-1)
+    each = errors.square().nanmean(0).sqrt()
+    bias = offsets.nanmean(0).norm(dim=-1)
+    high = errors.double().nanquantile(0.95, dim=0)
+    seen = torch.isfinite(errors).float().mean(0)
+    order = each.nan_to_num(-1.0).argsort(descending=True).tolist()
+    rows = [
+        (
+            labels[i],
+            *(f"{float(value[i]):.2f} mm" for value in (each, bias, high)),
+            f"{100 * float(seen[i]):.1f} %",
+        )
+        for i in order
+    ]
+    heading = ("marker", "RMSE", "constant part", "95th percentile", "seen")
+    points = solution.attachment.on(rig.neutral.faces, rig.vertices)
+    picture = marker_map(rig.neutral, points, each, round_maximum(1.5 * float(each.nanmedian())), labels)
+    text = (
+        "Worst first. A constant part that makes up most of an error speaks of a site that is wrong (see torchface "
+        "attach), the rest of noise, swaps and shapes that the rig lacks."
+    )
+    tables = [Table(heading, rows[:_WORST_MARKERS])]
+    if len(rows) > _WORST_MARKERS:
+        tables.append(Table(heading, rows[_WORST_MARKERS:], f"the other {len(rows) - _WORST_MARKERS} markers"))
+    return [
+        Section("Error of each marker", text, tables, [("marker_map.png", picture)]),
+        Section("Marker error over time", pictures=[("error.png", error_curve(rmse, fps))]),
+    ]
+
+
+def _defects(cleanup: Cleanup, fps: float) -> Section:
+    """What was wrong by kind, swaps first; gaps, of which there may be hundreds, a marker a row."""
+    tables = []
+    for kind, title in _KINDS.items():
+        found = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
+        rows = [_row(defect, fps) for defect in found]
+        if rows:
+            tables.append(Table((title, *_HEADING[1:]), rows[:_MOST_ROWS]))
+        if len(rows) > _MOST_ROWS:
+            tables.append(Table(_HEADING, rows[_MOST_ROWS:], f"{len(rows) - _MOST_ROWS} more of them"))
+    gaps = [defect for defect in cleanup.defects if defect.kind == "gap"]
+    if gaps:
+        filled = sum(defect.action == "filled" for defect in gaps)
+        summary = f"{len(gaps)} gaps, {filled} of them filled, by marker"
+        tables.append(Table(("gaps of", "how many", "frames", "longest"), _gap_rows(gaps, fps), summary))
+    return Section("What was wrong with the take", cleanup.summary(), tables)
+
+
+def _row(defect: Defect, fps: float) -> tuple[str, ...]:
+    return (
+        " ↔ ".join(defect.labels),
+        f"{defect.first}–{defect.last}",
+        f"{defect.first / fps:.2f}",
+        f"{defect.size:.1f} mm",
+        defect.action,
+    )
+
+
+def _gap_rows(gaps: Sequence[Defect], fps: float) -> list[tuple[str, ...]]:
+    """A marker a row: how many gaps, frames in them, the longest in seconds; most frames first."""
+    lengths: dict[str, list[int]] = {}
+    for gap in gaps:
+        lengths.setdefault(gap.labels[0], []).append(gap.last - gap.first + 1)
+    order = sorted(lengths, key=lambda label: -sum(lengths[label]))
+    return [
+        (label, str(len(lengths[label])), str(sum(lengths[label])), f"{max(lengths[label]) / fps:.2f} s")
+        for label in order
+    ]

@@ -1,0 +1,103 @@
+"""Frames of weights sent in their own time, solved as they come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+from torchface.io.weights.live_link_stream import LiveLinkSender
+from torchface.onnx.live_solver import LiveMarkerSolver
+from torchface.temporal import OneEuroFilter
+
+
+@dataclass(frozen=True, eq=False)
+class StreamReport:
+    """What was sent.
+
+    Args:
+        weights: of each frame, (T,N).
+        latency: from when the frame was due to its packet on the way, what solves it included, (T,), milliseconds.
+    """
+
+    weights: Tensor
+    latency: Tensor
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        worst = float(self.latency.quantile(0.99))
+        return [
+            f"{len(self.weights)} frames sent, {float(self.latency.median()):.2f} ms from frame to packet "
+            f"(99th percentile {worst:.2f} ms)"
+        ]
+
+
+def stream_markers(
+    solver: LiveMarkerSolver,
+    frames: Iterable[Tensor],
+    fps: float,
+    address: str,
+    clock: Callable[[], float] = time.perf_counter,
+    wait: Callable[[float], None] = time.sleep,
+    smoothing: OneEuroFilter | None = None,
+) -> StreamReport:
+    """Solves frames one at a time and sends each at its time.
+
+    Args:
+        solver: for these markers.
+        frames: (M,3) each, millimetres, NaN for not seen; from a take or as they come in.
+        fps, address, clock, wait: see :func:`stream_weights`.
+        smoothing: calms the weights from frame to frame; none if absent.
+
+    Raises:
+        ValueRangeError: the address is none, or there was no frame.
+    """
+    weights = (solver.step(markers) for markers in frames)
+    if smoothing is not None:
+        weights = (smoothing.step(frame) for frame in weights)
+    return stream_weights(weights, solver.names, fps, address, clock, wait)
+
+
+def stream_weights(
+    frames: Iterable[Tensor],
+    names: Sequence[str],
+    fps: float,
+    address: str,
+    clock: Callable[[], float] = time.perf_counter,
+    wait: Callable[[float], None] = time.sleep,
+) -> StreamReport:
+    """Sends frames of weights, each at its time.
+
+    Args:
+        frames: (N,) each; each is asked for when it is due.
+        names: of the weights.
+        fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
+        address: ``udp://HOST:PORT``, in Live Link Face's packets.
+        clock, wait: what time it is, and to let it pass, in seconds.
+
+    Raises:
+        ValueRangeError: the address is none, or there was no frame.
+    """
+    sent: list[Tensor] = []
+    latency: list[float] = []
+    coming = iter(frames)
+    with LiveLinkSender(address, names, fps) as sender:
+        begin = clock()
+        while True:
+            early = begin + len(sent) / fps - clock()
+            if early > 0:
+                wait(early)
+            came = clock()
+            weights = next(coming, None)
+            if weights is None:
+                break
+            sender.send(weights)
+            latency.append(1000 * (clock() - came))
+            sent.append(weights)
+    if not sent:
+        raise ValueRangeError("stream: found no frame, expected at least one")
+    return StreamReport(torch.stack(sent), torch.tensor(latency))

@@ -1,0 +1,1 @@
+"""A face in a video as weights of the actor's rig."""

@@ -1,0 +1,30 @@
+"""A head's pose before a camera as Live Link Face has it: yaw, pitch and roll."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.io.weights.weight_csv import ROTATIONS
+
+
+def head_angles(rotation: Tensor) -> Tensor:
+    r"""Yaw, pitch and roll (...,3), radians, of rotations from the rig to an OpenCV camera (...,3,3); NaN stays NaN.
+
+    .. math:: \mathrm{diag}(1,-1,-1) \, R = R_y(\text{yaw}) \, R_x(\text{pitch}) \, R_z(\text{roll})
+
+    Zero is a face that looks straight into the lens. Positive yaw turns it to the viewer's right, positive pitch
+    nods it down, positive roll tilts it counter-clockwise as the viewer sees it.
+    """
+    upright = rotation * rotation.new_tensor([1.0, -1.0, -1.0])[:, None]
+    yaw = torch.atan2(upright[..., 0, 2], upright[..., 2, 2])
+    pitch = torch.asin((-upright[..., 1, 2]).clamp(-1, 1))
+    roll = torch.atan2(upright[..., 1, 0], upright[..., 1, 1])
+    return torch.stack([yaw, pitch, roll], dim=-1)
+
+
+def rotation_columns(rotation: Tensor) -> dict[str, Tensor]:
+    """Live Link Face's nine columns by name, each (T,) float64: the head's of rotations (T,3,3), the eyes' 0."""
+    angles = head_angles(rotation.detach().cpu().double())
+    still = angles.new_zeros(len(angles))
+    return {name: angles[:, i] if i < 3 else still for i, name in enumerate(ROTATIONS)}

@@ -1,0 +1,125 @@
+"""What tracking a video leaves on disk: curves, animation, and what a later run may take up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from torchface.capture.video import VideoSolution
+from torchface.errors import FileFormatError, TorchfaceError
+from torchface.files.whole_files import read_file, write_file
+from torchface.io import save_animation
+from torchface.io.landmarks.openface_csv import save_landmarks_csv
+from torchface.io.weights.live_link_csv import save_live_link
+from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.landmarks.images.tracking import LANDMARK_NAMES
+from torchface.rendering.point_light import PointLight
+from torchface.shape_names import ARKIT, mapping
+from torchface.take import Take, Track
+from torchface.workflows.track.head_rotations import rotation_columns
+from torchface.workflows.track.track_result import Tracked
+from torchface.workflows.track.track_state import TrackState
+
+SOLUTION, LIGHT, WEIGHTS, LIVE_LINK = "solution.safetensors", "light.safetensors", "weights.csv", "live_link.csv"
+LANDMARKS, ANIMATION, OVERLAY, SUMMARY = "landmarks.csv", "animation.glb", "overlay.mp4", "summary.json"
+
+_FORMAT = "torchface.track-summary/1"
+_LARGEST_SOLUTION = 2**31
+
+
+def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
+    """Keeps a solution for a later run."""
+    tensors = {
+        name: getattr(solution, name).detach().float().contiguous()
+        for name in ("weights", "rotation", "translation", "errors")
+    }
+    path = state.folder / SOLUTION
+    write_file(path, save({**tensors, "solved": solution.solved.contiguous()}))
+    state.made(path, key)
+
+
+def kept_solution(state: TrackState, key: str, frames: int, shapes: int) -> VideoSolution | None:
+    """The solution of an earlier run, if it is whole and of these frames and shapes."""
+    path = state.folder / SOLUTION
+    if not state.is_current(path, key):
+        return None
+    try:
+        found = load(read_file(path, _LARGEST_SOLUTION))
+        if found["weights"].shape != (frames, shapes) or found["rotation"].shape != (frames, 3, 3):
+            return None
+        return VideoSolution(**found)
+    except (SafetensorError, FileFormatError, KeyError, TypeError, ValueError):
+        return None  # made anew
+
+
+def keep_light(state: TrackState, key: str, light: PointLight) -> None:
+    """Keeps a video's light for a later run."""
+    path = state.folder / LIGHT
+    tensors = {
+        name: getattr(light, name).detach().float().contiguous() for name in ("ambient", "intensity", "position")
+    }
+    write_file(path, save(tensors))
+    state.made(path, key)
+
+
+def kept_light(state: TrackState, key: str) -> PointLight | None:
+    """The light of an earlier run, if it is whole and of this video's solution."""
+    path = state.folder / LIGHT
+    if not state.is_current(path, key):
+        return None
+    try:
+        return PointLight(**load(read_file(path, _LARGEST_SOLUTION)))
+    except (SafetensorError, TorchfaceError, KeyError, TypeError, ValueError):
+        return None  # found anew
+
+
+def save_curves(take: Take, out: Path) -> dict[str, Path]:
+    """Writes a take's weights by the rig's names, and as Live Link Face has them, with the head, where names allow;
+    gives the files by what they are."""
+    assert take.weights is not None
+    products = {"weights": out / WEIGHTS}
+    save_weights_csv(take, out / WEIGHTS)
+    if mapping(take.weights.names, ARKIT).any():
+        products["live link"] = out / LIVE_LINK
+        save_live_link(take, out / LIVE_LINK)
+    else:
+        (out / LIVE_LINK).unlink(missing_ok=True)  # one of an earlier run would tell of another rig
+    return products
+
+
+def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
+    """Writes the weights, the landmarks with the head's pose beside them, and the animation; gives the files by what
+    they are."""
+    fps, weights = tracked.video.fps, tracked.solution.weights.detach().float()
+    angles = rotation_columns(tracked.solution.rotation)
+    take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles})
+    products = {**save_curves(take, out), "landmarks": out / LANDMARKS, "animation": out / ANIMATION}
+    moved = tracked.solution.translation.detach().double()
+    columns = {f"pose_T{axis}": moved[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"pose_{name.removeprefix('Head').lower()}": angles[name] for name in list(angles)[:3]}
+    track = Track(LANDMARK_NAMES, tracked.frames.landmarks, tracked.frames.confidence)
+    save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}), products["landmarks"])
+    save_animation(tracked.rig, take, products["animation"])
+    return products
+
+
+def summary(tracked: Tracked) -> dict[str, object]:
+    """The figures as JSON has them."""
+    errors = tracked.solution.errors
+    return {
+        "format": _FORMAT,
+        "video": tracked.video.path.name,
+        "frames": len(tracked.frames),
+        "fps": tracked.video.fps,
+        "found": int(tracked.seen.sum()),
+        "jitter_px": tracked.jitter,
+        "reprojection_median_px": float(errors.nanmedian()),
+        "reprojection_95_px": float(errors.nanquantile(0.95)),
+        "camera_assumed": tracked.calibration.assumed,
+        "focal_px": float(tracked.calibration.intrinsics[0, 0]),
+        "faces_in_first_frame": tracked.faces,
+        "seconds": tracked.seconds,
+        "files": {name: path.name for name, path in tracked.products.items()},
+    }

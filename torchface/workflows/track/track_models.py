@@ -1,0 +1,126 @@
+"""The learned parts that track a video: landmarks of any face, the actor's own appearance, what faces do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from torch import nn
+
+from torchface import zoo
+from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files.models import read_record
+from torchface.landmarks import AppearanceModel, LandmarkTrees
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.track_state import digest
+
+DEFAULT_LANDMARKS = "face_landmarks"
+"""The model of the zoo that finds landmarks where none is named."""
+
+_Model = TypeVar("_Model", bound=nn.Module)
+Fitted = TypeVar("Fitted")
+
+
+@dataclass(frozen=True)
+class TrackModels:
+    """What tracks and solves.
+
+    Args:
+        trees: find landmarks in any face.
+        appearance: refines them on the actor's own.
+        prior: which weights faces have.
+        dynamics: how weights go on.
+        unlearned: shapes of the rig that a prior says nothing of: they stay near rest.
+        seeing: changes when what finds landmarks does.
+        solving: changes when what solves does.
+    """
+
+    trees: LandmarkTrees
+    appearance: AppearanceModel | None = None
+    prior: ShapePrior | None = None
+    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None
+    unlearned: tuple[str, ...] = ()
+    seeing: str = ""
+    solving: str = ""
+
+
+def load_track_models(
+    rig: BlendshapeRig,
+    landmarks: str | Path = DEFAULT_LANDMARKS,
+    appearance: str | Path | None = None,
+    prior: str | Path | None = None,
+    dynamics: str | Path | None = None,
+    fps: float | None = None,
+) -> TrackModels:
+    """Reads models by name or folder, see :func:`torchface.zoo.get_model`, and makes priors fit the rig and the video.
+
+    Args:
+        rig: whose shapes' names the priors are brought to.
+        landmarks, appearance, prior, dynamics: the models.
+        fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
+
+    Raises:
+        NameMismatchError: there is none of a name, one is of another kind, or a prior has learned less than half of
+            the rig's shapes.
+        ValueRangeError: the trees find other landmarks than the 68, or the dynamics prior is of a frame rate more than
+            eight times as high or as low.
+        FileFormatError: a model is damaged.
+    """
+    trees = _read("--landmarks", landmarks, LandmarkTrees)
+    if len(trees.mean) != 68:
+        raise ValueRangeError(f"{landmarks}: found a model of {len(trees.mean)} landmarks, expected the 68 of iBUG")
+    priors = load_priors(rig, prior, dynamics, fps)
+    return TrackModels(
+        trees,
+        None if appearance is None else _read("--appearance", appearance, AppearanceModel),
+        priors.shapes,
+        priors.dynamics,
+        priors.unlearned,
+        digest(*(_hash(name) for name in (landmarks, appearance))),
+        digest(*(_hash(name) for name in (prior, dynamics))),
+    )
+
+
+@dataclass(frozen=True)
+class FittedPriors:
+    """Priors for a rig's shapes and a video's frame rate, and the shapes that they say nothing of."""
+
+    shapes: ShapePrior | None
+    dynamics: DynamicsPrior | AdaptedDynamicsPrior | None
+    unlearned: tuple[str, ...]
+
+
+def load_priors(
+    rig: BlendshapeRig, prior: str | Path | None, dynamics: str | Path | None, fps: float | None = None
+) -> FittedPriors:
+    """Reads priors and brings them to a rig and a frame rate; see :func:`load_track_models`."""
+    shapes = None if prior is None else _read("--prior", prior, ShapePrior)
+    motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
+    silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
+    return FittedPriors(
+        None if shapes is None else _fitted(prior, lambda: shapes.renamed(rig.names)),
+        None if motion is None else _fitted(dynamics, lambda: adapt_dynamics(motion, rig.names, fps)),
+        tuple(name for name in rig.names if name in silent),
+    )
+
+
+def _fitted(name: str | Path | None, fit: Callable[[], Fitted]) -> Fitted:
+    """A prior brought to a rig's names and a video's rate; an error says which model it is of."""
+    try:
+        return fit()
+    except (NameMismatchError, ValueRangeError) as error:
+        raise type(error)(f"{name}: {error}") from error
+
+
+def _read(option: str, name: str | Path, kind: type[_Model]) -> _Model:
+    model = zoo.get_model(name)
+    if not isinstance(model, kind):
+        raise NameMismatchError(f"{option}: found {name}, a {type(model).__name__}, expected a {kind.__name__}")
+    return model
+
+
+def _hash(name: str | Path | None) -> str:
+    return "" if name is None else read_record(zoo.find(name)).sha256

@@ -1,0 +1,213 @@
+"""The solved face drawn over its video: a shaded mesh with the landmarks, or a new texture under the video's light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.capture.video.face_points import FacePoints
+from torchface.capture.video.lighting import PointLight, estimate_light
+from torchface.errors import ValueRangeError
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.io.images.transparent_images import load_paint
+from torchface.io.video import write_video
+from torchface.io.video.decoding import opencv
+from torchface.rendering.point_light import vertex_albedo
+from torchface.rendering.raycast import RayCaster
+from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces
+from torchface.workflows.track.track_result import Tracked
+
+CHUNK = 8
+_STRENGTH = 0.6
+_LIGHT_FRAMES = 2
+_EVEN_SKIN = (0.80, 0.62, 0.53)
+_SKIN = (0.62, 0.74, 0.90)
+_FOUND, _SOLVED = (60, 230, 60), (250, 70, 60)
+_LARGEST_SIDE = 480
+_SUBPIXEL = 4  # binary digits of OpenCV's drawing coordinates
+
+
+def write_overlay(
+    tracked: Tracked, path: Path, texture: Path | None, progress: Callable[[str, int, int], None] | None = None
+) -> None:
+    """Writes the overlay of a whole video; it appears when it is complete.
+
+    Args:
+        tracked: what was solved.
+        path: of the video to write.
+        texture: a picture to put on the face; without, the mesh is shown and the landmarks on it.
+        progress: told how far it is.
+    """
+    draw = mesh_drawer(tracked) if texture is None else paint_drawer(tracked, texture)
+
+    def drawn() -> Iterator[Tensor]:
+        at = 0
+        for chunk in tracked.video.color_chunks(CHUNK):
+            for frame in chunk[: len(tracked.frames) - at]:  # each frame has a surface of its own
+                yield draw(at, frame)[None]
+                at += 1
+                if progress is not None:
+                    progress("overlay", at, len(tracked.frames))
+
+    write_video(drawn(), path, tracked.video.fps)
+
+
+def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
+    """Draws frame number t, uint8 (3,H,W): the mesh half through, found landmarks green, the solved rig's red."""
+    solution, rig = tracked.solution, tracked.rig
+    weights = solution.weights.detach().to(rig.deltas)
+    points = FacePoints.of(rig, rig.neutral.landmarks)  # those of the contour slide, as the solver has them
+
+    def draw(t: int, frame: Tensor) -> Tensor:
+        if not tracked.seen[t]:
+            return frame
+        picture = undistorted(frame, tracked.calibration)
+        vertices = rig(weights[t : t + 1])[0].double()
+        camera = camera_at(tracked, t)
+        shaded = shade_over(picture, vertices, rig.neutral.faces, camera)
+        here = weights[t : t + 1].double()
+        rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
+        return with_dots(shaded, tracked.pinhole[t], camera.project(points.at(here)[0, rows]))
+
+    return draw
+
+
+def paint_drawer(tracked: Tracked, texture: Path) -> Callable[[int, Tensor], Tensor]:
+    """Draws frame number t, uint8 (3,H,W), with paint on the face, lit as the video is.
+
+    Raises:
+        FileFormatError: the texture cannot be read.
+        TopologyError: the rig has no texture coordinates.
+        AlignmentError: the video shows too little of the face to tell the light.
+    """
+    rig = tracked.rig
+    paint = FacePaint.of(rig.neutral, load_paint(texture))
+    light = video_light(tracked) if tracked.light is None else tracked.light
+    weights = tracked.solution.weights.detach().to(rig.deltas)
+
+    def draw(t: int, frame: Tensor) -> Tensor:
+        if not tracked.seen[t]:
+            return frame
+        vertices = rig(weights[t : t + 1])[0]
+        return overlay(frame, vertices, paint, light, camera_at(tracked, t), tracked.calibration)
+
+    return draw
+
+
+def video_light(tracked: Tracked) -> PointLight:
+    """The light of a video, from some frames spread over it, beside the rig's colours.
+
+    A rig without colours is taken to have skin of one colour: the light's direction is found all the same, its colour
+    then holds what the skin differs by.
+
+    Raises:
+        AlignmentError: the frames show too little of the face.
+    """
+    rig, found = tracked.rig, tracked.seen.nonzero()[:, 0]
+    wanted = found[torch.linspace(0, len(found) - 1, min(_LIGHT_FRAMES, len(found))).round().long()].tolist()
+    frames, at = [], 0
+    for chunk in tracked.video.color_chunks(CHUNK):
+        frames += [chunk[t - at] for t in wanted if at <= t < at + len(chunk)]
+        at += len(chunk)
+        if len(frames) == len(wanted):
+            break
+    try:
+        albedo = vertex_albedo(rig.neutral)
+    except ValueRangeError:
+        albedo = torch.tensor(_EVEN_SKIN).expand(len(rig.vertices), 3)
+    skin = torch.zeros(len(rig.vertices))
+    skin[rig.neutral.faces[skin_faces(rig.neutral)].flatten()] = 1.0
+    vertices = rig(tracked.solution.weights.detach()[wanted].to(rig.deltas))
+    cameras = [camera_at(tracked, t) for t in wanted]
+    picture = torch.stack(frames)
+    fit = estimate_light(picture, vertices, rig.neutral.faces, albedo, cameras, skin, tracked.calibration)
+    return fit.light
+
+
+def camera_at(tracked: Tracked, t: int) -> Camera:
+    """The camera of frame t, from the rig's space, without distortion."""
+    solution, film = tracked.solution, tracked.video
+    return Camera(
+        tracked.calibration.intrinsics.double(),
+        solution.rotation[t].detach().double(),
+        solution.translation[t].detach().double(),
+        film.width,
+        film.height,
+    )
+
+
+def undistorted(frame: Tensor, calibration: CameraCalibration) -> Tensor:
+    """What a camera without distortion would have seen, uint8 (3,H,W)."""
+    if not calibration.distortion.any():
+        return frame
+    cv2 = opencv()
+    picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    straight = cv2.undistort(picture, calibration.intrinsics.numpy(), calibration.distortion.numpy())
+    return torch.from_numpy(straight).permute(2, 0, 1)
+
+
+def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -> Tensor:
+    """A mesh (V,3) drawn half through over a frame, uint8 (3,H,W), lit from the lens."""
+    pixels = camera.project(vertices)
+    inside = torch.isfinite(pixels).all(1)
+    if not inside.any():
+        return frame
+    height, width = frame.shape[1:]
+    low = pixels[inside].amin(0).floor().clamp(min=0).long().tolist()
+    high = (pixels[inside].amax(0).ceil() + 1).long().tolist()
+    x0, y0, x1, y1 = low[0], low[1], min(high[0], width), min(high[1], height)
+    if x1 - x0 < 2 or y1 - y0 < 2:
+        return frame
+    # Large pictures are drawn at a part of their resolution: rays cost, and the mesh is shown half through anyway.
+    step = max(1, -(-max(x1 - x0, y1 - y0) // _LARGEST_SIDE))
+    part = _part_of(camera, x0, y0, x1, y1, step)
+    origins, ways = part.rays()
+    origins, ways = origins.reshape(-1, 3), ways.reshape(-1, 3)
+    hits = RayCaster(vertices, faces).cast(origins, ways)
+    seen = hits.triangle >= 0
+    normals = vertex_normals(vertices, faces)[faces[hits.triangle[seen]]]
+    normals = torch.nn.functional.normalize((normals * hits.barycentric[seen][..., None]).sum(1), dim=-1)
+    light = (normals * ways[seen]).sum(1).abs()
+    drawn = torch.zeros(len(ways), 4)
+    drawn[seen, :3] = ((0.15 + 0.85 * light)[:, None] * torch.tensor(_SKIN, dtype=torch.float64)).float()
+    drawn[seen, 3] = _STRENGTH
+    layer = drawn.view(part.height, part.width, 4).permute(2, 0, 1)[None]
+    if step > 1:
+        layer = torch.nn.functional.interpolate(layer, scale_factor=step, mode="bilinear", align_corners=False)
+    layer = layer[0, :, : y1 - y0, : x1 - x0]
+    picture = frame.float() / 255
+    under = picture[:, y0 : y0 + layer.shape[1], x0 : x0 + layer.shape[2]]
+    strength = layer[3:]
+    colors = layer[:3] / (strength / _STRENGTH).clamp(min=1e-6)
+    under.copy_(under * (1 - strength) + colors * strength)
+    return (255 * picture.clamp(0, 1)).round().to(torch.uint8)
+
+
+def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> Camera:
+    """A camera that sees a part of the picture at a part of its resolution."""
+    scale = torch.tensor([1 / step, 1 / step, 1.0], dtype=torch.float64)
+    shifted = camera.intrinsics.double().clone()
+    shifted[:2, 2] -= torch.tensor([x0, y0], dtype=torch.float64)
+    shrunk = scale[:, None] * shifted
+    shrunk[:2, 2] += (scale[:2] - 1) / 2  # the corner, not the centre of the first pixel, stays where it is
+    size = (-(-(x1 - x0) // step), -(-(y1 - y0) // step))
+    return Camera(shrunk, camera.rotation, camera.translation, *size)
+
+
+def with_dots(frame: Tensor, found: Tensor, solved: Tensor) -> Tensor:
+    """Landmarks on a frame, uint8 (3,H,W): found ones (L,2) green, the solved rig's (L,2) red."""
+    cv2 = opencv()
+    canvas = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    radius = max(1.0, 0.004 * max(frame.shape[1:]))
+    scale = 2**_SUBPIXEL
+    for points, color, size in ((solved, _SOLVED, 0.7 * radius), (found, _FOUND, radius)):
+        for x, y in (points[torch.isfinite(points).all(1)].double() * scale).round().long().tolist():
+            if abs(x) < 2**30 and abs(y) < 2**30:
+                cv2.circle(canvas, (x, y), round(size * scale), color, -1, cv2.LINE_AA, _SUBPIXEL)
+    return torch.from_numpy(canvas).permute(2, 0, 1)

@@ -1,0 +1,145 @@
+"""The report of a tracked video: what was found, frames with the solved face over them, curves, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.evaluation import weight_jitter
+from torchface.rendering.compositing import caption, sheet
+from torchface.viz.figures.curves import error_curve, weight_curves
+from torchface.viz.figures.helmet_motion import motion_curves
+from torchface.viz.reports.report_page import Section, Table, write_page
+from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.track.track_overlay import camera_at, mesh_drawer, paint_drawer
+from torchface.workflows.track.track_result import FEWEST_STABLE, Tracked
+
+SHOWN = 12
+_COLUMNS, _WIDTH = 4, 300
+_CURVES_A_PICTURE = 13
+_MARGIN = 0.6
+
+
+def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -> Path:
+    """Writes the report's page and pictures into a folder.
+
+    Args:
+        tracked: what came of the video.
+        out: the folder.
+        texture: what was put on the face, where something was.
+
+    Returns:
+        The page's path.
+    """
+    fps, solution = tracked.video.fps, tracked.solution
+    files = ", ".join(f"{name}: {path.name}" for name, path in tracked.products.items())
+    sections = [
+        Section("What was done", "; ".join(tracked.lines()) + f". Files: {files}."),
+        Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
+        Section(
+            "Frames",
+            "The solved face over the video; found landmarks are green, those of the solved rig red.",
+            pictures=[("frames.png", frames_sheet(tracked, mesh_drawer(tracked)))],
+        ),
+        Section(
+            "Reprojection error",
+            "Root mean square distance from the landmarks found to those of the solved rig, a frame; gaps are frames "
+            "without a face.",
+            pictures=[("error.png", error_curve(solution.errors.detach(), fps, "error (px)"))],
+        ),
+    ]
+    if texture is not None:
+        painted = ("painted.png", frames_sheet(tracked, paint_drawer(tracked, texture)))
+        text = f"{texture.name} on the face, in the light of the video."
+        sections.insert(3, Section("Texture", text, pictures=[painted]))
+    angles = torch.rad2deg(head_angles(solution.rotation.detach().double()))
+    moved = solution.translation.detach().double()
+    still = moved - moved.mean(0)
+    # Turns as the plot has them: about x, y and z.
+    head = motion_curves(still.float(), angles[:, [1, 0, 2]].float(), fps)
+    text = (
+        "Where the head is before the camera, about its mean place (x right, y down, z away from the camera), and how "
+        "it is turned: pitch about x, yaw about y, roll about z."
+    )
+    sections.append(Section("Head", text, pictures=[("head.png", head)]))
+    weights, names = solution.weights.detach(), tracked.rig.names
+    order = weights.amax(0).argsort(descending=True).tolist()
+    pictures = []
+    for number, first in enumerate(range(0, len(order), _CURVES_A_PICTURE)):
+        rows = order[first : first + _CURVES_A_PICTURE]
+        curve = weight_curves(weights[:, rows], None, [names[i] for i in rows], fps, len(rows))
+        pictures.append((f"weights{number + 1}.png", curve))
+    sections.append(Section("Weights", "Every shape's curve, the strongest first.", [_bounds(tracked)], pictures))
+    return write_page(out, f"Tracking of {tracked.video.path.name}", sections)
+
+
+def figures(tracked: Tracked) -> list[tuple[str, str]]:
+    """Names and numbers for a table."""
+    errors, count = tracked.solution.errors.detach(), len(tracked.frames)
+    seen, camera = tracked.seen, tracked.calibration
+    few = int((seen & (tracked.stable < FEWEST_STABLE)).sum())
+    weights = tracked.solution.weights.detach()
+    rows = [
+        ("frames", str(count)),
+        ("frames with a face", f"{100 * float(seen.float().mean()):.1f} %"),
+        ("frames with fewer than six stable landmarks", str(few)),
+        ("jitter of the landmarks", f"{tracked.jitter:.2f} px"),
+        ("jitter of the weights", f"{weight_jitter(weights):.4f}"),
+        ("reprojection error, median", f"{float(errors.nanmedian()):.2f} px"),
+        ("reprojection error, 95th percentile", f"{float(errors.nanquantile(0.95)):.2f} px"),
+        ("weights at 0", f"{100 * float((weights <= 1e-3).float().mean()):.0f} %"),
+        ("weights at 1", f"{100 * float((weights >= 1 - 1e-3).float().mean()):.1f} %"),
+        ("camera", "assumed" if camera.assumed else f"as given, {camera.error:.2f} px from what it was fitted to"),
+        ("focal length", f"{float(camera.intrinsics[0, 0]):.0f} px"),
+        ("faces in the first frame", str(tracked.faces)),
+    ]
+    rows += [(f"{name}, frames a second", f"{count / took:.0f}") for name, took in tracked.seconds.items() if took > 0]
+    return rows
+
+
+def frames_sheet(tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: int = SHOWN) -> Tensor:
+    """Frames spread over the video, cut to the face, as ``draw`` makes frame number t, (3,H,W)."""
+    count = len(tracked.frames)
+    wanted = torch.linspace(0, count - 1, min(most, count)).round().long().unique().tolist()
+    cells, at = [], 0
+    box = _face_box(tracked, wanted)
+    for chunk in tracked.video.color_chunks():
+        for t in [t for t in wanted if at <= t < at + len(chunk)]:
+            cells.append(caption(_cut(draw(t, chunk[t - at]).float() / 255, box), f"frame {t}", 12))
+        at += len(chunk)
+    return sheet(cells, min(_COLUMNS, len(cells)))
+
+
+def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
+    """A part of the picture, x0, y0, x1, y1, that holds the head in these frames."""
+    marks = tracked.rig.neutral.landmarks
+    weights = tracked.solution.weights.detach().to(tracked.rig.deltas)
+    pixels = torch.cat([camera_at(tracked, t).project(tracked.rig(weights[t : t + 1])[0, marks].double())
+                        for t in frames])  # fmt: skip
+    low, high = pixels.amin(0), pixels.amax(0)
+    room = _MARGIN * float((high - low).max())
+    film = tracked.video
+    x0, y0 = max(0, int(low[0] - room)), max(0, int(low[1] - room))
+    x1, y1 = min(film.width, int(high[0] + room) + 1), min(film.height, int(high[1] + room) + 1)
+    return (x0, y0, x1, y1) if x1 - x0 > 8 and y1 - y0 > 8 else (0, 0, film.width, film.height)
+
+
+def _cut(picture: Tensor, box: tuple[int, int, int, int]) -> Tensor:
+    x0, y0, x1, y1 = box
+    part = picture[:, y0:y1, x0:x1]
+    scale = _WIDTH / part.shape[2]
+    size = (max(1, round(part.shape[1] * scale)), _WIDTH)
+    return torch.nn.functional.interpolate(part[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+
+def _bounds(tracked: Tracked) -> Table:
+    share = tracked.bounds()
+    rows = [
+        (tracked.rig.names[i], f"{100 * float(share[i]):.0f} %")
+        for i in share.argsort(descending=True).tolist()
+        if share[i] > 0
+    ]
+    return Table(("at its bound of 1", "frames"), rows or [("none", "")])

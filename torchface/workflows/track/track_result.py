@@ -1,0 +1,127 @@
+"""What tracking a video gave, and what there is to say of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.capture.video import VideoSolution
+from torchface.capture.video.head_pose import STABLE_LANDMARKS, HeadPoses
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io.video import VideoFile
+from torchface.landmarks.images.tracking import landmark_jitter
+from torchface.rendering.point_light import PointLight
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.track_state import TrackedFrames
+
+FEWEST_STABLE = 6
+"""Stable landmarks that a pose needs."""
+_POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
+_AT_BOUND, _OFTEN, _MOST_NAMED = 1e-3, 0.2, 5
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What came of a video.
+
+    Args:
+        video: the file.
+        rig: the actor's.
+        frames: what the tracker saw.
+        pinhole: its landmarks as a camera without distortion has them, filtered along time, (T,68,2), pixels.
+        poses: of the head, from the stable landmarks.
+        solution: weights and refined poses.
+        calibration: of the camera.
+        faces: how many there are in the first frame.
+        reused: frames whose landmarks were known from an earlier run.
+        seconds: what each step took, by its name.
+        products: the files, by what they are.
+        unlearned: shapes that a prior says nothing of.
+        light: of the video, where a texture was put on the face.
+    """
+
+    video: VideoFile
+    rig: BlendshapeRig
+    frames: TrackedFrames
+    pinhole: Tensor
+    poses: HeadPoses
+    solution: VideoSolution
+    calibration: CameraCalibration
+    faces: int
+    reused: int
+    seconds: dict[str, float]
+    products: dict[str, Path]
+    unlearned: tuple[str, ...] = ()
+    light: PointLight | None = None
+
+    @property
+    def seen(self) -> Tensor:
+        """Frames in which the face was found, (T,) bool."""
+        return torch.isfinite(self.frames.landmarks).all(2).any(1)
+
+    @property
+    def stable(self) -> Tensor:
+        """How many stable landmarks each frame shows, (T,)."""
+        return torch.isfinite(self.frames.landmarks[:, list(STABLE_LANDMARKS)]).all(2).sum(1)
+
+    @property
+    def jitter(self) -> float:
+        """How much the landmarks tremble, pixels."""
+        return float(landmark_jitter(self.frames.landmarks))
+
+    def bounds(self) -> Tensor:
+        """The share of frames in which each weight is at 1, (N,)."""
+        return (self.solution.weights >= 1 - _AT_BOUND).float().mean(0)
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        count, seen = len(self.frames), int(self.seen.sum())
+        errors = torch.where(self.seen, self.solution.errors, torch.nan)
+        lines = [
+            f"{count} frames at {self.video.fps:g} a second, the face found in {seen} ({100 * seen / count:.1f} %)",
+            f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
+            f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
+        ]
+        if self.calibration.assumed:
+            lines.append(
+                f"camera: none given; assumed a field of view of {self.calibration.field_of_view:.0f} degrees "
+                f"(focal length {float(self.calibration.intrinsics[0, 0]):.0f} px), so distances are rough "
+                "(torchface calibrate measures it)"
+            )
+        else:
+            lines.append(f"camera: as given, {self.calibration.error:.2f} px from what it was fitted to")
+        if self.faces > 1:
+            lines.append(f"{self.faces} faces in the first frame; --face N picks another than the one followed")
+        few = int((self.seen & (self.stable < FEWEST_STABLE)).sum())
+        if few:
+            lines.append(
+                f"{few} frames show fewer than {FEWEST_STABLE} stable landmarks; their pose is that of other frames"
+            )
+        lost = count - seen
+        if lost:
+            lines.append(
+                f"{lost} frames without a face: they keep the face before, or with --whole-take lie between those "
+                "before and after; landmarks.csv says which (success 0)"
+            )
+        bounds = self.bounds()
+        often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
+        if often:
+            named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MOST_NAMED])
+            lines.append(f"often at their bound of 1: {named}")
+        span = (self.pinhole[:, 36] - self.pinhole[:, 45]).norm(dim=1).nanmedian()
+        if float(errors.nanmedian()) > _POOR * float(span):
+            lines.append(
+                f"the rig fits the landmarks poorly ({100 * float(errors.nanmedian() / span):.0f} % of the distance of "
+                "the eyes): is it this person's own?"
+            )
+        if self.unlearned:
+            lines.append(f"the priors have not learned {', '.join(self.unlearned)}: they hold these near rest")
+        if self.reused:
+            lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
+        lines.extend(
+            f"{name}: {took:.1f} s, {count / took:.0f} frames a second" for name, took in self.seconds.items() if took
+        )
+        return lines

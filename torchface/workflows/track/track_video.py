@@ -1,0 +1,311 @@
+"""From a video of a face and the actor's rig on disk to weights, animation, landmarks and an overlay on disk."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import torchface
+from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
+from torchface.capture.video.head_pose import HeadPoses, measure_poses, smooth_poses, track_pose
+from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
+from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.files.whole_files import write_file
+from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
+from torchface.geometry.cameras.distortion import undistort
+from torchface.io import load_rig
+from torchface.io.camera_files import load_calibration
+from torchface.io.images.transparent_images import load_paint
+from torchface.io.video import VideoFile, open_video
+from torchface.landmarks.images.face_box import find_faces
+from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.rendering.point_light import PointLight
+from torchface.rig import BlendshapeRig
+from torchface.workflows.track.track_files import (
+    OVERLAY,
+    SUMMARY,
+    keep_light,
+    keep_solution,
+    kept_light,
+    kept_solution,
+    summary,
+    write_curves,
+)
+from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
+from torchface.workflows.track.track_overlay import video_light, write_overlay
+from torchface.workflows.track.track_result import FEWEST_STABLE, Tracked
+from torchface.workflows.track.track_state import TrackedFrames, TrackState, digest, file_digest
+
+PIECE = 64
+"""Frames whose landmarks are kept at a time: what a killed run loses at most."""
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how many frames of it are done, and of how many."""
+
+_VERSION = torchface.__version__  # another one may track and solve differently
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How a video is tracked.
+
+    Args:
+        landmarks, appearance, prior, dynamics: models by name or folder.
+        camera: a calibration; a focal length is assumed without.
+        face: which of several, from 0, the largest first.
+        whole_take: poses from all frames, those after each too; weights as well where there is a dynamics prior.
+        part: keep this region of the rig only.
+        texture: a picture to put on the face in the overlay, in the rig's texture coordinates.
+        overlay: draw the overlay video.
+    """
+
+    landmarks: str | Path = DEFAULT_LANDMARKS
+    appearance: str | Path | None = None
+    prior: str | Path | None = None
+    dynamics: str | Path | None = None
+    camera: Path | None = None
+    face: int = 0
+    whole_take: bool = False
+    part: str | None = None
+    texture: Path | None = None
+    overlay: bool = True
+
+
+def track_video(
+    video: Path, rig: Path, out: Path, settings: TrackSettings = TrackSettings(), progress: Progress | None = None
+) -> Tracked:
+    """Tracks, solves and writes; see ``torchface track --help`` for the arguments.
+
+    A run killed at any moment leaves complete files only. Started again, it goes on behind the landmarks that it had,
+    and makes anew what depends on something that has changed.
+
+    Raises:
+        FileFormatError: the video cannot be decoded, changes its size or has a variable frame rate; or another file
+            is broken.
+        ValueRangeError: there is no face in the video, never six stable landmarks, the rig has no 68 landmarks, or
+            the take is too short for the dynamics prior.
+        NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
+    """
+    film = open_video(video)
+    film.check()
+    actor = load_actor(rig, settings.part)
+    calibration = camera_of(film, settings.camera)
+    models = load_track_models(
+        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, film.fps
+    )
+    check_length(film.count, models, film.path)
+    if settings.texture is not None:
+        check_texture(actor, settings.texture)
+    see_key = digest(_VERSION, file_digest(film.path), models.seeing, str(settings.face))
+    state = TrackState(out, see_key)
+    reused = state.done
+    seconds: dict[str, float] = {}
+    begin = time.perf_counter()
+    faces = _track(film, models, settings.face, state, progress)
+    if state.done > reused:
+        seconds["landmarks"] = time.perf_counter() - begin
+    frames = state.frames()
+    check_length(len(frames), models, film.path)
+    if not torch.isfinite(frames.landmarks).any():
+        state.clear()
+        raise ValueRangeError(f"{film.path}: found no face in any of its {len(frames)} frames, expected one")
+    begin = time.perf_counter()
+    steadied = smooth_landmarks if settings.whole_take else filter_landmarks
+    pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
+    poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, film.path)
+    seconds["pose"] = time.perf_counter() - begin
+    solver = solver_for(actor, models, calibration)
+    solve_key = digest(
+        see_key,
+        models.solving,
+        actor_digest(actor),
+        str(calibration.intrinsics.tolist()),
+        str(calibration.distortion.tolist()),
+        str(settings.whole_take),
+        str(solver.settings),
+    )
+    solution = kept_solution(state, solve_key, len(frames), len(actor.names))
+    if solution is None:
+        begin = time.perf_counter()
+        solution = _solve(solver, pinhole, poses, frames.confidence, settings.whole_take, progress)
+        seconds["weights"] = time.perf_counter() - begin
+        keep_solution(state, solve_key, solution)
+    products: dict[str, Path] = {}
+    tracked = Tracked(
+        film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
+    )
+    products |= write_curves(tracked, out)
+    if settings.overlay:
+        texture_key = "" if settings.texture is None else file_digest(settings.texture)
+        overlay_key = digest(solve_key, texture_key)
+        products["overlay"] = out / OVERLAY
+        if settings.texture is not None:
+            tracked = replace(tracked, light=_light(tracked, state, solve_key, progress))
+        if not state.is_current(out / OVERLAY, overlay_key):
+            begin = time.perf_counter()
+            write_overlay(tracked, out / OVERLAY, settings.texture, progress)
+            seconds["overlay"] = time.perf_counter() - begin
+            state.made(out / OVERLAY, overlay_key)
+    write_file(out / SUMMARY, json.dumps(summary(tracked), indent=1).encode())
+    return tracked
+
+
+def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
+    """The actor's rig, with its 68 landmarks.
+
+    Raises:
+        ValueRangeError: it has no such landmarks.
+        TorchfaceError: it cannot be read.
+    """
+    actor = load_rig(rig, part=part)
+    notes = actor.neutral.annotations
+    found = 0 if notes is None or notes.landmarks is None else len(notes.landmarks)
+    if found != 68:
+        what = "no landmark vertices" if found == 0 else f"{found} landmark vertices"
+        raise ValueRangeError(
+            f"{rig}: found {what}, expected the 68 of iBUG (torchface pick annotates them on the rig)"
+        )
+    return actor
+
+
+def camera_of(film: VideoFile, camera: Path | None) -> CameraCalibration:
+    """The video's camera: as calibrated, brought to its resolution, or assumed.
+
+    Raises:
+        FileFormatError: the calibration is broken.
+        ValueRangeError: it was made for another aspect.
+    """
+    if camera is None:
+        return assumed_calibration(film.width, film.height)
+    try:
+        return load_calibration(camera).resized(film.width, film.height)
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{camera}: {error}") from error
+
+
+def check_length(frames: int, models: TrackModels, path: Path) -> None:
+    """Raises a ``ValueRangeError`` where a take is too short for the dynamics prior's window."""
+    if models.dynamics is not None and frames <= models.dynamics.window:
+        raise ValueRangeError(
+            f"{path}: found {frames} frames, expected more than the {models.dynamics.window} that the dynamics prior "
+            "looks back"
+        )
+
+
+def check_texture(rig: BlendshapeRig, texture: Path) -> None:
+    """Raises where the rig cannot wear a texture, or the picture cannot be read."""
+    load_paint(texture)
+    if rig.neutral.uvs is None:
+        raise ValueRangeError(f"{texture}: found a rig without texture coordinates, expected some to put it on")
+
+
+def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration) -> VideoSolver:
+    """The solver of a rig, for landmarks that the models find."""
+    settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None)
+    return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
+
+
+def actor_digest(rig: BlendshapeRig) -> str:
+    """Changes where anything of a rig does that weights depend on."""
+    tensors = (rig.vertices, rig.deltas, rig.neutral.faces, rig.neutral.landmarks)
+    numbers = (tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors)
+    return digest(*(digest(data.hex()) for data in numbers), *rig.names)
+
+
+def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress | None) -> int:
+    """Landmarks of all frames into the state; how many faces the first frame shows."""
+    tracker = LandmarkTracker(models.trees, models.appearance, face=face)
+    kept, at, faces = state.done, 0, 0
+    last = state.frames()
+    for chunk in film.chunks(PIECE):
+        if at == 0:
+            faces = len(find_faces(chunk[0]))
+        if at >= kept:
+            if len(last):
+                # Each piece starts from the one before alone, so that a run that was killed gives the same landmarks.
+                tracker.resume(last.landmarks[-1], last.confidence[-1])
+            found = []
+            for number, frame in enumerate(chunk):  # a frame's box is the one before's
+                found.append(tracker.step(frame))
+                if progress is not None:
+                    progress("landmarks", at + number + 1, max(film.count, at + number + 1))
+            last = TrackedFrames(
+                torch.stack([one.landmarks for one in found]),
+                torch.stack([one.confidence for one in found]),
+                torch.stack([one.box for one in found]),
+            )
+            state.append(last)
+        at += len(chunk)
+        if progress is not None and at <= kept:
+            progress("landmarks", at, max(film.count, at))
+    return faces
+
+
+def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress | None) -> PointLight:
+    kept = kept_light(state, key)
+    if kept is not None:
+        return kept
+    if progress is not None:
+        progress("light", 0, 1)
+    begin = time.perf_counter()
+    found = video_light(tracked)
+    tracked.seconds["light"] = time.perf_counter() - begin
+    keep_light(state, key, found)
+    if progress is not None:
+        progress("light", 1, 1)
+    return found
+
+
+def _poses(
+    rig: BlendshapeRig,
+    landmarks: Tensor,
+    confidence: Tensor,
+    calibration: CameraCalibration,
+    whole_take: bool,
+    path: Path,
+) -> HeadPoses:
+    points, intrinsics = rig.vertices[rig.neutral.landmarks], calibration.intrinsics
+    try:
+        if whole_take:
+            return smooth_poses(measure_poses(points, landmarks, intrinsics, confidence))
+        return track_pose(points, landmarks, intrinsics, confidence)
+    except AlignmentError as error:
+        raise AlignmentError(f"{path}: {error}") from error
+
+
+def _solve(
+    solver: VideoSolver,
+    landmarks: Tensor,
+    poses: HeadPoses,
+    confidence: Tensor,
+    whole_take: bool,
+    progress: Progress | None,
+) -> VideoSolution:
+    rotation, translation = poses.rotation.to(landmarks), poses.translation.to(landmarks)
+    if whole_take and solver.dynamics is not None:
+        if progress is not None:
+            progress("weights", 0, len(landmarks))
+        return solve_whole_take(solver, landmarks, rotation, translation, confidence)
+    enough = torch.isfinite(landmarks).all(-1).sum(1) >= FEWEST_STABLE
+    first = int(enough.nonzero()[0, 0])
+    states, state = [], solver.start()
+    for t in range(first, len(landmarks)):  # a frame leans on the one before
+        state = solver.step(state, landmarks[t], rotation[t], translation[t], confidence[t])
+        states.append(state)
+        if progress is not None:
+            progress("weights", t + 1, len(landmarks))
+    states = [states[0]] * first + states
+    weights, turned, moved = (
+        torch.stack([getattr(one, name) for one in states]).detach().to(landmarks)
+        for name in ("weights", "rotation", "translation")
+    )
+    if whole_take:
+        weights = interpolated(weights, enough)
+    errors = solver.reprojection_errors(landmarks, weights, turned, moved)
+    return VideoSolution(weights, turned, moved, errors, enough)
