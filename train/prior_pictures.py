@@ -55,7 +55,7 @@ def curves_picture(prior: DynamicsPrior, take: Tensor) -> Figure:
     seconds = torch.arange(len(shown)) / prior.fps
     figure = _figure(11, 7)
     most = shown.std(0).argsort(descending=True)
-    groups = torch.tensor([prior.home[row] for row in most])
+    groups = torch.tensor([prior.group_index[row] for row in most])
     # One shape a region first, then whatever moves most.
     first = [int(most[(groups == g).nonzero()[0, 0]]) for g in groups.unique()]
     chosen = sorted(first, key=lambda row: -float(shown[:, row].std()))[:_SHOWN]

@@ -63,7 +63,7 @@ class Settings:
         pixel_noise: Of the landmarks in the trial solves, pixels.
         trial_frames: How many frames of each take are solved in a trial.
         inducing: How many windows stand for all others.
-        rounds: Of the ascent on the marginal likelihood.
+        iterations: Of the ascent on the marginal likelihood.
         seed: Draws made-up takes, windows and noise.
         licence: Under which the model may be used; MIT for the performer, else that of the takes, if absent.
         pictures: Folder for the pictures; OUT/pictures if absent.
@@ -87,7 +87,7 @@ class Settings:
     pixel_noise: float = 1.0
     trial_frames: int = 60
     inducing: int = 100
-    rounds: int = 50
+    iterations: int = 50
     seed: int = 0
     licence: str | None = None
     pictures: Path | None = None
@@ -200,7 +200,7 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
 def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[str], None]) -> dict[str, float]:
     """A dynamics prior; its window is chosen with the last of the takes to learn from, left out for that."""
     learn, test = material.learn, material.test
-    how = DynamicsSettings(inducing=settings.inducing, rounds=settings.rounds, seed=settings.seed)
+    how = DynamicsSettings(inducing=settings.inducing, iterations=settings.iterations, seed=settings.seed)
 
     def fitted(takes: PriorTakes, window: int) -> DynamicsPrior:
         return DynamicsPrior.fit(
@@ -353,7 +353,7 @@ def _save(
         flags = f"--takes {settings.takes.name}"
     standard = Settings()
     for name in ("rig", "attachment", "part", "fps", "held_out", "window", "input_noise", "strength", "bandwidth",
-                 "pixel_noise", "trial_frames", "inducing", "rounds"):  # fmt: skip
+                 "pixel_noise", "trial_frames", "inducing", "iterations"):  # fmt: skip
         value = getattr(settings, name)
         if value != getattr(standard, name):
             flags += f" --{name.replace('_', '-')} {value.name if isinstance(value, Path) else value}"

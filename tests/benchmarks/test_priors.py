@@ -77,7 +77,7 @@ def test_forms_of_the_dynamics(real_capture: Capture) -> None:
     print("\nroot mean square error and negative log likelihood a weight, takes 5 and 6 of six left out")
     for label, groups in forms.items():
         # So many processes would take minutes with as many inducing points each.
-        settings = DynamicsSettings(inducing=40, subset=400, rounds=15) if len(groups) > 10 else None
+        settings = DynamicsSettings(inducing=40, subset=400, iterations=15) if len(groups) > 10 else None
         prior, seconds = cpu_seconds(
             lambda groups=groups, settings=settings: DynamicsPrior.fit(  # type: ignore[misc]
                 takes[:4], names, 3, groups=groups, settings=settings

@@ -389,7 +389,7 @@ def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
     (shot,) = shots(faces, TEST, 1, 240, first=60)
     takes = [faces.takes[k] for k in range(len(faces.takes)) if k not in TEST]
     # As large as a prior that learned for longer, which is what counts here.
-    quickly = DynamicsSettings(subset=600, rounds=8)
+    quickly = DynamicsSettings(subset=600, iterations=8)
     dynamics = DynamicsPrior.fit(takes, faces.rig.names, input_noise=0.005, settings=quickly)
     solver = VideoSolver(shot.rig, None, K, ShapePrior.fit(takes, faces.rig.names), dynamics)
 

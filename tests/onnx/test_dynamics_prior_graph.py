@@ -24,7 +24,7 @@ def prior(request: pytest.FixtureRequest) -> DynamicsPrior:
         track = perform(240, torch.Generator().manual_seed(seed)).weights
         assert track is not None
         takes.append(track.values[..., 0])
-    settings = DynamicsSettings(inducing=30, subset=200, rounds=5)
+    settings = DynamicsSettings(inducing=30, subset=200, iterations=5)
     return DynamicsPrior.fit(takes, track.names, request.param, input_noise=0.01, settings=settings)
 
 

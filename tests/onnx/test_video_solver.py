@@ -45,7 +45,7 @@ def takes(rig: BlendshapeRig) -> list[Tensor]:
 
 @pytest.fixture(scope="module")
 def dynamics(takes: list[Tensor]) -> DynamicsPrior:
-    return DynamicsPrior.fit(takes, SEEN, 3, settings=DynamicsSettings(inducing=20, subset=100, rounds=2))
+    return DynamicsPrior.fit(takes, SEEN, 3, settings=DynamicsSettings(inducing=20, subset=100, iterations=2))
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     settings = Settings(
-        takes=folder, out=tmp_path / "own", held_out=1, window=3, inducing=20, rounds=3, strength=0.3, trial_frames=4
+        takes=folder,
+        out=tmp_path / "own",
+        held_out=1,
+        window=3,
+        inducing=20,
+        iterations=3,
+        strength=0.3,
+        trial_frames=4,
     )
     measured = train(settings, lines.append)
     assert set(measured) == {"own_shape", "own_dynamics"}
@@ -65,7 +72,7 @@ def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
 
 
 def test_the_window_is_chosen_and_the_rate_is_the_one_asked_for(folder: Path, tmp_path: Path) -> None:
-    settings = Settings(takes=folder, out=tmp_path / "own", kind="dynamics", fps=30.0, inducing=10, rounds=1)
+    settings = Settings(takes=folder, out=tmp_path / "own", kind="dynamics", fps=30.0, inducing=10, iterations=1)
     (found,) = train(settings).values()
     prior = zoo.get_model(tmp_path / "own")
     assert prior.fps == 30.0

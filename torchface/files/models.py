@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
+from torchface.files.state_renames import current_config
 from torchface.files.states import pack_state, read_state
 from torchface.files.whole_files import read_file, write_file
 
@@ -154,7 +155,7 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
         raise FileFormatError(f"{path}: found kind {record.kind!r}, expected {' or '.join(map(repr, sorted(kinds)))}")
     try:
         with torch.device("meta"):
-            model = kinds[record.kind].from_config(record.config)  # type: ignore[attr-defined]
+            model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
         expected: dict[str, Tensor] = model.state_dict()
     except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
         raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
@@ -162,7 +163,7 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
         raise FileFormatError(f"{path}: config cannot be used ({error})") from error
     if not state_path.is_file():
         raise FileFormatError(f"{state_path}: found no such file, expected the state of {path}")
-    state, data = read_state(state_path, expected, record.size)
+    state, data = read_state(state_path, expected, record.size, record.kind)
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
         raise FileFormatError(

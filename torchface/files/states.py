@@ -14,6 +14,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.state_renames import current_state_keys
 
 _LARGEST_HEADER = 2**20
 _TYPES = {
@@ -68,13 +69,16 @@ def pack_state(state: Mapping[str, Tensor], half: Collection[str] = ()) -> bytes
     return save(packed)
 
 
-def read_state(path: Path, expected: Mapping[str, Tensor], size: int) -> tuple[dict[str, Tensor], bytes]:
+def read_state(
+    path: Path, expected: Mapping[str, Tensor], size: int, kind: str = ""
+) -> tuple[dict[str, Tensor], bytes]:
     """A state in the shapes and types of ``expected``, and the bytes it came from.
 
     Args:
         path: of the file.
         expected: the module's own state; tensors on the meta device will do.
         size: how many bytes the file should have.
+        kind: of the model, for keys that were renamed; see ``state_renames``.
 
     Raises:
         FileFormatError: the file is cut off, is no safetensors file, holds other tensors than the module has, or NaN.
@@ -84,7 +88,9 @@ def read_state(path: Path, expected: Mapping[str, Tensor], size: int) -> tuple[d
         if found != size:
             raise FileFormatError(f"{path}: found {found} bytes, expected {size}: cut off, or of another model")
         with path.open("rb") as file:
-            _check(path, _header(path, file.read(min(size, 8 + _LARGEST_HEADER)), size), expected)
+            stored = _header(path, file.read(min(size, 8 + _LARGEST_HEADER)), size)
+            names = current_state_keys(kind, stored, expected)
+            _check(path, {names[key]: tensor for key, tensor in stored.items()}, expected)
             file.seek(0)
             data = file.read(size + 1)
     except OSError as error:
@@ -93,7 +99,7 @@ def read_state(path: Path, expected: Mapping[str, Tensor], size: int) -> tuple[d
         loaded = load(data)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise FileFormatError(f"{path}: no readable state ({error})") from error
-    state = {name: loaded[name].to(tensor.dtype) for name, tensor in expected.items()}
+    state = {names[key]: tensor.to(expected[names[key]].dtype) for key, tensor in loaded.items()}
     for name, tensor in state.items():
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise FileFormatError(f"{path}: found NaN or infinity in {name}, expected finite numbers")

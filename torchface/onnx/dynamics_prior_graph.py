@@ -50,13 +50,13 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
     build = GraphBuilder()
     op = build.op
     processes, noise = model.processes, model.noise
-    count, kinds = len(model.names), len(noise.own)
+    count, kinds = len(model.names), len(noise.own_coefficients)
     groups, _, inputs = processes.inducing.shape
     # The newest frame itself is the step's start.
     own = model.coefficients.clone()
     own[-1] += 1.0
-    scale = model.target_scale * model.trust[model.home]
-    members = torch.nn.functional.one_hot(model.home, groups).float().T
+    scale = model.target_scale * model.gain[model.group_index]
+    members = torch.nn.functional.one_hot(model.group_index, groups).float().T
     constants: dict[str, Tensor | float] = {
         "center": model.center,
         "to_motion": model.basis.T,
@@ -68,10 +68,10 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         "signal": processes.signal[:, None, None],
         "signal_row": processes.signal[:, None],
         "whitening": processes.whitening,
-        "spread": processes.spread,
+        "spread": processes.covariance_root,
         "weights": processes.weights * scale,
         "to_shapes": members * scale.square(),
-        "rest": noise.rest,
+        "rest": noise.rest_variance,
         "low": float(model.limits[0]),
         "high": float(model.limits[1]),
         "zero": 0.0,
@@ -105,10 +105,10 @@ def dynamics_model(model: DynamicsPrior, facts: Mapping[str, object] | None = No
         step = torch.zeros(1, model.window)
         step[0, -2:] = torch.tensor([-1.0, 1.0])
         build.constant("to_moving", torch.cat([model.basis.T[1:], step]))
-        build.constant("own_share", noise.own.flatten())
-        build.constant("shared_share", (noise.shared * noise.scale.square()).flatten())
+        build.constant("own_share", noise.own_coefficients.flatten())
+        build.constant("shared_share", (noise.group_coefficients * noise.scale.square()).flatten())
         build.constant("usual", noise.scale.square().flatten())
-        build.constant("around", torch.block_diag(*[noise.together.T] * kinds))
+        build.constant("around", torch.block_diag(*[noise.group_average.T] * kinds))
         build.constant("to_noise", torch.eye(count).repeat(kinds, 1))
         moving = op("Reshape", op("MatMul", "to_moving", "windows"), "moving_row")
         energy = op("Mul", moving, moving)

@@ -266,7 +266,7 @@ def _bells(prior: ShapePrior | None, shapes: int, like: Tensor) -> list[_Bell]:
         factor = density.factor.to(like)
         matrix = like.new_zeros(shapes, shapes)
         matrix[rows[:, None], rows] = factor @ factor.T
-        parts.append(_Bell(len(group), float(density.freedom), prior.strength, matrix))
+        parts.append(_Bell(len(group), float(density.degrees_of_freedom), prior.strength, matrix))
     return parts
 
 

@@ -18,14 +18,14 @@ from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, resampled, windows_of
 from torchface.capture.priors.dynamics_training import cross_validated, fitted_kernel, import_gpytorch
-from torchface.capture.priors.gaussian_process import Evidence, GaussianProcesses, Kernel, posterior, whitening_of
+from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.errors import FileFormatError, MissingExtraError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
 from torchface.synthetic.stages.weight_curves import perform
 
 NAMES = ("browInnerUp", "eyeBlinkLeft", "eyeLookInLeft", "jawOpen", "mouthPucker")
-QUICK = DynamicsSettings(inducing=40, subset=300, rounds=15)
+QUICK = DynamicsSettings(inducing=40, subset=300, iterations=15)
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -65,7 +65,7 @@ def test_a_process_with_all_points_is_scikit_learns() -> None:
     kernel = Kernel(0.7, 1 / lengths, 0.1)
     whitening = whitening_of(kernel, inputs)
     features = kernel.between(inputs, inputs) @ whitening
-    learned = posterior(kernel, inputs, whitening, Evidence(features.T @ features, features.T @ targets), 1.0)
+    learned = posterior(kernel, inputs, whitening, Statistics(features.T @ features, features.T @ targets), 1.0)
     mean, variance = GaussianProcesses.stacked([learned], [kernel])(new)
     kernels = ConstantKernel(0.7, "fixed") * RBF(lengths.numpy(), "fixed") + WhiteKernel(0.1, "fixed")
     theirs = GaussianProcessRegressor(kernels, optimizer=None).fit(inputs.numpy(), targets.numpy())
@@ -83,8 +83,8 @@ def test_inducing_points_come_near_the_whole_process() -> None:
     for points in (inputs[:80], inputs):
         whitening = whitening_of(kernel, points)
         features = kernel.between(inputs, points) @ whitening
-        evidence = Evidence(features.T @ features, features.T @ targets)
-        learned = posterior(kernel, points, whitening, evidence, 1.0)
+        statistics = Statistics(features.T @ features, features.T @ targets)
+        learned = posterior(kernel, points, whitening, statistics, 1.0)
         found.append(GaussianProcesses.stacked([learned], [kernel])(new))
     np.testing.assert_allclose(found[0][0].numpy(), found[1][0].numpy(), atol=0.02)
     assert float((found[0][0] - torch.sin(new.sum(1, keepdim=True))).abs().mean()) < 0.05
@@ -104,9 +104,9 @@ def test_hyperparameters_come_back() -> None:
 def test_a_process_that_tells_nothing_is_not_trusted() -> None:
     inputs, noise = [normal(200, 3, seed=i) for i in range(3)], [normal(200, 2, seed=5 + i) for i in range(3)]
     kernel = Kernel(1.0, torch.full((3,), 2.0).double(), 0.1)
-    assert cross_validated(kernel, inputs[0][:50], inputs, noise, 1.0).trust < 0.1
+    assert cross_validated(kernel, inputs[0][:50], inputs, noise, 1.0).gain < 0.1
     told = [torch.sin(2 * part[:, :2]) for part in inputs]
-    assert cross_validated(kernel, inputs[0][:50], inputs, told, 1.0).trust > 0.8
+    assert cross_validated(kernel, inputs[0][:50], inputs, told, 1.0).gain > 0.8
 
 
 def test_planted_motion_is_recovered(swinging: DynamicsPrior) -> None:
@@ -192,7 +192,7 @@ def test_real_takes_are_predicted_better_than_by_a_line(performances: list[Path]
     tracks = [load_take(path).weights for path in performances]
     takes = [track.values[..., 0] for track in tracks if track is not None]
     assert tracks[0] is not None
-    settings = DynamicsSettings(inducing=30, subset=300, rounds=8)
+    settings = DynamicsSettings(inducing=30, subset=300, iterations=8)
     prior = DynamicsPrior.fit(takes[:4], tracks[0].names, 3, settings=settings)
     windows, following = (torch.cat(parts) for parts in zip(*(windows_of(take, 3) for take in takes[4:]), strict=True))
     mean, variance = prior(windows)

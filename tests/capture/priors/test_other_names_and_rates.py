@@ -49,7 +49,9 @@ def test_a_student_density_in_other_names_is_scipys() -> None:
     spread = spread_of(density.factor, SPLIT, ("jawOpen", "eyeBlink_L", "cheekPuff"))
     points = samples(6, seed=3) @ mapping(NAMES, SPLIT).double().T
     points[3:, 1] += 0.01
-    wanted = multivariate_t(torch.zeros(5).numpy(), spread.numpy(), df=float(density.freedom)).logpdf(points.numpy())
+    wanted = multivariate_t(torch.zeros(5).numpy(), spread.numpy(), df=float(density.degrees_of_freedom)).logpdf(
+        points.numpy()
+    )
     torch.testing.assert_close(renamed.log_density(points), torch.from_numpy(wanted), rtol=1e-4, atol=1e-3)
     assert prior.renamed(NAMES) is prior
     assert renamed.config["strength"] == prior.strength
@@ -65,7 +67,7 @@ def test_a_mixture_in_other_names_is_scipys_group_by_group() -> None:
         assert isinstance(density, GaussianMixture)
         back = mapping([NAMES[i] for i in learned], [SPLIT[i] for i in group]).double()
         parts = []
-        for mean, factor, share in zip(density.means, density.factors, density.log_shares, strict=True):
+        for mean, factor, share in zip(density.means, density.factors, density.log_mixing_weights, strict=True):
             covariance = back @ torch.linalg.inv(factor.double() @ factor.double().T) @ back.T
             halves = torch.tensor([SPLIT[i].startswith("browInnerUp") for i in group]).double()
             covariance = covariance + PARTING_VARIANCE * torch.diag(halves)
@@ -105,7 +107,7 @@ def learned() -> DynamicsPrior:
         assert track is not None
         takes.append(track.values[..., 0])
         names = track.names
-    settings = DynamicsSettings(inducing=40, subset=300, rounds=15)
+    settings = DynamicsSettings(inducing=40, subset=300, iterations=15)
     return DynamicsPrior.fit(takes, names, 3, settings=settings, input_noise=0.005)
 
 

@@ -62,7 +62,7 @@ def test_heavy_tails_are_scipys() -> None:
     shape = torch.tensor([[0.04, 0.03, 0.0], [0.03, 0.05, 0.01], [0.0, 0.01, 0.02]], dtype=torch.float64)
     true = multivariate_t(shape=shape.numpy(), df=5.0, seed=1)
     x = torch.from_numpy(true.rvs(20_000))
-    density = StudentDensity.fit(x, freedom=5.0, floor=1e-9)
+    density = StudentDensity.fit(x, degrees_of_freedom=5.0, floor=1e-9)
     found = torch.linalg.inv(density.factor.double() @ density.factor.double().T)
     torch.testing.assert_close(found, shape, rtol=0.05, atol=1e-3)
     ours = density.double().log_density(x[:50])
@@ -77,7 +77,7 @@ def test_heavy_tails_are_scipys() -> None:
 def density(request: pytest.FixtureRequest) -> ParzenDensity | GaussianMixture | StudentDensity:
     x = clusters()
     if request.param == "student":
-        return StudentDensity.fit(x, freedom=4.0)
+        return StudentDensity.fit(x, degrees_of_freedom=4.0)
     return ParzenDensity.fit(x) if request.param == "parzen" else GaussianMixture.fit(x, 3)
 
 

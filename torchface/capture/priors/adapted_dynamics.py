@@ -15,11 +15,11 @@ from torchface.capture.priors.learned_names import name_matrices, require_same_n
 from torchface.capture.priors.motion_features import newest_frames, same_rate
 from torchface.errors import FileFormatError, ValueRangeError
 
-_LARGEST_RATIO = 8.0
+_MAX_RATIO = 8.0
 
 
 class AdaptedDynamicsPrior(nn.Module):
-    r"""Where weights will be in the next frame of a rig's or a video's own kind.
+    r"""Mean and variance of the next frame, for another rig's names and another frame rate.
 
     A window is translated into the learned names, interpolated at the learned frame rate and carried forward by as
     many learned steps as a frame lasts; a last part of a step moves the mean by a part. The predicted change comes back
@@ -50,10 +50,10 @@ class AdaptedDynamicsPrior(nn.Module):
     def __init__(self, learned: DynamicsPrior, names: Sequence[str], fps: float) -> None:
         super().__init__()
         ratio = learned.fps / fps if fps > 0 else math.inf
-        if not 1 / _LARGEST_RATIO <= ratio <= _LARGEST_RATIO:
+        if not 1 / _MAX_RATIO <= ratio <= _MAX_RATIO:
             raise ValueRangeError(
-                f"dynamics prior: found {fps:g} frames a second, expected from {learned.fps / _LARGEST_RATIO:g} to "
-                f"{learned.fps * _LARGEST_RATIO:g} for a prior learned at {learned.fps:g}"
+                f"dynamics prior: found {fps:g} frames a second, expected from {learned.fps / _MAX_RATIO:g} to "
+                f"{learned.fps * _MAX_RATIO:g} for a prior learned at {learned.fps:g}"
             )
         if same_rate(learned.fps, fps):
             ratio = 1.0
@@ -87,15 +87,15 @@ class AdaptedDynamicsPrior(nn.Module):
             ShapeError: fewer frames than the window, or another number of shapes.
         """
         windows = newest_frames(windows, self.window, len(self.names))
-        known = torch.einsum("kj,bjn,ln->bkl", self.interpolation, windows, self.to_learned)
-        last = before = known[:, -1]
+        frames = torch.einsum("kj,bjn,ln->bkl", self.interpolation, windows, self.to_learned)
+        last = before = frames[:, -1]
         variances: list[Tensor] = []
         for _ in range(self.steps):  # a step starts from the one before
-            before = known[:, -1]
-            mean, variance = self.learned(known)
-            known = torch.cat([known[:, 1:], mean[:, None]], dim=1)
+            before = frames[:, -1]
+            mean, variance = self.learned(frames)
+            frames = torch.cat([frames[:, 1:], mean[:, None]], dim=1)
             variances.append(variance)
-        mean = torch.lerp(before, known[:, -1], self.last_part)
+        mean = torch.lerp(before, frames[:, -1], self.last_part)
         deviation = _carried(variances, _growth(self.learned.coefficients, self.steps))
         ahead = windows[:, -1] + (mean - last) @ self.from_learned.T
         # The halves of a shape err together, so deviations add up and not variances.

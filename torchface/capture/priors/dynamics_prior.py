@@ -1,4 +1,4 @@
-"""How weights go on: Gaussian processes from the last frames to the next, as an energy for the solvers."""
+"""The dynamics prior: Gaussian processes from the last frames to the next, as an energy for the solvers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchface.capture.priors.motion_features import motion_basis, moving_parts,
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
-_LARGEST = 2**26
-_LONGEST = 120
+_MAX_NUMBERS = 2**26
+_MAX_WINDOW = 120
 
 
 @dataclass(frozen=True)
@@ -26,36 +26,36 @@ class DynamicsSettings:
     """How a dynamics prior learns.
 
     Args:
-        inducing: M, how many windows stand for all others.
+        inducing: M, number of inducing points.
         subset: how many windows the kernels' hyperparameters are learned from.
-        rounds: of gradient ascent on the bound of the marginal likelihood.
-        memory: seconds of a take that tell as much as a single independent frame: frames repeat each other, and a
-            process that counts each of them trusts what one take happened to show too much.
-        floor: the least standard deviation that is predicted, in weights.
+        iterations: of gradient ascent on the bound of the marginal likelihood.
+        correlation_time: seconds of a take that count as a single independent frame: neighbouring frames are
+            correlated, and a process that counts each of them overfits the takes.
+        floor: minimum of the predicted standard deviation, in weights.
         seed: draws windows and noise.
     """
 
     inducing: int = 100
     subset: int = 1500
-    rounds: int = 50
-    memory: float = 0.5
+    iterations: int = 50
+    correlation_time: float = 0.5
     floor: float = 1e-3
     seed: int = 0
 
     def __post_init__(self) -> None:
-        counts = min(self.inducing, self.subset, self.rounds)
-        if counts < 1 or not 0 < self.memory < math.inf or not 0 < self.floor < math.inf:
+        counts = min(self.inducing, self.subset, self.iterations)
+        if counts < 1 or not 0 < self.correlation_time < math.inf or not 0 < self.floor < math.inf:
             raise ValueRangeError(f"dynamics settings: found {self}, expected positive numbers")
 
 
 class DynamicsPrior(nn.Module):
-    r"""Where weights will be in the next frame, and how surely.
+    r"""Mean and variance of the next frame's weights.
 
     .. math:: w_{n+1} = w_n + A x + s \, f_g(x) + \varepsilon(x), \qquad f_g \sim GP(0, k_g)
 
-    for a window x of the last J frames. Each shape goes on by its own last steps (A is diagonal in the shapes, and a
-    window that rests goes on resting); the processes, one for each group of shapes, add what depends on the other
-    shapes of the group and on the pose; the noise grows with how much the window moves. The mean stays within the
+    for a window x of the last J frames. A is an autoregression of each shape on its own (diagonal in the shapes, and
+    a window at rest stays at rest); the processes, one for each group of shapes, add what depends on the other shapes
+    of the group and on the pose; the noise variance grows with the motion in the window. The mean stays within the
     range of weights.
 
     ``prior(windows)`` gives mean and variance; :meth:`energy` the quadratic for a solver.
@@ -70,8 +70,8 @@ class DynamicsPrior(nn.Module):
         coefficients: A, (J,N).
         feature_scale: usual sizes of place, slope and curvature, (O,N).
         target_scale: s, (N,).
-        trust: by what the mean of each process is multiplied, (G,).
-        limits: least and largest weight, (2,).
+        gain: by what the mean of each process is multiplied, (G,).
+        limits: smallest and largest weight, (2,).
         fps: frames a second of the takes.
         input_noise: standard deviation of the weights in the windows that it has learned from; 0 for true ones.
 
@@ -88,10 +88,10 @@ class DynamicsPrior(nn.Module):
     coefficients: Tensor
     feature_scale: Tensor
     target_scale: Tensor
-    trust: Tensor
+    gain: Tensor
     limits: Tensor
     basis: Tensor
-    home: Tensor
+    group_index: Tensor
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class DynamicsPrior(nn.Module):
         coefficients: Tensor,
         feature_scale: Tensor,
         target_scale: Tensor,
-        trust: Tensor,
+        gain: Tensor,
         limits: Tensor,
         fps: float,
         input_noise: float = 0.0,
@@ -120,7 +120,7 @@ class DynamicsPrior(nn.Module):
             "coefficients": (coefficients, (window, count)),
             "feature_scale": (feature_scale, (basis.shape[1], count)),
             "target_scale": (target_scale, (count,)),
-            "trust": (trust, (len(groups),)),
+            "gain": (gain, (len(groups),)),
             "limits": (limits, (2,)),
         }
         for name, (value, shape) in shapes.items():
@@ -131,10 +131,10 @@ class DynamicsPrior(nn.Module):
         self.groups = tuple(tuple(group) for group in groups)
         self.input_noise = float(input_noise)
         self.processes, self.noise = processes, noise
-        places = {row: i for i, group in enumerate(self.groups) for row in group}
-        home = torch.tensor([places[row] for row in range(count)], dtype=torch.int64, device="cpu")
+        index = {row: i for i, group in enumerate(self.groups) for row in group}
+        group_index = torch.tensor([index[row] for row in range(count)], dtype=torch.int64, device="cpu")
         self.register_buffer("basis", basis, persistent=False)
-        self.register_buffer("home", home, persistent=False)
+        self.register_buffer("group_index", group_index, persistent=False)
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next frame.
@@ -150,11 +150,11 @@ class DynamicsPrior(nn.Module):
         """
         windows = newest_frames(windows, self.window, len(self.names))
         motion = torch.einsum("bjn,jo->bon", windows - self.center, self.basis)
-        told, own = self.processes((motion / self.feature_scale).flatten(1))
+        process_mean, process_variance = self.processes((motion / self.feature_scale).flatten(1))
         steps = (windows * self.coefficients).sum(1)
-        scale = self.target_scale * self.trust[self.home]
-        mean = windows[:, -1] + steps + scale * told
-        variance = scale.square() * own[:, self.home] + self.noise(moving_parts(windows, motion))
+        scale = self.target_scale * self.gain[self.group_index]
+        mean = windows[:, -1] + steps + scale * process_mean
+        variance = scale.square() * process_variance[:, self.group_index] + self.noise(moving_parts(windows, motion))
         return mean.clamp(self.limits[0], self.limits[1]), variance
 
     def energy(self, windows: Tensor) -> Quadratic:
@@ -205,10 +205,10 @@ class DynamicsPrior(nn.Module):
         except (KeyError, TypeError, ValueError) as error:
             raise FileFormatError(f"dynamics prior: found a config without a usable {error}, expected one") from error
         n, orders, g = len(names), min(window, 3), len(groups)
-        if not 0 < fps < math.inf or window > _LONGEST or g * points * max(orders * n, points, n) > _LARGEST:
+        if not 0 < fps < math.inf or window > _MAX_WINDOW or g * points * max(orders * n, points, n) > _MAX_NUMBERS:
             raise FileFormatError(
                 f"dynamics prior: found {n} shapes in {g} groups, a window of {window} frames at {fps} a second and "
-                f"{points} inducing points, expected a window of {_LONGEST} and {_LARGEST} numbers at most"
+                f"{points} inducing points, expected a window of {_MAX_WINDOW} and {_MAX_NUMBERS} numbers at most"
             )
         inputs = orders * n
         processes = GaussianProcesses(
@@ -219,8 +219,8 @@ class DynamicsPrior(nn.Module):
             torch.zeros(g, points, points),
             torch.zeros(g, points, n),
         )
-        shares = torch.ones(0 if window == 1 else min(window, 3), n)
-        noise = MotionNoise(torch.ones(n), shares, shares.clone(), shares.clone(), torch.zeros(n, n))
+        coefficients = torch.ones(0 if window == 1 else min(window, 3), n)
+        noise = MotionNoise(torch.ones(n), coefficients, coefficients.clone(), coefficients.clone(), torch.zeros(n, n))
         return cls(
             names,
             window,
@@ -231,7 +231,7 @@ class DynamicsPrior(nn.Module):
             coefficients=torch.zeros(window, n),
             feature_scale=torch.ones(orders, n),
             target_scale=torch.ones(n),
-            trust=torch.ones(g),
+            gain=torch.ones(g),
             limits=torch.zeros(2),
             fps=fps,
             input_noise=input_noise,
@@ -243,12 +243,17 @@ class DynamicsPrior(nn.Module):
         Raises:
             ValueRangeError: a scale or variance that must be positive is not.
         """
-        positive = {"feature_scale": self.feature_scale, "noise.rest": self.noise.rest, "noise.scale": self.noise.scale}
+        noise = self.noise
+        positive = {
+            "feature_scale": self.feature_scale,
+            "noise.rest_variance": noise.rest_variance,
+            "noise.scale": noise.scale,
+        }
         for name, value in positive.items():
             if not bool((value > 0).all()):
                 raise ValueRangeError(f"dynamics prior: found {name} that is not positive, expected all to be")
-        if bool((self.noise.own < 0).any()) or bool((self.noise.shared < 0).any()):
-            raise ValueRangeError("dynamics prior: found negative shares of noise, expected none")
+        if bool((noise.own_coefficients < 0).any()) or bool((noise.group_coefficients < 0).any()):
+            raise ValueRangeError("dynamics prior: found negative coefficients of the noise, expected none")
 
 
 def _whole(config: Mapping[str, Any], name: str) -> int:

@@ -1,4 +1,4 @@
-"""Learning how weights go on: hyperparameters by gpytorch, the rest in closed form on takes left out in turn."""
+"""Training of the dynamics prior: hyperparameters by gpytorch, the rest in closed form on takes left out in turn."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
 from torchface.capture.priors.gaussian_process import (
-    Evidence,
     GaussianProcesses,
     Kernel,
     Posterior,
+    Statistics,
     posterior,
     whitening_of,
 )
@@ -26,10 +26,10 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.extra_packages import import_extra
 
 _FOLDS = 4  # of a single take
-_STEP = 0.1  # of Adam
+_LEARNING_RATE = 0.1
 _RIDGE = 1e-6  # of the coefficients, in squared weights
-_COMMON = 0.02  # how much of what is common to the shapes each one's own coefficients are learned with
-_SMALLEST = 1e-3  # a usual size below which a shape counts as one that never moves
+_POOLING = 0.02  # weight of the coefficients that all shapes share against each one's own
+_MIN_SCALE = 1e-3  # a standard deviation below which a shape counts as one that never moves
 
 
 def import_gpytorch() -> Any:
@@ -54,7 +54,7 @@ class _Part:
     following: Tensor
 
     def steps(self, coefficients: Tensor) -> Tensor:
-        """What the shapes' own frames do not tell of the step to the next frame, (B,N)."""
+        """The step to the next frame less what the shapes' own frames predict, (B,N)."""
         return self.following - self.windows[:, -1] - (self.windows * coefficients).sum(1)
 
 
@@ -69,11 +69,10 @@ def fit_dynamics_prior(
     settings: DynamicsSettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DynamicsPrior:
-    """Learns from takes; what cannot be known from a take itself is judged on takes left out in turn.
+    """Learns from takes, with cross-validation over takes that are left out in turn.
 
-    The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). How far the
-    processes are trusted, and the noise, are such that takes that were left out are predicted best; of a single
-    take its quarters are left out.
+    The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). The gain of
+    the processes and the noise are those that predict left-out takes best; of a single take its quarters are left out.
 
     Args:
         takes: weights of each take, (T,N), all at one frame rate (see ``resampled``); windows with a NaN are left
@@ -83,9 +82,9 @@ def fit_dynamics_prior(
         fps: frames a second of the takes.
         groups: :func:`face_regions` if absent.
         input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
-            for windows of solved weights should expect as much noise as these have, or it locks their errors in.
+            for windows of solved weights should expect as much noise as these have, or it keeps their errors.
         settings: of the learning.
-        progress: told what is being done.
+        progress: called with what is being done.
 
     Raises:
         ShapeError: no takes, of another number of shapes, or too short for the window.
@@ -96,7 +95,7 @@ def fit_dynamics_prior(
     """
     names, settings = tuple(names), settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
-    say = progress or (lambda line: None)
+    report = progress or (lambda line: None)
     import_gpytorch()
     _check(takes, names, window, fps, input_noise)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -105,9 +104,9 @@ def fit_dynamics_prior(
     center = frames.mean(0)
     basis = motion_basis(window)
     motions = [torch.einsum("bjn,jo->bon", part.windows - center, basis) for part in parts]
-    feature_scale = torch.cat(motions).std(0).clamp(min=_SMALLEST)
-    coefficients, left_out = _own_coefficients(parts)
-    target_scale = torch.cat([part.steps(coefficients) for part in parts]).std(0).clamp(min=_SMALLEST)
+    feature_scale = torch.cat(motions).std(0).clamp(min=_MIN_SCALE)
+    coefficients, left_out = _autoregression(parts)
+    target_scale = torch.cat([part.steps(coefficients) for part in parts]).std(0).clamp(min=_MIN_SCALE)
     steps = torch.cat([part.steps(coefficients) for part in parts]) / target_scale
     unseen = [part.steps(own) / target_scale for part, own in zip(parts, left_out, strict=True)]
     inputs = [(motion / feature_scale).flatten(1) for motion in motions]
@@ -117,26 +116,28 @@ def fit_dynamics_prior(
     kernels: list[Kernel] = []
     chosen: list[CrossValidated] = []
     for number, group in enumerate(regions):
-        say(f"process {number + 1} of {len(regions)}")
-        looked_at = torch.zeros_like(feature_scale)
-        looked_at[:, list(group)] = 1.0
+        report(f"process {number + 1} of {len(regions)}")
+        active = torch.zeros_like(feature_scale)
+        active[:, list(group)] = 1.0
         kernels.append(
-            fitted_kernel(everything[some], steps[some][:, list(group)], inducing, looked_at, settings.rounds)
+            fitted_kernel(everything[some], steps[some][:, list(group)], inducing, active, settings.iterations)
         )
         targets = [part[:, list(group)] for part in unseen]
-        chosen.append(cross_validated(kernels[-1], inducing, inputs, targets, max(settings.memory * fps, 1.0)))
-    say("noise")
-    told, known = torch.zeros_like(steps), torch.zeros_like(steps)
+        chosen.append(
+            cross_validated(kernels[-1], inducing, inputs, targets, max(settings.correlation_time * fps, 1.0))
+        )
+    report("noise")
+    process_mean, process_variance = torch.zeros_like(steps), torch.zeros_like(steps)
     weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in regions]
     for group, one, row in zip(regions, chosen, weights, strict=True):
-        told[:, list(group)], known[:, list(group)] = one.mean, one.variance[:, None]
+        process_mean[:, list(group)], process_variance[:, list(group)] = one.mean, one.variance[:, None]
         row[:, list(group)] = one.posterior.weights
     moving = torch.cat([moving_parts(part.windows, motion) for part, motion in zip(parts, motions, strict=True)])
     noise = MotionNoise.fit(
         moving,
-        (torch.cat(unseen) - told) * target_scale,
-        known * target_scale.square(),
-        moving.square().mean(0).sqrt().clamp(min=_SMALLEST),
+        (torch.cat(unseen) - process_mean) * target_scale,
+        process_variance * target_scale.square(),
+        moving.square().mean(0).sqrt().clamp(min=_MIN_SCALE),
         regions,
         settings.floor,
     )
@@ -153,7 +154,7 @@ def fit_dynamics_prior(
             coefficients=coefficients,
             feature_scale=feature_scale,
             target_scale=target_scale,
-            trust=torch.tensor([one.trust for one in chosen], dtype=torch.float64),
+            gain=torch.tensor([one.gain for one in chosen], dtype=torch.float64),
             limits=torch.stack([frames.min().clamp(max=0.0), frames.max().clamp(min=1.0)]),
             fps=fps,
             input_noise=input_noise,
@@ -163,7 +164,7 @@ def fit_dynamics_prior(
     )
 
 
-def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, looked_at: Tensor, rounds: int) -> Kernel:
+def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Tensor, iterations: int) -> Kernel:
     """Hyperparameters that maximise the bound of the marginal likelihood with inducing points, all targets together.
 
     One length for places, one for slopes, one for curvatures; by Adam on what gpytorch makes of them so that they stay
@@ -173,15 +174,15 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, looked_at: 
         inputs: (B,O·N), scaled.
         targets: (B,n), scaled.
         inducing: (M,O·N).
-        looked_at: 1 for inputs that the kernel looks at, else 0, (O,N).
-        rounds: of Adam.
+        active: 1 for inputs that the kernel uses, else 0, (O,N).
+        iterations: of Adam.
 
     Source: Titsias 2009.
     """
     gpytorch = import_gpytorch()
     from linear_operator.utils.warnings import NumericalWarning
 
-    columns = [looked_at[order].nonzero()[:, 0] + order * looked_at.shape[1] for order in range(len(looked_at))]
+    columns = [active[order].nonzero()[:, 0] + order * active.shape[1] for order in range(len(active))]
     used = torch.cat(columns)
     sizes = torch.tensor([len(column) for column in columns]).cumsum(0).tolist()
     product = None
@@ -195,10 +196,10 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, looked_at: 
     likelihood.noise = 0.7
     points = gpytorch.kernels.InducingPointKernel(scaled, inducing[:, used].clone(), likelihood).double().train()
     points.inducing_points.requires_grad_(False)
-    optimizer = torch.optim.Adam(points.parameters(), lr=_STEP)
+    optimizer = torch.optim.Adam(points.parameters(), lr=_LEARNING_RATE)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)  # of the jitter that inducing points close by need
-        for _ in range(rounds):  # each step needs the one before
+        for _ in range(iterations):  # each step needs the one before
             optimizer.zero_grad()
             covariance = points(inputs[:, used]).evaluate_kernel().add_diagonal(likelihood.noise.expand(len(inputs)))
             fit, volume = covariance.inv_quad_logdet(targets, logdet=True)
@@ -207,23 +208,23 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, looked_at: 
             loss.backward()
             optimizer.step()
     lengths = [one.lengthscale.item() for one in scaled.base_kernel.modules() if hasattr(one, "raw_lengthscale")]
-    inverse = looked_at / torch.tensor(lengths, dtype=looked_at.dtype)[:, None]
+    inverse = active / torch.tensor(lengths, dtype=active.dtype)[:, None]
     return Kernel(scaled.outputscale.item(), inverse.flatten(), likelihood.noise.item())
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidated:
-    """A process learned from all parts, and what it tells of each part when learned from the others.
+    """A process learned from all parts, and its predictions of each part when learned from the others.
 
     Args:
         posterior: of all parts.
-        trust: by what its mean is multiplied, in [0,1].
-        mean: of the parts left out, trust included, (B,n).
+        gain: by what its mean is multiplied, in [0,1].
+        mean: of the parts left out, gain included, (B,n).
         variance: of the same, without noise, (B,).
     """
 
     posterior: Posterior
-    trust: float
+    gain: float
     mean: Tensor
     variance: Tensor
 
@@ -231,39 +232,39 @@ class CrossValidated:
 def cross_validated(
     kernel: Kernel, inducing: Tensor, inputs: Sequence[Tensor], targets: Sequence[Tensor], redundancy: float
 ) -> CrossValidated:
-    """Learns a process, and how far to trust it by what it tells of parts left out in turn.
+    """Learns a process, and its gain from the predictions of parts left out in turn.
 
     Args:
         kernel: of the process.
         inducing: (M,F).
         inputs: of each part, (B,F).
-        targets: of each part, as they look to one that has not seen the part, (B,n).
-        redundancy: how many frames tell as much as a single independent one.
+        targets: of each part, under autoregression coefficients learned from the other parts, (B,n).
+        redundancy: number of correlated frames that count as one independent frame.
     """
     whitening = whitening_of(kernel, inducing)
     near = [kernel.between(part, inducing) for part in inputs]
     features = [part @ whitening for part in near]
-    evidence = [Evidence(f.T @ f, f.T @ t) for f, t in zip(features, targets, strict=True)]
+    statistics = [Statistics(f.T @ f, f.T @ t) for f, t in zip(features, targets, strict=True)]
     means, variances = [], []
     for i, (k, f) in enumerate(zip(near, features, strict=True)):
-        own = posterior(kernel, inducing, whitening, _summed(evidence[:i] + evidence[i + 1 :]), redundancy)
-        told = k @ own.spread
-        means.append(told @ own.weights)
-        variances.append((kernel.signal - f.square().sum(1)).clamp(min=0.0) + told.square().sum(1))
-    mean, wanted = torch.cat(means), torch.cat(list(targets))
-    # A lively take must not decide for all: errors count relative to those that the take has without the process.
-    weight = torch.cat([(1 / t.square().sum().clamp(min=_SMALLEST)).expand(len(t), 1) for t in targets])
-    trust = float(((weight * mean * wanted).sum() / (weight * mean.square()).sum().clamp(min=1e-12)).clamp(0, 1))
-    whole = posterior(kernel, inducing, whitening, _summed(evidence), redundancy)
-    return CrossValidated(whole, trust, trust * mean, trust**2 * torch.cat(variances))
+        own = posterior(kernel, inducing, whitening, _summed(statistics[:i] + statistics[i + 1 :]), redundancy)
+        projected = k @ own.covariance_root
+        means.append(projected @ own.weights)
+        variances.append((kernel.signal - f.square().sum(1)).clamp(min=0.0) + projected.square().sum(1))
+    mean, target = torch.cat(means), torch.cat(list(targets))
+    # Errors count relative to those without the process, so that a take with much motion does not dominate.
+    weight = torch.cat([(1 / t.square().sum().clamp(min=_MIN_SCALE)).expand(len(t), 1) for t in targets])
+    gain = float(((weight * mean * target).sum() / (weight * mean.square()).sum().clamp(min=1e-12)).clamp(0, 1))
+    whole = posterior(kernel, inducing, whitening, _summed(statistics), redundancy)
+    return CrossValidated(whole, gain, gain * mean, gain**2 * torch.cat(variances))
 
 
-def _own_coefficients(parts: Sequence[_Part]) -> tuple[Tensor, list[Tensor]]:
+def _autoregression(parts: Sequence[_Part]) -> tuple[Tensor, list[Tensor]]:
     """Each shape's step from its own frames, (J,N): by least squares from all parts, and from all but each.
 
-    A window that rests is to go on resting wherever it does, so the step is a sum of the steps before: a shape that
-    the takes never raised must not be drawn back to where they left it. What is common to all shapes is learned from
-    all, and each differs from it as far as its own frames tell.
+    A window at rest must stay at rest whatever the weights there, so the step is a linear function of the steps before:
+    a shape that the takes never raised must not be drawn back to 0. The coefficients are pooled: each shape's are drawn
+    toward those that fit all shapes.
     """
     squares, products = [], []
     for part in parts:
@@ -282,9 +283,9 @@ def _from_steps(square: Tensor, product: Tensor) -> Tensor:
     """Coefficients (J,N) of frames, of normal equations (N,J-1,J-1), (N,J-1) of the steps between them."""
     count, steps = product.shape
     ridge = _RIDGE * torch.eye(steps, dtype=torch.float64)
-    usual = square.mean(0) + ridge
-    common = torch.linalg.solve(usual, product.mean(0))
-    own = torch.linalg.solve(square + _COMMON * usual, product + _COMMON * (usual @ common))
+    pooled = square.mean(0) + ridge
+    common = torch.linalg.solve(pooled, product.mean(0))
+    own = torch.linalg.solve(square + _POOLING * pooled, product + _POOLING * (pooled @ common))
     zero = torch.zeros(count, 1, dtype=torch.float64)
     padded = torch.cat([zero, own, zero], dim=1)
     return (padded[:, :-1] - padded[:, 1:]).T
@@ -301,9 +302,9 @@ def _parts(takes: Sequence[Tensor], window: int, input_noise: float, generator: 
     ]
 
 
-def _summed(evidence: Sequence[Evidence]) -> Evidence:
-    total = evidence[0]
-    for one in evidence[1:]:
+def _summed(statistics: Sequence[Statistics]) -> Statistics:
+    total = statistics[0]
+    for one in statistics[1:]:
         total = total + one
     return total
 

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchface.capture.priors.parzen import checked_sizes
 from torchface.errors import ShapeError, ValueRangeError
 
-_ROUNDS, _DONE = 200, 1e-5
-_SEED_ROUNDS = 20
+_MAX_ITERATIONS, _TOLERANCE = 200, 1e-5
+_SEED_ITERATIONS = 20
 
 
 class GaussianMixture(nn.Module):
@@ -24,22 +24,22 @@ class GaussianMixture(nn.Module):
     Args:
         means: (K,D).
         factors: L with :math:`\Sigma_k^{-1} = L_k L_k^\top`, lower triangular, (K,D,D).
-        log_shares: :math:`\log \pi_k`, (K,).
+        log_mixing_weights: :math:`\log \pi_k`, (K,).
     """
 
     means: Tensor
     factors: Tensor
-    log_shares: Tensor
+    log_mixing_weights: Tensor
 
-    def __init__(self, means: Tensor, factors: Tensor, log_shares: Tensor) -> None:
+    def __init__(self, means: Tensor, factors: Tensor, log_mixing_weights: Tensor) -> None:
         super().__init__()
         count, dimensions = means.shape
-        if factors.shape != (count, dimensions, dimensions) or log_shares.shape != (count,):
+        if factors.shape != (count, dimensions, dimensions) or log_mixing_weights.shape != (count,):
             raise ShapeError(
-                f"Gaussian mixture: found means {tuple(means.shape)}, factors {tuple(factors.shape)}, log_shares "
-                f"{tuple(log_shares.shape)}, expected (K,D), (K,D,D), (K,)"
+                f"Gaussian mixture: found means {tuple(means.shape)}, factors {tuple(factors.shape)}, "
+                f"log_mixing_weights {tuple(log_mixing_weights.shape)}, expected (K,D), (K,D,D), (K,)"
             )
-        for name, value in (("means", means), ("factors", factors), ("log_shares", log_shares)):
+        for name, value in (("means", means), ("factors", factors), ("log_mixing_weights", log_mixing_weights)):
             self.register_buffer(name, value.detach().float())
 
     @classmethod
@@ -55,9 +55,9 @@ class GaussianMixture(nn.Module):
 
         Args:
             samples: weights, (T,D).
-            components: K; those that lose all samples are dropped.
-            shrinkage: how far each covariance is drawn toward that of all samples, as a share: a component with few
-                samples keeps directions in which it saw nothing.
+            components: K; components without samples are dropped.
+            shrinkage: weight of the covariance of all samples in each component's, in [0,1]: a component with few
+                samples keeps variance in directions that it has not seen.
             floor: added to each variance.
             seed: of the k-means.
 
@@ -74,21 +74,21 @@ class GaussianMixture(nn.Module):
         if components < 1 or not 0 <= shrinkage <= 1 or not floor > 0:
             raise ValueRangeError(
                 f"Gaussian mixture: found {components} components, shrinkage {shrinkage}, floor {floor}, expected "
-                "at least one, a share, and a positive variance"
+                "at least one, a number in [0,1], and a positive variance"
             )
         x = samples.detach().double()
-        whole = torch.cov(x.T, correction=0).reshape(x.shape[1], -1)
-        share = torch.nn.functional.one_hot(_nearest(x, _seeds(x, components, seed)), components).double()
+        pooled = torch.cov(x.T, correction=0).reshape(x.shape[1], -1)
+        responsibilities = torch.nn.functional.one_hot(_nearest(x, _seeds(x, components, seed)), components).double()
         before = -math.inf
-        # Each round needs the shares of the one before.
-        for _ in range(_ROUNDS):
-            share = share[:, share.sum(0) > 1e-6]
-            mixture = _maximised(x, share, whole, shrinkage, floor)
+        # Each iteration needs the responsibilities of the one before.
+        for _ in range(_MAX_ITERATIONS):
+            responsibilities = responsibilities[:, responsibilities.sum(0) > 1e-6]
+            mixture = _maximised(x, responsibilities, pooled, shrinkage, floor)
             joint = mixture._log_joint(x)
             likelihood = float(joint.logsumexp(1).mean())
-            if likelihood - before < _DONE:
+            if likelihood - before < _TOLERANCE:
                 break
-            before, share = likelihood, joint.softmax(1)
+            before, responsibilities = likelihood, joint.softmax(1)
         return mixture.float()
 
     def log_density(self, samples: Tensor) -> Tensor:
@@ -98,17 +98,17 @@ class GaussianMixture(nn.Module):
     def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
 
-        By the share :math:`r_k` that each Gaussian has in the density there:
+        With the responsibilities :math:`r_k` of the Gaussians there:
         :math:`\sum_k r_k \tfrac12 (x - \mu_k)^\top \Sigma_k^{-1} (x - \mu_k)` and a constant.
 
         Returns:
             H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
         """
-        share = self._log_joint(samples).softmax(1)
+        responsibilities = self._log_joint(samples).softmax(1)
         factors = self.factors.to(samples)
         precision = factors @ factors.transpose(1, 2)
         pulled = (precision @ self.means.to(samples)[..., None])[..., 0]
-        return (share @ precision.flatten(1)).unflatten(1, precision.shape[1:]), -share @ pulled
+        return (responsibilities @ precision.flatten(1)).unflatten(1, precision.shape[1:]), -responsibilities @ pulled
 
     def mapped(self, matrix: Tensor, floor: Tensor) -> GaussianMixture:
         """The density of y = Mx with a variance added to each y; see ``StudentDensity.mapped``."""
@@ -116,7 +116,9 @@ class GaussianMixture(nn.Module):
         covariance = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factors @ factors.mT)) @ matrix.T
         covariance.diagonal(dim1=1, dim2=2).add_(floor.to(covariance))
         precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
-        return GaussianMixture(self.means.double() @ matrix.T, torch.linalg.cholesky(precision), self.log_shares)
+        return GaussianMixture(
+            self.means.double() @ matrix.T, torch.linalg.cholesky(precision), self.log_mixing_weights
+        )
 
     def _log_joint(self, samples: Tensor) -> Tensor:
         """:math:`\\log \\pi_k N(x \\mid \\mu_k, \\Sigma_k)`, (B,K)."""
@@ -124,7 +126,7 @@ class GaussianMixture(nn.Module):
         whitened = torch.einsum("bkd,kde->bke", samples[:, None] - means, factors)
         volume = factors.diagonal(dim1=1, dim2=2).log().sum(1)
         constant = 0.5 * samples.shape[1] * math.log(2 * math.pi)
-        return self.log_shares.to(samples) + volume - constant - 0.5 * whitened.square().sum(-1)
+        return self.log_mixing_weights.to(samples) + volume - constant - 0.5 * whitened.square().sum(-1)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -143,25 +145,25 @@ class GaussianMixture(nn.Module):
         return cls(torch.zeros(count, dimensions), torch.zeros(count, dimensions, dimensions), torch.zeros(count))
 
 
-def _maximised(x: Tensor, share: Tensor, whole: Tensor, shrinkage: float, floor: float) -> GaussianMixture:
-    """The mixture that is likeliest for samples x (T,D) whose shares (T,K) are known, in float64."""
-    count = share.sum(0)
-    means = (share.T @ x) / count[:, None]
-    moments = _moments(share, x)
+def _maximised(x: Tensor, responsibilities: Tensor, pooled: Tensor, shrinkage: float, floor: float) -> GaussianMixture:
+    """The mixture that is likeliest for samples x (T,D) with given responsibilities (T,K), in float64."""
+    count = responsibilities.sum(0)
+    means = (responsibilities.T @ x) / count[:, None]
+    moments = _moments(responsibilities, x)
     own = moments / count[:, None, None] - means[:, :, None] * means[:, None]
-    covariance = (1 - shrinkage) * own + shrinkage * whole
+    covariance = (1 - shrinkage) * own + shrinkage * pooled
     covariance = 0.5 * (covariance + covariance.transpose(1, 2))
     covariance.diagonal(dim1=1, dim2=2).add_(floor)
     factors = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance)))
     mixture = GaussianMixture(means, factors, (count / count.sum()).log())
-    # The buffers are float32 in a finished module; the rounds need the digits.
-    mixture.means, mixture.factors, mixture.log_shares = means, factors, (count / count.sum()).log()
+    # The buffers are float32 in a finished module; the iterations need float64.
+    mixture.means, mixture.factors, mixture.log_mixing_weights = means, factors, (count / count.sum()).log()
     return mixture
 
 
-def _moments(share: Tensor, x: Tensor) -> Tensor:
+def _moments(responsibilities: Tensor, x: Tensor) -> Tensor:
     """Second moments (K,D,D); a loop over components keeps (T,K,D) out of the memory."""
-    return torch.stack([(column[:, None] * x).T @ x for column in share.T])
+    return torch.stack([(column[:, None] * x).T @ x for column in responsibilities.T])
 
 
 def _seeds(x: Tensor, count: int, seed: int) -> Tensor:
@@ -173,7 +175,7 @@ def _seeds(x: Tensor, count: int, seed: int) -> Tensor:
         if float(squared.sum()) == 0:
             break
         centers = torch.cat([centers, x[torch.multinomial(squared, 1, generator=generator)]])
-    for _ in range(_SEED_ROUNDS):
+    for _ in range(_SEED_ITERATIONS):
         member = torch.nn.functional.one_hot(_nearest(x, centers), len(centers)).double()
         total = member.sum(0)
         centers = torch.where(total[:, None] > 0, member.T @ x / total.clamp(min=1)[:, None], centers)

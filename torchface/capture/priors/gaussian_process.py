@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError
 
 # Directions of the inducing points that the kernel tells apart by less than this are left out: float32 cannot.
-_SMALLEST = 1e-6
+_MIN_EIGENVALUE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Kernel:
 
     Args:
         signal: :math:`\theta_0`.
-        inverse_lengths: :math:`1/\ell_d`, (F,); 0 for inputs that it does not look at.
+        inverse_lengths: :math:`1/\ell_d`, (F,); 0 for inputs that it does not use.
         noise: :math:`\beta^{-1}`, the variance of targets around the function.
 
     Source: thesis 4.2.10, equations 58 and 59, with a length for each input.
@@ -40,7 +40,7 @@ class Kernel:
 class GaussianProcesses(nn.Module):
     r"""G independent processes over the same inputs, each for some of N targets.
 
-    With :math:`\Phi = k(X,Z) K_{ZZ}^{-1/2}` the inducing points Z stand for all inputs X, and a process predicts
+    With :math:`\Phi = k(X,Z) K_{ZZ}^{-1/2}` the inducing points Z approximate all inputs X, and a process predicts
 
     .. math:: m(x) = k(x,Z) K_{ZZ}^{-1/2} (\Phi^\top\Phi + \beta^{-1} I)^{-1} \Phi^\top t, \qquad
         \sigma^2(x) = \theta_0 - k(x,Z) \big(K_{ZZ}^{-1} - K_{ZZ}^{-1/2}(\beta\,\Phi^\top\Phi + I)^{-1} K_{ZZ}^{-1/2}
@@ -53,7 +53,7 @@ class GaussianProcesses(nn.Module):
         inducing: Z times the inverse lengths, (G,M,F).
         signal: (G,).
         whitening: :math:`K_{ZZ}^{-1/2}`, (G,M,M).
-        spread: R with :math:`R R^\top = K_{ZZ}^{-1/2}(\beta\,\Phi^\top\Phi + I)^{-1} K_{ZZ}^{-1/2}`, (G,M,M).
+        covariance_root: R with :math:`R R^\top = K_{ZZ}^{-1/2}(\beta\,\Phi^\top\Phi + I)^{-1} K_{ZZ}^{-1/2}`, (G,M,M).
         weights: what R's columns add to the mean, (G,M,N).
 
     Source: thesis 4.2.10, equations 60 to 63; Titsias 2009 for the inducing points.
@@ -63,7 +63,7 @@ class GaussianProcesses(nn.Module):
     inducing: Tensor
     signal: Tensor
     whitening: Tensor
-    spread: Tensor
+    covariance_root: Tensor
     weights: Tensor
 
     def __init__(
@@ -72,7 +72,7 @@ class GaussianProcesses(nn.Module):
         inducing: Tensor,
         signal: Tensor,
         whitening: Tensor,
-        spread: Tensor,
+        covariance_root: Tensor,
         weights: Tensor,
     ) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class GaussianProcesses(nn.Module):
             "inducing": (inducing, (groups, points, inputs)),
             "signal": (signal, (groups,)),
             "whitening": (whitening, (groups, points, points)),
-            "spread": (spread, (groups, points, points)),
+            "covariance_root": (covariance_root, (groups, points, points)),
             "weights": (weights, (groups, points, weights.shape[-1])),
         }
         for name, (value, shape) in expected.items():
@@ -98,7 +98,7 @@ class GaussianProcesses(nn.Module):
             torch.stack([one.inducing for one in learned]),
             torch.tensor([kernel.signal for kernel in kernels], dtype=learned[0].inducing.dtype),
             torch.stack([one.whitening for one in learned]),
-            torch.stack([one.spread for one in learned]),
+            torch.stack([one.covariance_root for one in learned]),
             torch.stack([one.weights for one in learned]),
         )
 
@@ -113,25 +113,25 @@ class GaussianProcesses(nn.Module):
         """
         scaled = inputs * self.inverse_lengths[:, None]
         near = self.signal[:, None, None] * torch.exp(-0.5 * _squared_distances(scaled, self.inducing))
-        told = near @ self.spread
-        known = (near @ self.whitening).square().sum(-1)
-        variance = (self.signal[:, None] - known).clamp(min=0.0) + told.square().sum(-1)
-        return (told @ self.weights).sum(0), variance.T
+        projected = near @ self.covariance_root
+        explained = (near @ self.whitening).square().sum(-1)
+        variance = (self.signal[:, None] - explained).clamp(min=0.0) + projected.square().sum(-1)
+        return (projected @ self.weights).sum(0), variance.T
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What one process has learned; fields as of :class:`GaussianProcesses`, for one."""
+    """The posterior of one process; fields as of :class:`GaussianProcesses`, for one."""
 
     inducing: Tensor
     whitening: Tensor
-    spread: Tensor
+    covariance_root: Tensor
     weights: Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Frames in terms of the inducing points: sums over frames, so that takes can be added and left out.
+class Statistics:
+    """Sufficient statistics: sums over frames, so that takes can be added and left out.
 
     Args:
         square: :math:`\\Phi^\\top\\Phi`, (M,M).
@@ -141,33 +141,35 @@ class Evidence:
     square: Tensor
     product: Tensor
 
-    def __add__(self, other: Evidence) -> Evidence:
-        return Evidence(self.square + other.square, self.product + other.product)
+    def __add__(self, other: Statistics) -> Statistics:
+        return Statistics(self.square + other.square, self.product + other.product)
 
 
 def whitening_of(kernel: Kernel, inducing: Tensor) -> Tensor:
     """:math:`K_{ZZ}^{-1/2}` (M,M), in float64, without the directions in which K is all but singular."""
     values, vectors = torch.linalg.eigh(kernel.between(inducing, inducing))
-    kept = values > _SMALLEST * values[-1]
+    kept = values > _MIN_EIGENVALUE * values[-1]
     root = torch.where(kept, values.clamp(min=1e-300).rsqrt(), torch.zeros_like(values))
     return (vectors * root) @ vectors.T
 
 
-def posterior(kernel: Kernel, inducing: Tensor, whitening: Tensor, evidence: Evidence, redundancy: float) -> Posterior:
-    """What a process knows after evidence.
+def posterior(
+    kernel: Kernel, inducing: Tensor, whitening: Tensor, statistics: Statistics, redundancy: float
+) -> Posterior:
+    """The posterior of a process given the statistics of its frames.
 
     Args:
         kernel: of the process.
         inducing: Z, (M,F).
         whitening: of :func:`whitening_of`, (M,M).
-        evidence: of all frames.
-        redundancy: how many frames tell as much as one that is independent of the others would.
+        statistics: of all frames.
+        redundancy: number of correlated frames that count as one independent frame.
     """
     noise = kernel.noise * redundancy
     eye = torch.eye(len(inducing), dtype=inducing.dtype)
-    factor = torch.linalg.cholesky(evidence.square / noise + eye)
+    factor = torch.linalg.cholesky(statistics.square / noise + eye)
     root = torch.linalg.solve_triangular(factor, eye, upper=False).T
-    weights = root.T @ evidence.product / noise
+    weights = root.T @ statistics.product / noise
     return Posterior(inducing * kernel.inverse_lengths, whitening, whitening @ root, weights)
 
 

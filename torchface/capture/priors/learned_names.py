@@ -9,7 +9,7 @@ from torch import Tensor
 from torchface.errors import NameMismatchError
 from torchface.shape_names import mapping
 
-_LEAST_SHARE = 0.5
+_MIN_LEARNED = 0.5
 
 
 def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -23,11 +23,11 @@ def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor,
     """
     there, back = mapping(names, learned), mapping(learned, names)
     known = back.any(1)
-    if float(known.float().mean()) < _LEAST_SHARE:
+    if float(known.float().mean()) < _MIN_LEARNED:
         unknown = [name for name, found in zip(names, known.tolist(), strict=True) if not found]
         raise NameMismatchError(
             f"prior: has learned {int(known.sum())} of the rig's {len(names)} shapes "
-            f"(none of {', '.join(unknown[:3])}, ...), expected at least half of them; it knows "
+            f"(none of {', '.join(unknown[:3])}, ...), expected at least half of them; it has "
             f"{', '.join(learned[:3])}, ... (train.priors --rig makes a prior for a rig's names)"
         )
     return there, back

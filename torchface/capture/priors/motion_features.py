@@ -1,4 +1,4 @@
-"""How a window of weights moves: where it is, how fast it goes, how that changes."""
+"""Features of a window of weights: its place, slope and curvature."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 
 _REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
-_MOST_ORDERS = 3
+_MAX_ORDERS = 3
 _SAME_RATE = 0.02  # relative
 
 
@@ -25,8 +25,8 @@ def face_regions(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
         >>> face_regions(["jawOpen", "eyeBlink_L", "eyeLookIn_L", "browInnerUp", "mouthPucker"])
         ((2,), (1,), (3,), (0, 4))
     """
-    home = [next(i for i, kind in enumerate(_REGIONS) if re.match(kind, name, re.IGNORECASE)) for name in names]
-    regions = (tuple(row for row, region in enumerate(home) if region == i) for i in range(len(_REGIONS)))
+    region_of = [next(i for i, kind in enumerate(_REGIONS) if re.match(kind, name, re.IGNORECASE)) for name in names]
+    regions = (tuple(row for row, region in enumerate(region_of) if region == i) for i in range(len(_REGIONS)))
     return tuple(region for region in regions if region)
 
 
@@ -36,17 +36,17 @@ def motion_basis(window: int) -> Tensor:
     White noise of the frames is white, and of the same size, in all of them.
 
     Args:
-        window: J; O is J or 3, what is less.
+        window: J; O is the smaller of J and 3.
     """
     # On the CPU also where a model is being rebuilt without memory: it is computed, not loaded.
     steps = torch.linspace(-1, 1, window, dtype=torch.float64, device="cpu")
-    powers = torch.stack([steps**order for order in range(min(window, _MOST_ORDERS))], dim=1)
+    powers = torch.stack([steps**order for order in range(min(window, _MAX_ORDERS))], dim=1)
     basis, triangle = torch.linalg.qr(powers)
     return basis * triangle.diagonal().sign()
 
 
 def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
-    """What tells how much a window moves: slope, curvature, and the last step by itself, which lags least.
+    """The motion in a window: slope, curvature, and the last step by itself, which has no lag.
 
     Args:
         windows: (B,J,N).
@@ -98,12 +98,12 @@ def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
 
 
 def same_rate(fps: float, other: float) -> bool:
-    """Whether two frame rates are as good as one: 59.94 and 60 frames a second are, 25 and 24 are not."""
+    """Whether two frame rates count as the same: 59.94 and 60 frames a second do, 25 and 24 do not."""
     return abs(fps - other) <= _SAME_RATE * fps
 
 
 def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
-    """A take at another frame rate, by straight lines between frames; a NaN spreads to the frames beside it.
+    """A take at another frame rate, by linear interpolation; a NaN spreads to the frames beside it.
 
     Args:
         weights: (T,N).
@@ -123,5 +123,5 @@ def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
     count = int((len(weights) - 1) * to_fps / from_fps + 1e-9) + 1
     place = torch.arange(count, dtype=torch.float64, device=weights.device) * (from_fps / to_fps)
     before = place.floor().long().clamp(max=len(weights) - 2)
-    share = (place - before).to(weights)[:, None]
-    return torch.lerp(weights[before], weights[before + 1], share)
+    fraction = (place - before).to(weights)[:, None]
+    return torch.lerp(weights[before], weights[before + 1], fraction)

@@ -1,4 +1,4 @@
-"""How far the next frame may lie from what is predicted: little where the face rests, much where it moves."""
+"""The variance of the next frame about its prediction: small at rest, larger the more a window moves."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError
 
-_ROUNDS = 60
-_USUAL = -2.5  # of the logarithm of a share of the energy
+_ITERATIONS = 60
+_PRIOR_MEAN = -2.5  # of the logarithm of a coefficient
 
 
 class MotionNoise(nn.Module):
@@ -17,35 +17,44 @@ class MotionNoise(nn.Module):
     .. math:: \beta_i^{-1}(x) = a_i + \sum_o \big(b_{io}\, x_{oi}^2 + c_{io}\, s_{oi}^2 \operatorname{mean}_{k
         \in g(i)} x_{ok}^2 / s_{ok}^2\big)
 
-    over a window's slope, curvature and last step x: the shape's own, and those of the shapes that it moves with.
+    over a window's slope, curvature and last step x: the shape's own, and those of its group of shapes.
 
     Args:
-        rest: :math:`a`, the variance at rest, (N,).
-        own: :math:`b`, (K,N).
-        shared: :math:`c`, (K,N).
-        scale: :math:`s`, usual sizes of the K kinds of motion, (K,N).
-        together: (N,N), rows of :math:`1/|g(i)|` where k is in i's group.
+        rest_variance: :math:`a`, (N,).
+        own_coefficients: :math:`b`, (K,N).
+        group_coefficients: :math:`c`, (K,N).
+        scale: :math:`s`, root mean squares of the K kinds of motion, (K,N).
+        group_average: (N,N), rows of :math:`1/|g(i)|` where k is in i's group.
 
     Source: Engle 1982 (autoregressive conditional heteroscedasticity), in place of the one noise of equation 54.
     """
 
-    rest: Tensor
-    own: Tensor
-    shared: Tensor
+    rest_variance: Tensor
+    own_coefficients: Tensor
+    group_coefficients: Tensor
     scale: Tensor
-    together: Tensor
+    group_average: Tensor
 
-    def __init__(self, rest: Tensor, own: Tensor, shared: Tensor, scale: Tensor, together: Tensor) -> None:
+    def __init__(
+        self,
+        rest_variance: Tensor,
+        own_coefficients: Tensor,
+        group_coefficients: Tensor,
+        scale: Tensor,
+        group_average: Tensor,
+    ) -> None:
         super().__init__()
-        count = len(rest)
-        if own.shape != shared.shape or own.shape != scale.shape or together.shape != (count, count):
-            raise ShapeError(
-                f"motion noise: found own {tuple(own.shape)}, shared {tuple(shared.shape)}, scale "
-                f"{tuple(scale.shape)}, together {tuple(together.shape)}, expected (O,{count}) thrice and "
-                f"({count},{count})"
-            )
-        named = (("rest", rest), ("own", own), ("shared", shared), ("scale", scale), ("together", together))
-        for name, value in named:
+        count, terms = len(rest_variance), tuple(own_coefficients.shape)
+        named = {
+            "rest_variance": (rest_variance, (count,)),
+            "own_coefficients": (own_coefficients, terms),
+            "group_coefficients": (group_coefficients, terms),
+            "scale": (scale, terms),
+            "group_average": (group_average, (count, count)),
+        }
+        for name, (value, shape) in named.items():
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"motion noise: found {name} {tuple(value.shape)}, expected {shape}")
             self.register_buffer(name, value.detach())
 
     @classmethod
@@ -53,7 +62,7 @@ class MotionNoise(nn.Module):
         cls,
         motion: Tensor,
         errors: Tensor,
-        known: Tensor,
+        model_variance: Tensor,
         scale: Tensor,
         groups: tuple[tuple[int, ...], ...],
         floor: float,
@@ -63,38 +72,38 @@ class MotionNoise(nn.Module):
         Args:
             motion: of the windows, see :func:`moving_parts`, (B,K,N).
             errors: (B,N).
-            known: variance that the errors have besides, (B,N).
-            scale: usual sizes of the K kinds of motion, (K,N).
-            groups: shapes that move together.
-            floor: the least standard deviation.
+            model_variance: variance of the errors that the noise does not have to explain, (B,N).
+            scale: root mean squares of the K kinds of motion, (K,N).
+            groups: rows of shapes, a tuple a group.
+            floor: minimum of the standard deviation.
         """
         count = errors.shape[1]
-        together = torch.zeros(count, count, dtype=torch.float64)
+        average = torch.zeros(count, count, dtype=torch.float64)
         for group in groups:
             rows = torch.tensor(group)
-            together[rows[:, None], rows] = 1 / len(group)
+            average[rows[:, None], rows] = 1 / len(group)
         squared = motion.square()
-        around = (squared / scale.square()) @ together.T * scale.square()
-        energies = torch.cat([squared, around], dim=1)
-        wanted = errors.square()
-        rest = (0.3 * wanted.mean(0)).clamp(min=floor**2).log().requires_grad_()
-        shares = torch.full(energies.shape[1:], _USUAL, dtype=torch.float64).requires_grad_()
-        optimizer = torch.optim.LBFGS([rest, shares], max_iter=_ROUNDS, line_search_fn="strong_wolfe")
+        group_energy = (squared / scale.square()) @ average.T * scale.square()
+        energies = torch.cat([squared, group_energy], dim=1)
+        squared_errors = errors.square()
+        log_rest = (0.3 * squared_errors.mean(0)).clamp(min=floor**2).log().requires_grad_()
+        log_coefficients = torch.full(energies.shape[1:], _PRIOR_MEAN, dtype=torch.float64).requires_grad_()
+        optimizer = torch.optim.LBFGS([log_rest, log_coefficients], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
         def loss() -> Tensor:
             optimizer.zero_grad()
-            variance = known + floor**2 + rest.exp() + (energies * shares.exp()).sum(1)
-            value = 0.5 * (wanted / variance + variance.log()).mean(0).sum()
-            value = value + 1e-4 * (shares - _USUAL).square().sum()
+            variance = model_variance + floor**2 + log_rest.exp() + (energies * log_coefficients.exp()).sum(1)
+            value = 0.5 * (squared_errors / variance + variance.log()).mean(0).sum()
+            value = value + 1e-4 * (log_coefficients - _PRIOR_MEAN).square().sum()
             value.backward()
             return value
 
         optimizer.step(loss)
-        own, shared = shares.detach().exp().chunk(2)
-        return cls(rest.detach().exp() + floor**2, own, shared, scale, together)
+        own, group = log_coefficients.detach().exp().chunk(2)
+        return cls(log_rest.detach().exp() + floor**2, own, group, scale, average)
 
     def forward(self, motion: Tensor) -> Tensor:
-        """The variance (B,N) after windows that move like this, (B,K,N)."""
+        """The variance (B,N) after windows with this motion, (B,K,N)."""
         squared = motion.square()
-        around = (squared / self.scale.square()) @ self.together.T * self.scale.square()
-        return self.rest + (self.own * squared + self.shared * around).sum(1)
+        group_energy = (squared / self.scale.square()) @ self.group_average.T * self.scale.square()
+        return self.rest_variance + (self.own_coefficients * squared + self.group_coefficients * group_energy).sum(1)

@@ -1,4 +1,4 @@
-"""The Parzen window: how likely weights are, by their distance to those that were seen."""
+"""The Parzen window: a kernel density estimate of weights."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch import Tensor, nn
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.optim.mean_shift import mean_shift
 
-_LARGEST = 2**28
-_SAMPLE = 1000
+_MAX_NUMBERS = 2**28
+_MAX_SAMPLES = 1000
 
 
 class ParzenDensity(nn.Module):
-    r"""A density of equal bells around centres.
+    r"""A density of equal isotropic Gaussians around centres.
 
     .. math:: p(x) = \frac{1}{K} \sum_{k=1}^{K} \exp\Big(-\frac{\lVert x - c_k \rVert^2}{2\sigma^2}\Big)
 
-    The bells are not scaled to an area of one: with the scale, a prior's strength would depend on the dimension.
+    The Gaussians are not normalised: with the normaliser, a prior's strength would depend on the dimension.
 
     Args:
         centers: :math:`c_k`, (K,D).
@@ -42,12 +42,12 @@ class ParzenDensity(nn.Module):
 
     @classmethod
     def fit(cls, samples: Tensor, bandwidth: float | None = None, seed: int = 0) -> ParzenDensity:
-        """Bins samples (T,D) by mean shift, so that what was seen often counts as much as what was seen once.
+        """Bins samples (T,D) by mean shift, so that frequent and rare weights count alike.
 
         Args:
             samples: weights, (T,D).
-            bandwidth: of the mean shift and of the bells; :func:`automatic_bandwidth` if absent.
-            seed: for the samples that the automatic bandwidth looks at.
+            bandwidth: of the mean shift and of the Gaussians; :func:`automatic_bandwidth` if absent.
+            seed: of the samples drawn for the automatic bandwidth.
 
         Raises:
             ShapeError: fewer than two samples.
@@ -61,29 +61,29 @@ class ParzenDensity(nn.Module):
 
     def log_density(self, samples: Tensor) -> Tensor:
         """:math:`\\log p` of samples (B,D), (B,), at most 0."""
-        return torch.logsumexp(self._log_bells(samples), dim=1) - math.log(len(self.centers))
+        return torch.logsumexp(self._log_kernels(samples), dim=1) - math.log(len(self.centers))
 
     def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
 
-        By the share :math:`r_k` that each bell has in the density there:
+        With the responsibilities :math:`r_k` of the Gaussians there:
         :math:`\sum_k r_k \lVert x - c_k \rVert^2 / 2\sigma^2` and a constant.
 
         Returns:
             H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
         """
-        share = torch.softmax(self._log_bells(samples), dim=1)
+        responsibilities = torch.softmax(self._log_kernels(samples), dim=1)
         precision = 1 / self.bandwidth.to(samples).square()
         H = (precision * torch.eye(samples.shape[1], dtype=samples.dtype, device=samples.device)).expand(
             len(samples), -1, -1
         )
-        return H, -precision * (share @ self.centers.to(samples))
+        return H, -precision * (responsibilities @ self.centers.to(samples))
 
     def mapped(self, matrix: Tensor, floor: Tensor) -> ParzenDensity:
-        """The density with its centres at Mc, M (E,D); its bells are as wide in every direction, so no floor counts."""
+        """The density with its centres at Mc, M (E,D); its Gaussians are isotropic, so the floor has no effect."""
         return ParzenDensity(self.centers @ matrix.to(self.centers).T, self.bandwidth)
 
-    def _log_bells(self, samples: Tensor) -> Tensor:
+    def _log_kernels(self, samples: Tensor) -> Tensor:
         squared = torch.cdist(samples, self.centers.to(samples)).square()
         return -0.5 * squared / self.bandwidth.to(samples).square()
 
@@ -103,18 +103,18 @@ class ParzenDensity(nn.Module):
 
 
 def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -> float:
-    """The mean distance from a sample to the farthest of its nearest share of the others.
+    """The mean distance from a sample to its k-th nearest neighbour, k a fraction of all samples.
 
     Args:
-        samples: (T,D); of many a thousand are looked at.
-        quantile: that share.
-        seed: which ones.
+        samples: (T,D); of more than a thousand, a thousand are drawn.
+        quantile: that fraction.
+        seed: of the draw.
 
     Source: thesis 4.2.8; the rule of scikit-learn's ``estimate_bandwidth``.
     """
     _check_samples(samples)
     generator = torch.Generator().manual_seed(seed)
-    some = samples.double()[torch.randperm(len(samples), generator=generator)[:_SAMPLE]]
+    some = samples.double()[torch.randperm(len(samples), generator=generator)[:_MAX_SAMPLES]]
     nearest = max(int(quantile * len(some)), 1)
     return float(torch.cdist(some, some).kthvalue(nearest, dim=1).values.mean())
 
@@ -130,8 +130,8 @@ def checked_sizes(config: Mapping[str, Any], *names: str) -> tuple[int, ...]:
     if not all(isinstance(size, int) and not isinstance(size, bool) and size >= 1 for size in sizes):
         raise FileFormatError(f"density: found sizes {found}, expected whole numbers from 1")
     whole = tuple(int(size) for size in sizes if size is not None)
-    if math.prod(whole) > _LARGEST:
-        raise FileFormatError(f"density: found sizes {found}, expected at most {_LARGEST} numbers")
+    if math.prod(whole) > _MAX_NUMBERS:
+        raise FileFormatError(f"density: found sizes {found}, expected at most {_MAX_NUMBERS} numbers")
     return whole
 
 

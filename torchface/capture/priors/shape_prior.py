@@ -1,4 +1,4 @@
-"""Which weights faces have: a density of all shapes, or of each part of the face, as an energy for the solvers."""
+"""The shape prior: a density of weights, of all shapes or of each part of the face, as an energy for the solvers."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture] | type[StudentDens
 }
 STRENGTH = 0.15
 """Of a fitted prior: chosen by the error of solves of real takes that were left out of the learning."""
-_MOST_COMPONENTS = 8
+_MAX_COMPONENTS = 8
 _FLOORS = (1e-4, 3e-4, 1e-3, 3e-3)
 _SHRINKAGES = (0.3, 0.5)
 
 
 class Density(Protocol):
-    """What a prior asks of a density; see ``StudentDensity``, ``GaussianMixture``, ``ParzenDensity``."""
+    """A density as a prior uses it; see ``StudentDensity``, ``GaussianMixture``, ``ParzenDensity``."""
 
     def log_density(self, samples: Tensor) -> Tensor:
         """(B,D) to (B,)."""
@@ -43,7 +43,7 @@ class Density(Protocol):
 def face_halves(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
     """The shapes of eyes and brows, and all others: two groups of rows, or one where a half has none.
 
-    What the brows do says nothing of what the jaw does, and no take holds all combinations of both.
+    Brows and jaw move independently, and no take holds all combinations of both.
 
     Example:
         >>> face_halves(["jawOpen", "browInnerUp", "eyeBlink_L", "mouthPucker"])
@@ -57,13 +57,13 @@ def face_halves(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
 
 
 class ShapePrior(nn.Module):
-    r"""How unlikely weights are, as an energy.
+    r"""The negative log density of weights, as an energy.
 
     .. math:: E(w) = -\lambda \sum_g \log p_g(w_g)
 
     over groups of shapes that are independent of each other. The energy that a solver gets is quadratic, touches this
-    one at the weights where it is asked for and lies above it elsewhere, so that minimising it never makes things
-    worse: no pops, no step control.
+    one at the weights where it is asked for and lies above it elsewhere, so that minimising it
+    never raises the energy, without step control.
 
     Args:
         names: N shapes; solvers refuse others.
@@ -101,16 +101,15 @@ class ShapePrior(nn.Module):
         names: Sequence[str],
         groups: Sequence[Sequence[int]] | None = None,
     ) -> ShapePrior:
-        """Learns a bell with heavy tails about the face at rest, a :class:`StudentDensity` a group.
+        """Learns a Student's t-distribution about the face at rest, a :class:`StudentDensity` a group.
 
-        Of the forms that were compared by the error of solves of takes left out of the learning it is the best: it
-        keeps what shapes do together, does not draw toward the mean of the takes it has seen, and lets go of
-        expressions that they lack.
+        Of the densities that were compared by the error of solves of left-out takes it is the best: it keeps the
+        correlation of shapes, does not draw toward the mean of its takes, and draws less on expressions beyond them.
 
         Args:
             takes: weights of each take, (T,N); frames with a NaN are left out.
             names: of the N shapes.
-            groups: all shapes together if absent: brows and mouth do tell of each other in real takes.
+            groups: all shapes together if absent: brows and mouth are correlated in real takes.
 
         Raises:
             ShapeError: no takes, or of another number of shapes.
@@ -128,7 +127,7 @@ class ShapePrior(nn.Module):
         groups: Sequence[Sequence[int]] | None = None,
         seed: int = 0,
     ) -> ShapePrior:
-        """Learns a mixture of Gaussians a group; how many and how smooth makes takes left out in turn likeliest.
+        """Learns a mixture of Gaussians a group; number and smoothness by cross-validation over takes.
 
         Args:
             takes: weights of each take, (T,N); frames with a NaN are left out.
@@ -180,9 +179,9 @@ class ShapePrior(nn.Module):
     def renamed(self, names: Sequence[str]) -> ShapePrior:
         """The prior for a rig's shapes, which may have other names: itself where they are the same.
 
-        A whole shape becomes two halves that move together, two halves their mean, as far apart as ``StudentDensity``
-        lets shapes be that always moved together. What the prior has not learned stays near 0, as in a prior that
-        ``train.priors --rig`` learns for these names; see :func:`unlearned`.
+        A whole shape becomes two halves that move together, two halves their mean, with the variance that
+        ``StudentDensity`` adds to shapes that always moved together. What the prior has not
+        learned stays near 0, as in a prior that ``train.priors --rig`` learns for these names; see :func:`unlearned`.
 
         Args:
             names: of the rig's N shapes.
@@ -193,10 +192,10 @@ class ShapePrior(nn.Module):
         if tuple(names) == self.names:
             return self
         _, back = name_matrices(self.names, names)
-        home = back.argmax(1)
-        places = {row: place for place, group in enumerate(self.groups) for row in group}
-        # A shape that nothing is known of goes with the first group.
-        member = [places[int(row)] if bool(known) else 0 for row, known in zip(home, back.any(1), strict=True)]
+        nearest = back.argmax(1)
+        group_of = {row: place for place, group in enumerate(self.groups) for row in group}
+        # A shape that was not learned joins the first group.
+        member = [group_of[int(row)] if bool(learned) else 0 for row, learned in zip(nearest, back.any(1), strict=True)]
         split = ((back > 0) & ((back > 0).sum(0) > 1)).any(1)
         groups, densities = [], []
         for place, group in enumerate(self.groups):
@@ -260,7 +259,7 @@ class ReciprocalPrior(ShapePrior):
 
     Args:
         names, groups, densities, strength: as ``ShapePrior``.
-        guard: :math:`p_0`, against a density whose bells have height 1.
+        guard: :math:`p_0`, relative to kernels of height 1.
 
     Source: thesis 4.2.9, equation 44.
     """
@@ -317,11 +316,11 @@ class ReciprocalPrior(ShapePrior):
 
 
 def _chosen_mixture(takes: list[Tensor], seed: int) -> GaussianMixture:
-    """The mixture whose settings make takes left out likeliest; a single take is halved for that."""
+    """The mixture with the settings that make left-out takes likeliest; a single take is halved for that."""
     parts = takes if len(takes) > 1 else list(takes[0].chunk(2))
     best, likelihood = (1, _SHRINKAGES[0], _FLOORS[-1]), -float("inf")
     count = 1
-    while count <= _MOST_COMPONENTS:
+    while count <= _MAX_COMPONENTS:
         for shrinkage in _SHRINKAGES if count > 1 else _SHRINKAGES[:1]:
             for floor in _FLOORS:
                 found = sum(_left_out(parts, i, count, shrinkage, floor, seed) for i in range(len(parts)))

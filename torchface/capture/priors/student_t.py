@@ -1,4 +1,4 @@
-"""A bell with heavy tails about the face at rest."""
+"""Student's t-distribution of weights, with its mode at rest."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from torch import Tensor, nn
 from torchface.capture.priors.parzen import checked_sizes
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
-_ROUNDS = 50
+_ITERATIONS = 50
 PARTING_VARIANCE = 3e-5
-"""Of shapes that always moved together: how far they may part."""
+"""Added to each variance: shapes that always moved together stay distinguishable."""
 
 
 class StudentDensity(nn.Module):
-    r"""Student's distribution in D dimensions, with its peak at rest.
+    r"""Student's t-distribution in D dimensions, with its mode at rest.
 
     .. math:: p(x) \propto \Big( 1 + \frac{x^\top \Sigma^{-1} x}{\nu} \Big)^{-(\nu + D)/2}
 
-    Weights of takes are not spread about their mean: a face keeps coming back to rest, whatever else a take asks of
-    it, and what other takes ask goes further than one has seen. So the peak is at zero, and the tails are heavy: an
-    expression beyond those learned from is drawn back less firmly, in all shapes together.
+    Weights do not scatter about their mean: a face keeps coming back to rest, and other takes go further than those
+    seen. So the mode is at zero and the tails are heavy: an expression beyond those learned from is drawn back less,
+    in all shapes together.
 
     Args:
         factor: L with :math:`\Sigma^{-1} = L L^\top`, lower triangular, (D,D).
-        freedom: :math:`\nu`, a positive number; a Gaussian's is infinite.
+        degrees_of_freedom: :math:`\nu`, positive; infinite for a Gaussian.
 
     Source: Liu and Rubin 1995 for the fit; Lange, Little and Taylor 1989 for the bound.
     """
 
     factor: Tensor
-    freedom: Tensor
+    degrees_of_freedom: Tensor
 
-    def __init__(self, factor: Tensor, freedom: float | Tensor) -> None:
+    def __init__(self, factor: Tensor, degrees_of_freedom: float | Tensor) -> None:
         super().__init__()
         if factor.ndim != 2 or factor.shape[0] != factor.shape[1]:
             raise ShapeError(f"Student density: found a factor of {tuple(factor.shape)}, expected (D,D)")
         self.register_buffer("factor", factor.detach().float().contiguous())
-        self.register_buffer("freedom", torch.as_tensor(freedom).detach().float().reshape(()))
+        self.register_buffer("degrees_of_freedom", torch.as_tensor(degrees_of_freedom).detach().float().reshape(()))
 
     @classmethod
-    def fit(cls, samples: Tensor, freedom: float = 10.0, floor: float = PARTING_VARIANCE) -> StudentDensity:
+    def fit(cls, samples: Tensor, degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE) -> StudentDensity:
         r"""The likeliest :math:`\Sigma`, by expectation maximisation in float64.
 
         Args:
             samples: weights, (T,D).
-            freedom: :math:`\nu`.
-            floor: added to each variance: how far shapes that always moved together may part.
+            degrees_of_freedom: :math:`\nu`.
+            floor: added to each variance.
 
         Raises:
             ShapeError: fewer than two samples.
@@ -60,29 +60,33 @@ class StudentDensity(nn.Module):
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (T,D) with at least two")
         if not torch.isfinite(samples).all():
             raise ValueRangeError("samples: found NaN or infinity, expected weights")
-        if not 0 < freedom < math.inf or not 0 < floor < math.inf:
-            raise ValueRangeError(f"Student density: found freedom {freedom}, floor {floor}, expected positive numbers")
+        if not 0 < degrees_of_freedom < math.inf or not 0 < floor < math.inf:
+            raise ValueRangeError(
+                f"Student density: found {degrees_of_freedom} degrees of freedom and floor {floor}, "
+                "expected positive numbers"
+            )
         x = samples.detach().double()
         count, dimensions = x.shape
-        share = torch.ones(count, dtype=torch.float64, device=x.device)
+        sample_weights = torch.ones(count, dtype=torch.float64, device=x.device)
         precision = torch.eye(dimensions, dtype=torch.float64, device=x.device)
-        for _ in range(_ROUNDS):  # each round needs the shares of the one before
-            spread = (share[:, None] * x).T @ x / count
-            spread.diagonal().add_(floor)
-            precision = torch.cholesky_inverse(torch.linalg.cholesky(spread))
-            before, share = share, (freedom + dimensions) / (freedom + ((x @ precision) * x).sum(1))
-            if float((share - before).abs().max()) < 1e-4:
+        for _ in range(_ITERATIONS):  # each iteration needs the weights of the one before
+            covariance = (sample_weights[:, None] * x).T @ x / count
+            covariance.diagonal().add_(floor)
+            precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+            distance = ((x @ precision) * x).sum(1)
+            before, sample_weights = sample_weights, (degrees_of_freedom + dimensions) / (degrees_of_freedom + distance)
+            if float((sample_weights - before).abs().max()) < 1e-4:
                 break
-        return cls(torch.linalg.cholesky(precision), freedom)
+        return cls(torch.linalg.cholesky(precision), degrees_of_freedom)
 
     def log_density(self, samples: Tensor) -> Tensor:
         """:math:`\\log p` of samples (B,D), (B,)."""
-        factor, freedom = self.factor.to(samples), self.freedom.to(samples)
+        factor, nu = self.factor.to(samples), self.degrees_of_freedom.to(samples)
         dimensions = samples.shape[1]
-        half = 0.5 * (freedom + dimensions)
-        constant = torch.lgamma(half) - torch.lgamma(0.5 * freedom) - 0.5 * dimensions * (freedom * math.pi).log()
+        half = 0.5 * (nu + dimensions)
+        constant = torch.lgamma(half) - torch.lgamma(0.5 * nu) - 0.5 * dimensions * (nu * math.pi).log()
         distance = (samples @ factor).square().sum(1)
-        return constant + factor.diagonal().log().sum() - half * torch.log1p(distance / freedom)
+        return constant + factor.diagonal().log().sum() - half * torch.log1p(distance / nu)
 
     def bound(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         r"""A quadratic that touches :math:`-\log p` at samples (B,D) and lies above it everywhere else.
@@ -93,10 +97,10 @@ class StudentDensity(nn.Module):
         Returns:
             H (B,D,D) and f (B,D) of :math:`\tfrac12 x^\top H x + f^\top x`.
         """
-        factor, freedom = self.factor.to(samples), self.freedom.to(samples)
+        factor, nu = self.factor.to(samples), self.degrees_of_freedom.to(samples)
         distance = (samples @ factor).square().sum(1)
-        share = (freedom + samples.shape[1]) / (freedom + distance)
-        return share[:, None, None] * (factor @ factor.T), torch.zeros_like(samples)
+        scale = (nu + samples.shape[1]) / (nu + distance)
+        return scale[:, None, None] * (factor @ factor.T), torch.zeros_like(samples)
 
     def mapped(self, matrix: Tensor, floor: Tensor) -> StudentDensity:
         """The density of y = Mx with a variance added to each y.
@@ -106,10 +110,10 @@ class StudentDensity(nn.Module):
             floor: (E,), not negative; positive where M makes entries of y depend on each other.
         """
         factor, matrix = self.factor.double(), matrix.to(self.factor.device).double()
-        spread = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factor @ factor.T)) @ matrix.T
-        spread.diagonal().add_(floor.to(spread))
+        covariance = matrix @ torch.cholesky_inverse(torch.linalg.cholesky(factor @ factor.T)) @ matrix.T
+        covariance.diagonal().add_(floor.to(covariance))
         return StudentDensity(
-            torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(spread))), self.freedom
+            torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))), self.degrees_of_freedom
         )
 
     @property

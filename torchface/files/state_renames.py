@@ -1,0 +1,63 @@
+"""Names that parts of saved states and configs once had: models saved under them still load."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+_SHAPE_PRIOR = {"log_shares": "log_mixing_weights", "freedom": "degrees_of_freedom"}
+_DYNAMICS_PRIOR = {
+    "trust": "gain",
+    "processes.spread": "processes.covariance_root",
+    "noise.rest": "noise.rest_variance",
+    "noise.own": "noise.own_coefficients",
+    "noise.shared": "noise.group_coefficients",
+    "noise.together": "noise.group_average",
+}
+STATE_RENAMES: Mapping[str, Mapping[str, str]] = {
+    "dynamics_prior": _DYNAMICS_PRIOR,
+    "reciprocal_prior": _SHAPE_PRIOR,
+    "shape_prior": _SHAPE_PRIOR,
+    "video_solver": {**_SHAPE_PRIOR, **_DYNAMICS_PRIOR},
+}
+"""For each kind of model: a state key's last parts as they were, and as they are now."""
+
+CONFIG_RENAMES: Mapping[str, Mapping[str, str]] = {}
+"""For each kind of model: a config key as it was, at any depth, and as it is now."""
+
+
+def current_state_keys(kind: str, stored: Collection[str], expected: Collection[str]) -> dict[str, str]:
+    """What the keys of a stored state are called now.
+
+    A key is renamed only where the module lacks it, has the new one, and the state does not hold that one besides;
+    what is left over is for the reader to refuse.
+
+    Args:
+        kind: of the model, a key of :data:`STATE_RENAMES`.
+        stored: keys of the file.
+        expected: keys of the module's own state.
+
+    Returns:
+        A name for each of ``stored``, all different.
+    """
+    names = {key: key for key in stored}
+    for key in stored:
+        for old, new in STATE_RENAMES.get(kind, {}).items():
+            renamed = key.removesuffix(old) + new
+            whole = key == old or key.endswith(f".{old}")
+            if whole and key not in expected and renamed in expected and renamed not in names.values():
+                names[key] = renamed
+    return names
+
+
+def current_config(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config under the names of today, nested tables and lists included; a key that is there under both stays."""
+    renames = CONFIG_RENAMES.get(kind, {})
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            names = {key: renames.get(key, key) for key in value}
+            return {key if names[key] in value else names[key]: renamed(inner) for key, inner in value.items()}
+        return [renamed(inner) for inner in value] if isinstance(value, list) else value
+
+    return dict(renamed(config))
