@@ -290,8 +290,8 @@ def test_a_mutated_model_is_loaded_or_refused(solver: MarkerSolver, dome_rig: Bl
         bundles[-1].write_bytes(
             (folder / "model.toml").read_bytes() + _BETWEEN + (folder / "state.safetensors").read_bytes()
         )
-    report = check_reader(read_bundle, bundles, ".bundle", cases=300)
-    assert report.refused > 200
+    report = check_reader(read_bundle, bundles, ".bundle")
+    assert report.refused > report.cases * 2 / 3
     assert report.read > 10
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import time
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mutation import SECONDS, check_reader, mutated, mutations
+from mutation import SECONDS, check_reader, mutated
 
 from torchface.errors import FileFormatError
 
@@ -73,13 +74,13 @@ def test_a_reader_that_misbehaves_is_caught_and_its_case_kept(reader: object, me
     kept.unlink()
 
 
-@given(data=mutated(GOOD))
-def test_damages_stay_of_the_size_of_the_file(data: bytes) -> None:
+@given(seed=st.integers(0, 2**31))
+def test_damages_stay_of_the_size_of_the_file_and_repeat_by_seed(seed: int) -> None:
+    data = mutated(GOOD, random.Random(seed))
     assert len(data) < len(GOOD) + 200_000
+    assert data == mutated(GOOD, random.Random(seed))
 
 
-@given(seed=st.integers(0, 1000))
-def test_damages_repeat_by_seed(seed: int) -> None:
-    first = list(mutations(GOOD, 5, seed))
-    assert first == list(mutations(GOOD, 5, seed))
-    assert any(data != GOOD for data in first)
+def test_most_damages_change_the_file() -> None:
+    generator = random.Random(0)
+    assert sum(mutated(GOOD, generator) != GOOD for _ in range(100)) > 80
