@@ -66,8 +66,8 @@ def test_a_slipping_helmet_is_named_and_passes_once_its_motion_is_taken_out(perf
     markers = filmed(performance, StageFlaws(slip_translation=8, slip_rotation=3))
     found = check_fit(sites(rig, attachment), markers)
     assert found.cause == "slip"
-    assert found.mended < 0.2 * found.distance
-    assert check_fit(sites(rig, attachment), markers, slip=True).distance == pytest.approx(found.mended, abs=0.1)
+    assert found.corrected < 0.2 * found.distance
+    assert check_fit(sites(rig, attachment), markers, slip=True).distance == pytest.approx(found.corrected, abs=0.1)
 
 
 def test_few_markers_close_together_may_stand_off_the_skin(performance: Performance) -> None:
@@ -78,7 +78,7 @@ def test_few_markers_close_together_may_stand_off_the_skin(performance: Performa
     take = record(rig, brow, takes[0][::24], torch.Generator().manual_seed(0), StageFlaws(standoff=3)).take
     assert take.markers is not None
     found = check_fit(sites(rig, brow), take.markers.values)
-    assert found.spread < 30
+    assert found.radius < 30
     assert not found.refused
 
 
@@ -91,7 +91,7 @@ def test_a_take_in_another_space_is_refused_for_its_alignment(
     assert found.refused
     assert found.cause == "alignment"
     assert found.distance > 100
-    assert found.mended < 0.6
+    assert found.corrected < 0.6
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_a_wrong_unit_is_told_by_its_scale(
     found = check_fit(sites(rig, attachment), factor * (stage_space.apply(markers) if elsewhere else markers))
     assert found.refused
     assert (found.cause, found.unit) == ("unit", unit)
-    assert found.mended < 0.6
+    assert found.corrected < 0.6
 
 
 def test_sites_of_other_markers_are_refused_wherever_the_take_lies(performance: Performance) -> None:

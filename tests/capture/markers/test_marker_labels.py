@@ -11,7 +11,7 @@ KNOWN = ("M001", "M002", "brow_L")
 
 
 @pytest.mark.parametrize(
-    ("found", "labels", "strangers"),
+    ("found", "labels", "unmatched"),
     [
         (("M002", "M001"), ("M002", "M001"), ()),
         (("Actor:M001", "Actor:M002", "Actor:helmet", "*12"), ("M001", "M002"), ("Actor:helmet", "*12")),
@@ -22,12 +22,12 @@ KNOWN = ("M001", "M002", "brow_L")
     ],
 )
 def test_prefixes_and_case_do_not_matter(
-    found: tuple[str, ...], labels: tuple[str, ...], strangers: tuple[str, ...]
+    found: tuple[str, ...], labels: tuple[str, ...], unmatched: tuple[str, ...]
 ) -> None:
     match = match_labels(found, KNOWN)
     assert match.labels == labels
-    assert match.strangers == strangers
-    assert match.channels == tuple(name for name in found if name not in strangers)
+    assert match.unmatched == unmatched
+    assert match.channels == tuple(name for name in found if name not in unmatched)
 
 
 def test_an_attachment_with_a_subjects_prefix_serves_another_subject() -> None:
@@ -38,7 +38,7 @@ def test_an_attachment_with_a_subjects_prefix_serves_another_subject() -> None:
 def test_a_map_goes_first_and_leaves_out() -> None:
     match = match_labels(["face1", "M001", "Actor:M002"], KNOWN, {"face1": "M001", "Actor:M002": ""})
     assert (match.channels, match.labels) == (("face1",), ("M001",))
-    assert match.strangers == ("M001", "Actor:M002")
+    assert match.unmatched == ("M001", "Actor:M002")
 
 
 def test_a_map_leaves_out_a_whole_subject() -> None:
@@ -64,6 +64,6 @@ def test_what_cannot_be_decided_is_said(found: tuple[str, ...], renamed: dict[st
 def test_without_an_attachment_every_labelled_marker_counts() -> None:
     match = own_labels(["Actor:a", "Actor:b", "*3", "unlabeled4", "Actor:*5", "helmet"], {"helmet": ""})
     assert match.labels == ("a", "b")
-    assert match.strangers == ("*3", "unlabeled4", "Actor:*5", "helmet")
+    assert match.unmatched == ("*3", "unlabeled4", "Actor:*5", "helmet")
     # Two subjects: the prefix is what tells them apart.
     assert own_labels(["A:a", "B:a"]).labels == ("A:a", "B:a")

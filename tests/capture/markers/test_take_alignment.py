@@ -67,7 +67,7 @@ def test_what_is_left_at_rest_is_told_and_subtracted(performance: Performance) -
         assert solved is not None
         return float((solved.values[..., 0] - takes[0][::5]).abs().mean())
 
-    once, often = (rest_residual(rig, attachment, shifted, rounds=rounds) for rounds in (1, 4))
+    once, often = (rest_residual(rig, attachment, shifted, iterations=count) for count in (1, 4))
     assert often.residual is not None
     # Most of the shift is seen as such; the part that expressions can imitate is not.
     assert float((often.residual - shift).norm()) < 0.7 * float(shift.norm())

@@ -49,7 +49,7 @@ def test_without_release_it_is_the_exact_quadratic_program(
     take = record(small_rig, small_attachment, weights, generator, StageFlaws(noise=1.0)).take
     assert take.markers is not None
     solver = MarkerSolver(small_rig, small_attachment, ridge=0.01)
-    whole = WholeTakeSolver(solver, smoothness=5.0, release=float("inf"), sparsity=0.05)
+    whole = WholeTakeSolver(solver, smoothness=5.0, huber_threshold=float("inf"), sparsity=0.05)
     markers = take.markers.values.double()
     bend = curvature(torch.eye(frames, dtype=torch.float64))
     energy = solver.energy(markers)
@@ -91,7 +91,7 @@ def test_a_blink_keeps_its_height(small_rig: BlendshapeRig, small_attachment: At
     assert take.markers is not None
     solver = MarkerSolver(small_rig, small_attachment)
     kept = WholeTakeSolver(solver)(take.markers.values)[:, 3].max()
-    flattened = WholeTakeSolver(solver, release=float("inf"))(take.markers.values)[:, 3].max()
+    flattened = WholeTakeSolver(solver, huber_threshold=float("inf"))(take.markers.values)[:, 3].max()
     assert kept > 0.85
     assert kept > flattened
 

@@ -43,7 +43,7 @@ def takes(rig: BlendshapeRig) -> list[Tensor]:
 def solver(rig: BlendshapeRig, takes: list[Tensor]) -> VideoSolver:
     """With both priors."""
     pytest.importorskip("gpytorch")
-    quick = DynamicsSettings(inducing=10, subset=60, rounds=3)
+    quick = DynamicsSettings(inducing=10, subset=60, iterations=3)
     dynamics = DynamicsPrior.fit(takes, NAMES, window=3, settings=quick)
     return VideoSolver(rig, None, K, ShapePrior.fit(takes, NAMES), dynamics, VideoSettings(relative_noise=0.01))
 
@@ -71,7 +71,7 @@ def test_the_state_of_another_rig_takes_effect(
 ) -> None:
     """Its camera and priors too, after the solver has been used."""
     intrinsics = torch.diag(torch.tensor([1.1, 1.1, 1.0], dtype=torch.float64)) @ K
-    quick = DynamicsSettings(inducing=10, subset=60, rounds=2, seed=1)
+    quick = DynamicsSettings(inducing=10, subset=60, iterations=2, seed=1)
     dynamics = DynamicsPrior.fit([take.flip(0) for take in takes], NAMES, window=3, settings=quick)
     prior = ShapePrior.fit([0.5 * take for take in takes], NAMES)
     theirs = VideoSolver(other, None, intrinsics, prior, dynamics, solver.settings)

@@ -225,7 +225,7 @@ def test_learned_dynamics_are_used(small: BlendshapeRig) -> None:
     pytest.importorskip("gpytorch")
     from torchface.capture.priors import DynamicsSettings
 
-    quick = DynamicsSettings(inducing=10, subset=60, rounds=3)
+    quick = DynamicsSettings(inducing=10, subset=60, iterations=3)
     dynamics = DynamicsPrior.fit([acted(90), acted(70).flip(0)], SEEN, window=3, settings=quick)
     found = film(small, acted(12), *poses(12), noise=1.0)
     with_it, without = (VideoSolver(small, None, K, dynamics=d)(found).weights for d in (dynamics, None))

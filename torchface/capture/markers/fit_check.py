@@ -1,4 +1,4 @@
-"""Whether a rig explains the markers of a take at all, and if not, why: told by trying what would make it."""
+"""Whether a rig explains the markers of a take, and if not, the cause whose correction helps most."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 # 1.4 to 1.6.
 TRIED_SHARE, DOUBTFUL_SHARE, REFUSED_SHARE = 0.015, 0.035, 0.1
 # Markers on the brows alone lie close together; they stand as far off the skin as those of a whole face.
-_LEAST_SPREAD = 40.0
-# What is tried counts as the cause if it leaves this part of the distance.
-_MENDED = 0.5
+_MIN_RADIUS = 40.0
+# A correction names the cause if it leaves less than this part of the distance.
+_CORRECTED = 0.5
 _UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0}
 _UNIT_TOLERANCE = 1.25
-# Beyond this no helmet slips: half the spread of the sites, or half a radian.
-_FARTHEST_SLIP, _LARGEST_TURN = 0.5, 0.5
+# Beyond this no helmet slips: half the radius of the sites, or half a radian.
+_MAX_SLIP, _MAX_SLIP_ANGLE = 0.5, 0.5
 _FRAMES, _RIDGE = 240, 0.01
-_SLIP_ROUNDS, _SETTLED = 40, 1e-3
+_SLIP_ITERATIONS, _TOLERANCE = 40, 1e-3
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,17 @@ class FitCheck:
 
     Args:
         distance: median over all samples that were seen, millimetres of rig space.
-        spread: of the sites at rest, mean distance from their centre, millimetres.
+        radius: of the sites at rest, mean distance from their centre, millimetres.
         cause: what most likely is wrong: ``unit``, ``alignment``, ``slip`` (the helmet moves on the head) or
             ``attachment`` (sites, labels or rig are other ones); empty where nothing is.
-        mended: what the distance becomes without that cause, millimetres; NaN where nothing that was tried helps.
-        similarity: what lays the markers on the rig best, (1,).
+        corrected: the distance without that cause, millimetres; NaN where no correction helps.
+        similarity: that aligns the markers with the rig best, (1,).
     """
 
     distance: float
-    spread: float
+    radius: float
     cause: str = ""
-    mended: float = math.nan
+    corrected: float = math.nan
     similarity: Similarity | None = None
 
     @property
@@ -71,7 +71,7 @@ class FitCheck:
 
     @property
     def _size(self) -> float:
-        return max(self.spread, _LEAST_SPREAD)
+        return max(self.radius, _MIN_RADIUS)
 
     @property
     def unit(self) -> str:
@@ -84,13 +84,13 @@ class FitCheck:
 def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     """Solves some frames of a take for weights, and where markers stay far from the rig looks for the cause.
 
-    Weights are solved with hardly a price, so that nothing but what the rig cannot do is left. Where the median
-    distance is more than noise makes, the take is laid on the rig by one similarity, then by a rigid motion a frame;
-    what leaves less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Label
-    swaps, spikes and markers that fell off move the median little: they are no cause.
+    Weights are solved with hardly a penalty, so that the distance is what the rig cannot explain. Where its median
+    is more than noise, the take is aligned by one similarity, then by a rigid motion a frame; a correction that leaves
+    less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Label swaps, spikes
+    and markers that fell off move the median little: they are no cause.
 
     Args:
-        affine: where each marker's site goes with the weights, (M,3,N+1), mm: at rest, then what each shape adds.
+        affine: of each marker's site in the weights, (M,3,N+1), mm: at rest, then each shape's delta.
         markers: (T,M,3), in rig space as far as is known, NaN for not seen.
         slip: the helmet's motion will be taken out: it is not part of the distance.
 
@@ -99,53 +99,53 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     """
     affine, markers = affine.double(), markers.double()
     rest = affine[..., 0]
-    spread = float((rest - rest.mean(0)).norm(dim=1).mean())
+    radius = float((rest - rest.mean(0)).norm(dim=1).mean())
     few = markers[~torch.isnan(markers).any(-1).all(1)]
     few = few[:: max(1, len(few) // _FRAMES)]
     if not len(few):
-        return FitCheck(math.nan, spread, "attachment")
-    apart = _distance(affine, few)
-    found = FitCheck(apart, spread)
+        return FitCheck(math.nan, radius, "attachment")
+    distance = _distance(affine, few)
+    found = FitCheck(distance, radius)
     if slip and not found.refused:
         return _with_slip(affine, few, found)
     if not found.noisy:
         return found
     if int((~torch.isnan(few).any(-1).all(0)).sum()) < 3:
-        return _otherwise(found)
+        return _uncorrected(found)
     pose = pose_of_take(affine, few)
     laid = pose.apply(few)
-    if slip and not _is_elsewhere(pose, few, spread):
+    if slip and not _is_elsewhere(pose, few, radius):
         return _with_slip(affine, few, found)
     found = replace(found, similarity=pose)
-    mended = _distance(affine, laid)
-    if replace(found, distance=mended).noisy and not _is_elsewhere(pose, few, spread):
+    corrected = _distance(affine, laid)
+    if replace(found, distance=corrected).noisy and not _is_elsewhere(pose, few, radius):
         steady = _distance(affine, _without_motion(affine, laid))
-        if steady < _MENDED * mended:
-            return replace(found, cause="slip", mended=steady)
-    if mended < _MENDED * apart:
+        if steady < _CORRECTED * corrected:
+            return replace(found, cause="slip", corrected=steady)
+    if corrected < _CORRECTED * distance:
         cause = "unit" if unit_of_scale(float(pose.scale[0])) else "alignment"
-        return replace(found, cause=cause, mended=mended)
-    return _otherwise(found)
+        return replace(found, cause=cause, corrected=corrected)
+    return _uncorrected(found)
 
 
-def _otherwise(found: FitCheck) -> FitCheck:
-    """Where nothing that was tried helps, it is the sites or the rig; or only noise, if the distance is small."""
+def _uncorrected(found: FitCheck) -> FitCheck:
+    """Where no correction helps, it is the sites or the rig; or only noise, if the distance is small."""
     return replace(found, cause="attachment") if found.doubtful else found
 
 
 def _with_slip(affine: Tensor, markers: Tensor, found: FitCheck) -> FitCheck:
     """The check of markers that a rigid motion a frame may move."""
-    return _otherwise(replace(found, distance=_distance(affine, _without_motion(affine, markers))))
+    return _uncorrected(replace(found, distance=_distance(affine, _without_motion(affine, markers))))
 
 
-def _is_elsewhere(pose: Similarity, markers: Tensor, spread: float) -> bool:
+def _is_elsewhere(pose: Similarity, markers: Tensor, radius: float) -> bool:
     """Whether a similarity moves markers (T,M,3) farther, or changes their size by more, than a helmet's slip would."""
     mean = markers.nanmean(0)
     mean = mean[~torch.isnan(mean).any(-1)]
-    shift = float((pose.apply(mean)[0] - mean).mean(0).norm())
-    turn = math.acos(min(max((float(pose.rotation[0].diagonal().sum()) - 1) / 2, -1.0), 1.0))
+    translation = float((pose.apply(mean)[0] - mean).mean(0).norm())
+    angle = math.acos(min(max((float(pose.rotation[0].diagonal().sum()) - 1) / 2, -1.0), 1.0))
     grown = abs(math.log(float(pose.scale[0])))
-    return shift > _FARTHEST_SLIP * spread or turn > _LARGEST_TURN or grown > math.log(_UNIT_TOLERANCE)
+    return translation > _MAX_SLIP * radius or angle > _MAX_SLIP_ANGLE or grown > math.log(_UNIT_TOLERANCE)
 
 
 def unit_of_scale(scale: float) -> str:
@@ -169,16 +169,16 @@ def _distance(affine: Tensor, markers: Tensor) -> float:
 
 
 def _without_motion(affine: Tensor, markers: Tensor) -> Tensor:
-    """Markers (T,M,3) with each frame laid on the rig by a rigid motion, found in turns with the weights."""
+    """Markers (T,M,3) with each frame aligned with the rig by a rigid motion, alternating with the weights."""
     rest = affine[..., 0].expand_as(markers)
     able = (~torch.isnan(markers).any(-1)).sum(1) >= 3
     markers = markers[able]
     moved = similarity_transform(markers, rest[able], scale=False).apply(markers)
     weights = None
-    for _ in range(_SLIP_ROUNDS):
+    for _ in range(_SLIP_ITERATIONS):
         weights = solve_weights(affine, moved, _RIDGE, weights)
         on_rig = affine[..., 0] + torch.einsum("mcn,tn->tmc", affine[..., 1:], weights)
         before, moved = moved, similarity_transform(markers, on_rig, scale=False).apply(markers)
-        if float((moved - before).norm(dim=-1).nan_to_num().max()) < _SETTLED:
+        if float((moved - before).norm(dim=-1).nan_to_num().max()) < _TOLERANCE:
             break
     return moved

@@ -11,24 +11,25 @@ from torchface.attachment import Attachment
 from torchface.capture.energy import marker_term
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError
+from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.temporal import bridged, nearest_rows
 
-# A turn counts by how far it moves a point this far from the pivot, so that all six columns are of one size.
+# Rotations are scaled to the motion of a point this far from the pivot, in mm, so that all six columns are of one size.
 _ARM = 30.0
-# mm² a marker for a squared millimetre of slip: decides only where markers are too few to tell a motion.
+# mm² a marker for a squared millimetre of slip: counts only where markers are too few to determine a motion.
 _MOTION_RIDGE = 1e-4
-_EXACT_STEPS, _SETTLED = 6, 1e-4
+_MAX_ITERATIONS, _MOTION_TOLERANCE = 6, 1e-4
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 _CHUNK_NUMBERS = 2**23
 
 
 @dataclass(frozen=True, eq=False)
 class HelmetMotion:
-    r"""How the helmet moved against the head: a point p of the face was seen at :math:`R (p - c) + c + t`.
+    r"""The motion of the helmet against the head: a point p of the face was seen at :math:`R (p - c) + c + t`.
 
     Args:
         rotation: :math:`R`, (T,3,3).
@@ -53,14 +54,8 @@ class HelmetMotion:
         ) + self.pivot.to(markers)
 
     def degrees(self) -> Tensor:
-        """The rotation as turns about x, y and z (a rotation vector), (T,3), degrees."""
-        skew = 0.5 * (self.rotation - self.rotation.transpose(1, 2))
-        axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
-        sine = axis.norm(dim=1)
-        cosine = 0.5 * (self.rotation.diagonal(dim1=1, dim2=2).sum(1) - 1)
-        angle = torch.atan2(sine, cosine)
-        factor = torch.where(sine > 1e-8, angle / sine.clamp(min=1e-8), 1.0)
-        return torch.rad2deg(axis * factor[:, None])
+        """The rotation vectors, (T,3), degrees."""
+        return torch.rad2deg(rotation_vector(self.rotation))
 
 
 class HelmetSolver(nn.Module):
@@ -70,10 +65,10 @@ class HelmetSolver(nn.Module):
         \min_{0 \le w \le 1,\,R,\,t} \frac{1}{|S|} \sum_{m \in S}
         \lVert R (b_m + B_m w - c) + c + t - y_m \rVert^2 + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
 
-    Six dummy shapes take up the motion: translations along the axes and, as the small turn :math:`d\omega \times
-    (b_m - c)`, rotations about them. They are unbounded, which takes the place of a positive and a negative one each,
-    and free of the sparsity. ``exact`` undoes the rigid motion that a solve found and solves again until none is left,
-    so that the motion is rigid however large it is; otherwise one solve with the linear shapes is all.
+    Six dummy shapes model the motion: translations along the axes and, as the small rotation :math:`d\omega \times
+    (b_m - c)`, rotations about them. They are unbounded, in place of a positive and a negative one each, and
+    without sparsity. ``exact`` undoes the rigid motion that a solve found and solves again until none is left, so that
+    large motions are rigid too; otherwise there is one solve with the linear shapes.
 
     Args:
         rig, attachment, alignment, sparsity, ridge: as in ``MarkerSolver``.
@@ -129,7 +124,7 @@ class HelmetSolver(nn.Module):
         tolerance = _TOLERANCE.get(markers.dtype, 3e-6)
         gaps = torch.isnan(seen).any(-1).any(-1)
         if bool(torch.isnan(seen).any(-1).all(-1).any()):
-            self.markers(markers)  # says which frames are empty
+            self.markers(markers)  # its error names the empty frames
         weights = seen.new_zeros(len(seen), len(self.names))
         rotation = torch.eye(3, dtype=seen.dtype, device=seen.device).repeat(len(seen), 1, 1)
         translation = seen.new_zeros(len(seen), 3)
@@ -169,29 +164,29 @@ class HelmetSolver(nn.Module):
         bound = rest.new_tensor([torch.inf]).expand(6)
         lower = torch.cat([rest.new_zeros(shapes), -bound])
         upper = torch.cat([rest.new_ones(shapes), bound])
-        price = rest.new_zeros(shapes + 6)
-        price[:shapes] = self.markers.sparsity
+        penalty = rest.new_zeros(shapes + 6)
+        penalty[:shapes] = self.markers.sparsity
         ridge = rest.new_full((shapes + 6,), 2 * _MOTION_RIDGE)
         ridge[:shapes] = 2 * self.markers.ridge
         rotation = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(seen), 3, 3)
         translation = rest.new_zeros(len(seen), 3)
         solution: Tensor | None = None
         shared: BoxQP | None = None
-        for _ in range(_EXACT_STEPS if self.exact else 1):
-            here = HelmetMotion(rotation, translation, pivot).undo(seen)
-            energy = marker_term(columns, rest, here)
-            H, f = energy.H + torch.diag(ridge), energy.f + price
+        for _ in range(_MAX_ITERATIONS if self.exact else 1):
+            unmoved = HelmetMotion(rotation, translation, pivot).undo(seen)
+            energy = marker_term(columns, rest, unmoved)
+            H, f = energy.H + torch.diag(ridge), energy.f + penalty
             if H.ndim == 2:
                 shared = shared or BoxQP(H, lower, upper, tolerance)
                 solution = shared(f, solution)
             else:
                 solution = box_qp(H, f, lower, upper, solution, tolerance)
-            slid, turned = solution[:, shapes : shapes + 3], rigid_turn(solution[:, shapes + 3 :])
-            translation = translation + (rotation @ slid[..., None])[..., 0]
-            rotation = rotation @ turned
+            step = solution[:, shapes : shapes + 3]
+            translation = translation + (rotation @ step[..., None])[..., 0]
+            rotation = rotation @ rigid_rotation(solution[:, shapes + 3 :])
             moved = float(solution[:, shapes:].abs().max())
             solution = torch.cat([solution[:, :shapes], torch.zeros_like(solution[:, shapes:])], dim=1)
-            if moved < _SETTLED:
+            if moved < _MOTION_TOLERANCE:
                 break
         assert solution is not None
         return solution[:, :shapes], rotation, translation
@@ -204,13 +199,10 @@ def rigid_columns(rest: Tensor, pivot: Tensor) -> Tensor:
     """Six columns of rigid motion (M,3,6) for sites at rest (M,3): along x, y, z, then about them, each of 1 mm."""
     arm = (rest - pivot)[:, None, :].expand(-1, 3, -1)
     axes = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3)
-    turns = torch.linalg.cross(axes, arm, dim=-1) / _ARM
-    return torch.cat([axes, turns.transpose(1, 2)], dim=2)
+    rotations = torch.linalg.cross(axes, arm, dim=-1) / _ARM
+    return torch.cat([axes, rotations.transpose(1, 2)], dim=2)
 
 
-def rigid_turn(turns: Tensor) -> Tensor:
-    """The rotations (B,3,3) of the last three of ``rigid_columns``'s weights (B,3)."""
-    x, y, z = (turns / _ARM).unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
-    return torch.linalg.matrix_exp(skew)
+def rigid_rotation(weights: Tensor) -> Tensor:
+    """The rotations (B,3,3) of weights (B,3) of the last three of ``rigid_columns``."""
+    return rotation_matrix(weights / _ARM)

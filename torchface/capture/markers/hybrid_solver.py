@@ -1,4 +1,4 @@
-"""Blendshape weights from markers and from what a classifier saw between them."""
+"""Blendshape weights from markers and from a classifier's predictions."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from torchface.take import Take, Track
 from torchface.temporal import bridged, savitzky_golay
 
 GAMMA = 4.0
-"""The classifier's greatest say, mm² over all markers for a squared weight of 1."""
+"""Largest weight of a prediction, mm² over all markers for a squared weight of 1."""
 
 # Numbers in the matrices of frames that are in memory at once: 64 MB of float64.
 _CHUNK_NUMBERS = 2**23
 
 
 def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order: int = 2) -> Tensor:
-    r"""How much a classifier has to say in each frame, fading in and out.
+    r"""The weight of a classifier's predictions in each frame, smoothed over time.
 
-    Where it is asked :math:`\gamma` is ``maximum``, elsewhere 0; smoothed over time, and kept in [0, ``maximum``],
+    Where it is active :math:`\gamma` is ``maximum``, elsewhere 0; smoothed over time, and kept in [0, ``maximum``],
     which the filter overshoots (a negative :math:`\gamma` would leave the energy without a minimum).
 
     Args:
-        active: which shapes the classifier shall lead in which frames, (T,N) bool.
+        active: which shapes the classifier predicts in which frames, (T,N) bool.
         maximum: mm² over all markers for a squared weight of 1; of the order of the markers' squared error.
         window, order: of :func:`torchface.temporal.savitzky_golay`.
 
     Returns:
-        :math:`\gamma`, (T,N) float32; exactly 0 where the classifier leads in no frame of the window.
+        :math:`\gamma`, (T,N) float32; exactly 0 where no frame of the window is active.
 
     Raises:
         ShapeError: ``active`` is not (T,N).
@@ -46,12 +46,12 @@ def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order
     if not 0 <= maximum < float("inf"):
         raise ValueRangeError(f"maximum: found {maximum}, expected a number that is not negative")
     smooth = savitzky_golay(maximum * active.double(), window, order)
-    # Rounding must not leave a say where there is none.
+    # Rounding must not leave a weight where there is none.
     return torch.where(smooth < 1e-9 * maximum, 0.0, smooth).clamp(0.0, maximum).float()
 
 
 class HybridSolver(nn.Module):
-    r"""Solves markers for blendshape weights, some of which a classifier knows better.
+    r"""Solves markers for blendshape weights, some of which a classifier predicts.
 
     .. math::
         \min_{0 \le w \le 1} E(w) + \frac{1}{M} \sum_i \gamma_i (w_i - \tilde w_i)^2
@@ -84,8 +84,8 @@ class HybridSolver(nn.Module):
 
         Args:
             markers: (B,M,3), millimetres, in the order of ``markers.labels``; NaN for not seen.
-            predicted: :math:`\tilde w`, what the classifier says, (B,N); only looked at where :math:`\gamma > 0`.
-            gamma: :math:`\gamma`, how much it counts, (B,N), mm² over all markers; see :func:`gamma_curves`.
+            predicted: :math:`\tilde w`, the classifier's prediction, (B,N); used only where :math:`\gamma > 0`.
+            gamma: :math:`\gamma`, its weight, (B,N), mm² over all markers; see :func:`gamma_curves`.
 
         Returns:
             Weights in [0,1], (B,N), differentiable in markers and predictions.
@@ -96,16 +96,16 @@ class HybridSolver(nn.Module):
         """
         self._check(markers, predicted, gamma)
         alone: Tensor = self.markers(markers)
-        led = (gamma > 0).any(1).nonzero()[:, 0]
-        if not len(led):
+        pulled = (gamma > 0).any(1).nonzero()[:, 0]
+        if not len(pulled):
             return alone
         parts = []
-        for chunk in led.split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
-            asked = gamma[chunk] > 0
-            energy = self.energy(markers[chunk], torch.where(asked, predicted[chunk], 0.0), gamma[chunk])
+        for chunk in pulled.split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
+            active = gamma[chunk] > 0
+            energy = self.energy(markers[chunk], torch.where(active, predicted[chunk], 0.0), gamma[chunk])
             H = energy.H if energy.H.ndim == 3 else energy.H.expand(len(chunk), -1, -1)
             parts.append(box_qp(H, energy.f, 0.0, 1.0, alone[chunk].detach().double()).to(alone.dtype))
-        return alone.index_copy(0, led, torch.cat(parts))
+        return alone.index_copy(0, pulled, torch.cat(parts))
 
     def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:
         """The take with weights solved from its markers and from predicted curves, matched by name.

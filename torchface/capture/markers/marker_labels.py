@@ -13,21 +13,21 @@ _UNLABELLED = re.compile(r"\*\d*|un(label?led|named|known)[\s_*-]*\d*", re.IGNOR
 
 @dataclass(frozen=True)
 class LabelMatch:
-    """What a take's labels mean.
+    """A take's labels matched to an attachment's.
 
     Args:
         channels: of the take's labels, those that are markers of the attachment.
-        labels: what the attachment calls each of them.
-        strangers: the take's labels that are none of the attachment's.
+        labels: the attachment's label of each of them.
+        unmatched: the take's labels that are none of the attachment's.
     """
 
     channels: tuple[str, ...]
     labels: tuple[str, ...]
-    strangers: tuple[str, ...]
+    unmatched: tuple[str, ...]
 
     def notes(self) -> list[str]:
         """For people to read: what was left out."""
-        return [f"left out {_listed(self.strangers)}: not among the attachment's markers"] if self.strangers else []
+        return [f"left out {_listed(self.unmatched)}: not among the attachment's markers"] if self.unmatched else []
 
 
 def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[str, str] | None = None) -> LabelMatch:
@@ -53,24 +53,24 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
             raise NameMismatchError(
                 f"labels: found {_listed(absent)} in the map, expected labels of {side}: {_listed(there)}"
             )
-    taken: dict[str, str] = {}  # channel by known label
+    assigned: dict[str, str] = {}  # channel by known label
     for channel, own in renamed.items():
         if own:
-            _take(taken, own, channel)
+            _assign(assigned, own, channel)
     for fold in (False, True):
         folded = {_spelled(label, fold): label for label in known}
         bare = {_spelled(_bare(label), fold): label for label in known}
         for strip in (False, True):
             here: dict[str, str] = {}
             for channel in found:
-                if channel in renamed or channel in taken.values():
+                if channel in renamed or channel in assigned.values():
                     continue
                 label = _known_as(channel, folded, bare, fold, strip)
-                if label is None or label in taken:
+                if label is None or label in assigned:
                     continue
-                _take(here, label, channel)
-            taken |= here
-    by_channel = {channel: label for label, channel in taken.items()}
+                _assign(here, label, channel)
+            assigned |= here
+    by_channel = {channel: label for label, channel in assigned.items()}
     channels = tuple(channel for channel in found if channel in by_channel)
     if not channels:
         raise NameMismatchError(
@@ -109,9 +109,9 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
         raise NameMismatchError(f"labels: found {_listed(found)}, expected labelled markers")
     bare = [renamed.get(name, _bare(name)) for name in channels]
     labels = bare if len(set(bare)) == len(bare) else [renamed.get(name, name) for name in channels]
-    taken: dict[str, str] = {}
+    assigned: dict[str, str] = {}
     for channel, label in zip(channels, labels, strict=True):
-        _take(taken, label, channel)
+        _assign(assigned, label, channel)
     return LabelMatch(tuple(channels), tuple(labels), tuple(name for name in found if name not in channels))
 
 
@@ -127,14 +127,14 @@ def _known_as(channel: str, known: Mapping[str, str], bare: Mapping[str, str], f
     """The known label of a channel, its whole name or what follows a separator in it."""
     if not strip:
         return known.get(_spelled(channel, fold))
-    for rest in _rests(channel):
+    for rest in _suffixes(channel):
         label = known.get(_spelled(rest, fold)) or bare.get(_spelled(rest, fold))
         if label is not None:
             return label
     return None
 
 
-def _rests(name: str) -> Iterable[str]:
+def _suffixes(name: str) -> Iterable[str]:
     """A name, then what follows each separator of a subject's prefix in it, the longest first."""
     yield name
     for separator in re.finditer(r"[:|/._-]", name):
@@ -149,15 +149,15 @@ def _spelled(name: str, fold: bool) -> str:
     return name.strip().casefold() if fold else name.strip()
 
 
-def _take(taken: dict[str, str], label: str, channel: str) -> None:
-    if label in taken:
+def _assign(assigned: dict[str, str], label: str, channel: str) -> None:
+    if label in assigned:
         raise NameMismatchError(
-            f"labels: found {taken[label]!r} and {channel!r} for the marker {label!r}, expected one: leave the "
+            f"labels: found {assigned[label]!r} and {channel!r} for the marker {label!r}, expected one: leave the "
             "other out by a row without a second cell in a table (--labels map.csv; 'Actor:*,' for a whole subject)"
         )
-    taken[label] = channel
+    assigned[label] = channel
 
 
-def _listed(names: Iterable[str], most: int = 6) -> str:
+def _listed(names: Iterable[str], max_names: int = 6) -> str:
     names = list(names)
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return ", ".join(names[:max_names]) + (f" and {len(names) - max_names} more" if len(names) > max_names else "")

@@ -20,13 +20,13 @@ from torchface.take import Take, Track
 from torchface.temporal import bridged
 
 # On six real takes with 0.3 mm of noise the paper's rule (``sparsity_by_rule``) gives 0.03 to 0.07, where the weights
-# come out muted by a fifth. At 0.01, of the rule's order of magnitude still, as many shapes are active as in truth (25
-# of 53) and the error of the weights is near its least with 50 markers as with 100.
+# come out a fifth too small. At 0.01, of the rule's order of magnitude still, as many shapes are active as in truth (25
+# of 53) and the error of the weights is near its minimum with 50 markers as with 100.
 SPARSITY = 0.01
-# Small against the least curvature that 100 markers give 53 real shapes, yet enough for layouts that see less.
+# Small against the smallest curvature that 100 markers give 53 real shapes, yet enough for layouts that see less.
 RIDGE = 1e-3
 
-_COARSE, _FINE = 3e-6, 1e-11
+_TOLERANCE_FLOAT32, _TOLERANCE_FLOAT64 = 3e-6, 1e-11
 # Numbers in the matrices of frames with gaps that are in memory at once: 64 MB of float64.
 _CHUNK_NUMBERS = 2**23
 
@@ -75,9 +75,9 @@ class MarkerSolver(nn.Module):
         if attachment.residual is not None:
             rest = rest + attachment.residual.to(rest)
         basis = attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous()
-        self._hold(rig.names, tuple(attachment.labels or ()), basis, rest, alignment, sparsity, ridge)
+        self._register(rig.names, tuple(attachment.labels or ()), basis, rest, alignment, sparsity, ridge)
 
-    def _hold(
+    def _register(
         self,
         names: Sequence[str],
         labels: Sequence[str],
@@ -152,7 +152,7 @@ class MarkerSolver(nn.Module):
             torch.zeros(config["tensors"][name]) if name in config.get("tensors", {}) else config[name]
             for name in ("sparsity", "ridge")
         )
-        self._hold(names, labels, basis, rest, alignment, sparsity, ridge)
+        self._register(names, labels, basis, rest, alignment, sparsity, ridge)
         return self
 
     @property
@@ -177,12 +177,12 @@ class MarkerSolver(nn.Module):
         squared = (points - self._in_rig_space(markers.double())).square().sum(-1)
         return squared.nanmean(-1)
 
-    def forward(self, markers: Tensor, start: Tensor | None = None) -> Tensor:
+    def forward(self, markers: Tensor, initial: Tensor | None = None) -> Tensor:
         """Weights for markers.
 
         Args:
             markers: (B,M,3), millimetres, in the order of ``labels``; a marker with a NaN coordinate is not seen.
-            start: a guess of the weights, (B,N).
+            initial: initial guess of the weights, (B,N).
 
         Returns:
             Weights in [0,1], (B,N), in the dtype of ``markers``; differentiable in ``markers``.
@@ -195,18 +195,18 @@ class MarkerSolver(nn.Module):
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
         missing = torch.isnan(markers).any(-1)
         _check_seen(missing)
-        tolerance = _FINE if markers.dtype == torch.float64 else _COARSE
-        start = None if start is None else start.double()
+        tolerance = _TOLERANCE_FLOAT64 if markers.dtype == torch.float64 else _TOLERANCE_FLOAT32
+        initial = None if initial is None else initial.double()
         gaps = missing.any(-1)
         if not bool(gaps.any()):
-            return self._complete(markers, start, tolerance).to(markers.dtype)
+            return self._complete(markers, initial, tolerance).to(markers.dtype)
         whole = (~gaps).nonzero()[:, 0]
-        rows, parts = [whole], [self._complete(markers[whole], None if start is None else start[whole], tolerance)]
+        rows, parts = [whole], [self._complete(markers[whole], None if initial is None else initial[whole], tolerance)]
         # A frame with gaps has an H of its own; a chunk of them bounds the memory.
         for chunk in gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
             energy = self.energy(markers[chunk])
             rows.append(chunk)
-            guess = None if start is None else start[chunk]
+            guess = None if initial is None else initial[chunk]
             parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
         weights = markers.new_zeros(len(markers), len(self.names), dtype=torch.float64)
         return weights.index_copy(0, torch.cat(rows), torch.cat(parts)).to(markers.dtype)
@@ -236,11 +236,11 @@ class MarkerSolver(nn.Module):
         arranged = markers.values.new_full((len(markers), len(self.labels), 3), torch.nan)
         return arranged.index_copy(1, ids, markers.values).to(self.rest.device)
 
-    def _complete(self, markers: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
+    def _complete(self, markers: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
         """Weights (B,N), float64, for markers without gaps: one H, factored on first use."""
         offset = self.rest.double() - self._in_rig_space(markers.double())
         f = (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
-        return self._shared(tolerance)(f, start)
+        return self._shared(tolerance)(f, initial)
 
     def _shared(self, tolerance: float) -> BoxQP:
         """The problem of complete frames: prepared once, and anew where what it is made of has changed."""

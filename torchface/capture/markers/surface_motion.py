@@ -1,4 +1,4 @@
-"""How the points of a rig's surface, and points that stand off it, move with the weights: affine maps."""
+"""The points of a rig's surface, and points at a height above it, as affine maps of the weights."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ class SurfaceMotion:
         skin = (part == part[faces.flatten()].mode().values)[faces[:, 0]]
         if not normals:
             return SurfaceMotion(faces, points, None, skin)
-        still = vertex_normals(rest, faces)
+        rest_normals = vertex_normals(rest, faces)
         # A shape at a time: all shapes' triangles at once would take a gigabyte on a large rig.
-        moved = [vertex_normals(rest + delta, faces) - still for delta in deltas]
-        return SurfaceMotion(faces, points, torch.stack([still, *moved], dim=2), skin)
+        moved = [vertex_normals(rest + delta, faces) - rest_normals for delta in deltas]
+        return SurfaceMotion(faces, points, torch.stack([rest_normals, *moved], dim=2), skin)
 
     def lifted(self, height: float) -> Tensor:
         """Points at a height over the vertices, (V,3,N+1)."""
@@ -50,7 +50,7 @@ class SurfaceMotion:
         return self.points + height * self.normals
 
     def at(self, vertices: Tensor, sites: Attachment) -> Tensor:
-        """What of vertices (V,3,N+1) arrives at the sites, (M,3,N+1)."""
+        """The maps (M,3,N+1) of the sites, of those of the vertices (V,3,N+1)."""
         corners = self.faces[sites.triangles]
         return (vertices[corners] * sites.barycentric.to(vertices)[..., None, None]).sum(1)
 

@@ -1,4 +1,4 @@
-"""How a take lies in the rig's space, and what is left at rest between its markers and their sites."""
+"""The alignment of a take with a rig, and the mean residual between its markers and their sites."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
-from torchface.capture.markers.rest_pose import check_spread, pose_of_take
+from torchface.capture.markers.rest_pose import check_not_collinear, pose_of_take
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
@@ -21,8 +21,8 @@ _FRAMES = 240
 def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_frame: int | None = None) -> Similarity:
     r"""The similarity that moves a take's markers into the rig's space; every take has its own.
 
-    With a neutral frame, that frame is laid on the rig at rest. Without one (a take may hold none) the similarity and
-    the weights of frames spread over the take are found together, in turns:
+    With a neutral frame, that frame is aligned with the rig at rest. Without one (a take may hold none) the similarity
+    and the weights of frames spread over the take are found by alternation:
 
     .. math:: \min_{s,R,t,\,w} \sum_{t,m} \lVert s R y_{tm} + t - b_m - B_m w_t \rVert^2, \quad 0 \le w \le 1
 
@@ -54,37 +54,37 @@ def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_f
             )
         frame = paths[neutral_frame]
         pose = similarity_transform(frame[None], rest[None])
-        check_spread(frame[~torch.isnan(frame).any(-1)])
+        check_not_collinear(frame[~torch.isnan(frame).any(-1)])
         return pose
-    check_spread(paths.nanmean(0))
+    check_not_collinear(paths.nanmean(0))
     few = paths[:: max(1, len(paths) // _FRAMES)]
     return pose_of_take(affine, few[~torch.isnan(few).any(-1).all(1)])
 
 
 def rest_residual(
-    rig: BlendshapeRig, attachment: Attachment, take: Take, alignment: Similarity | None = None, rounds: int = 1
+    rig: BlendshapeRig, attachment: Attachment, take: Take, alignment: Similarity | None = None, iterations: int = 1
 ) -> Attachment:
     r"""The attachment with the mean distance between markers and solved sites over a take as its ``residual``.
 
     .. math:: r_m = \frac{1}{|T_m|} \sum_{t \in T_m} (s R y_{tm} + t - p_m(w_t))
 
-    What a marker's site is wrong by, or stands off the skin, then no longer pulls at the weights of any frame. The mean
+    A marker's error of its site, or its stand-off, then no longer biases the weights of any frame. The mean
     is over the whole solved take, since a take may hold no neutral frame.
 
     Args:
         rig: the performer's.
-        attachment: where the markers sit; a residual that it has is where the solve starts.
+        attachment: where the markers sit; a residual that it has is the initial one.
         take: the one to be solved.
         alignment: marker space to rig space; none if absent.
-        rounds: how often to solve and to take the mean.
+        iterations: of solving and taking the mean.
 
     Returns:
-        The attachment with a residual (M,3), millimetres in rig space; a marker that the take never shows keeps what it
-        had.
+        The attachment with a residual (M,3), millimetres in rig space; a marker that the take never shows keeps its
+        residual.
 
     Source: thesis 4.1.2, after algorithm 4.
     """
-    for _ in range(rounds):
+    for _ in range(iterations):
         solver = MarkerSolver(rig, attachment, alignment)
         assert take.markers is not None
         markers = solver.arrange(take.markers)
@@ -92,9 +92,9 @@ def rest_residual(
         markers = markers[shown].double()
         on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), solver(markers))
         moved = markers if alignment is None else alignment.apply(markers)
-        left = (moved - on_rig).nanmean(0)
-        had = torch.zeros_like(left) if attachment.residual is None else attachment.residual.double()
-        attachment = replace(attachment, residual=(had + left.nan_to_num(0.0)).float())
+        residual = (moved - on_rig).nanmean(0)
+        before = torch.zeros_like(residual) if attachment.residual is None else attachment.residual.double()
+        attachment = replace(attachment, residual=(before + residual.nan_to_num(0.0)).float())
     return attachment
 
 

@@ -1,4 +1,4 @@
-"""Blendshape weights of a whole take at once: every frame leans on its neighbours in time."""
+"""Batch smoothing: blendshape weights of all frames of a take in one solve, with a smoothness term over time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchface.take import Take, Track
 
 SMOOTHNESS = 10.0
 """At 60 frames a second, mm² a marker for a squared second difference of 1: noise of 0.3 mm hardly shows."""
-RELEASE = 0.005
-"""At 60 frames a second, the second difference above which motion counts as meant: blinks keep their height."""
-# Neighbours in time say what a single frame's price on every shape has to guess, so a tenth of it is enough.
-SPARSITY_SHARE = 0.1
+HUBER_THRESHOLD = 0.005
+"""At 60 frames a second, in weights: larger second differences count linearly, so that blinks keep their height."""
+# Neighbouring frames regularise, so a tenth of a single frame's L1 penalty is enough.
+SPARSITY_RATIO = 0.1
 
 _RHO, _RELAXATION = 0.12, 1.8
-_STEPS, _SETTLED = 400, 2e-4
-_SECOND = 60.0
+_MAX_ITERATIONS, _TOLERANCE = 400, 2e-4
+_REFERENCE_FPS = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +35,13 @@ class WholeTakeSolver:
         + \lambda \sum_i h_\tau(w_{t-1,i} - 2 w_{ti} + w_{t+1,i}) \Big)
 
     with Huber's :math:`h_\tau(d) = d^2` for :math:`|d| \le \tau` and :math:`2\tau|d| - \tau^2` beyond it: slow motion
-    is smoothed, a blink or a syllable is let through. The first term counts all M markers, seen or not, so a frame that
-    shows few of them leans on its neighbours the more, and one that shows none is bridged.
+    is smoothed, a blink or a syllable passes. The first term counts all M markers, seen or not, so a frame that
+    shows few of them depends more on its neighbours, and one that shows none is interpolated.
 
     Args:
         markers: rig, attachment, alignment and ridge; its sparsity is for single frames, see ``sparsity``.
         smoothness: :math:`\lambda` at 60 frames a second, mm² a marker.
-        release: :math:`\tau` at 60 frames a second; infinite for a quadratic term.
+        huber_threshold: :math:`\tau` at 60 frames a second; infinite for a quadratic term.
         sparsity: :math:`\beta`, mm² a marker for a weight of 1; a tenth of the marker solver's if absent.
 
     Raises:
@@ -52,15 +52,15 @@ class WholeTakeSolver:
 
     markers: MarkerSolver
     smoothness: float = SMOOTHNESS
-    release: float = RELEASE
+    huber_threshold: float = HUBER_THRESHOLD
     sparsity: float | None = None
 
     def __post_init__(self) -> None:
-        sparsity = SPARSITY_SHARE * penalty_value(self.markers.sparsity) if self.sparsity is None else self.sparsity
+        sparsity = SPARSITY_RATIO * penalty_value(self.markers.sparsity) if self.sparsity is None else self.sparsity
         object.__setattr__(self, "sparsity", float(sparsity))
-        for name in ("smoothness", "release", "sparsity"):
+        for name in ("smoothness", "huber_threshold", "sparsity"):
             value = getattr(self, name)
-            if not value >= 0 or (value == math.inf and name != "release"):
+            if not value >= 0 or (value == math.inf and name != "huber_threshold"):
                 raise ValueRangeError(f"{name}: found {value}, expected a number that is not negative")
 
     def solve_take(self, take: Take) -> Take:
@@ -75,7 +75,7 @@ class WholeTakeSolver:
         weights = self(self.markers.arrange(take.markers), take.fps)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))
 
-    def __call__(self, markers: Tensor, fps: float = _SECOND) -> Tensor:
+    def __call__(self, markers: Tensor, fps: float = _REFERENCE_FPS) -> Tensor:
         """Weights (T,N) for the markers (T,M,3) of consecutive frames, NaN for not seen.
 
         Raises:
@@ -90,35 +90,39 @@ class WholeTakeSolver:
             raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
         return self._solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
 
-    def energy(self, markers: Tensor, weights: Tensor, fps: float = _SECOND) -> float:
+    def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
         """What the solve minimises, over all frames."""
-        smoothness, release = self._scaled(fps)
+        smoothness, huber_threshold = self._scaled(fps)
         solver = self.markers
         seen = markers.double() if solver.alignment is None else solver.alignment.apply(markers.double())
         w = weights.double()
         points = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), w)
         data = (points - seen).square().sum(-1).nan_to_num(0.0).sum() / points.shape[1]
         size = curvature(w).abs()
-        huber = torch.where(size <= release, size.square(), 2 * release * size - release * release)
-        if release == math.inf:
+        huber = torch.where(
+            size <= huber_threshold, size.square(), 2 * huber_threshold * size - huber_threshold * huber_threshold
+        )
+        if huber_threshold == math.inf:
             huber = size.square()
-        price = self.sparsity or 0.0
-        return float(data + price * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber.sum())
+        penalty = self.sparsity or 0.0
+        return float(
+            data + penalty * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber.sum()
+        )
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
         if not 0 < fps < math.inf:
             raise ValueRangeError(f"fps: found {fps}, expected a positive number")
-        return self.smoothness * (fps / _SECOND) ** 4, self.release * (_SECOND / fps) ** 2
+        return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
 
-    def _solve(self, markers: Tensor, smoothness: float, release: float) -> Tensor:
+    def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:
         r"""Splitting: a smooth problem without bounds, then a clamp.
 
         The smooth problem has one H and one Laplacian K in all frames. A cosine transform over time diagonalises K, the
         eigenvectors of H the rest, so a step is two transforms, products and a division. What differs from frame to
-        frame is brought up to date in its right side, which majorises the energy and so keeps its minimum: a marker
-        that is not seen sits where the weights have it, and of a second difference the part b beyond
-        :math:`\tau` is let go, :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
+        frame is on its right side, updated by majorisation, which keeps the minimum: a marker that is not seen is
+        filled in by the weights, and the part b of a second difference beyond :math:`\tau` is subtracted,
+        :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
 
         Source: Boyd et al. 2011, section 5.2; Geman and Yang 1995 for b.
         """
@@ -134,27 +138,27 @@ class WholeTakeSolver:
         bending = (2 - 2 * torch.cos(waves)).square()
         divisor = values + (2 * smoothness) * bending[:, None] + rho
         gaps = torch.isnan(seen).any(-1)
-        known = ~gaps[..., None]
-        offset = torch.where(known, rest - seen.nan_to_num(0.0), 0.0).flatten(1) @ rows * (2.0 / count)
+        seen_mask = ~gaps[..., None]
+        offset = torch.where(seen_mask, rest - seen.nan_to_num(0.0), 0.0).flatten(1) @ rows * (2.0 / count)
         frames = gaps.any(-1).nonzero()[:, 0]
         hidden = gaps[frames].repeat_interleave(3, dim=1)
         z = seen.new_zeros(len(seen), shapes)
         dual = torch.zeros_like(z)
-        price = self.sparsity or 0.0
-        for _ in range(_STEPS):
-            f = offset + price
+        penalty = self.sparsity or 0.0
+        for _ in range(_MAX_ITERATIONS):
+            f = offset + penalty
             if len(frames):
                 f[frames] -= (torch.where(hidden, z[frames] @ rows.T, 0.0) @ rows) * (2.0 / count)
-            if release != math.inf:
-                bent = curvature(z)
-                beyond = bent.sign() * (bent.abs() - release).clamp(min=0)
-                f = f - 2 * smoothness * curvature(beyond)
+            if huber_threshold != math.inf:
+                difference = curvature(z)
+                excess = difference.sign() * (difference.abs() - huber_threshold).clamp(min=0)
+                f = f - 2 * smoothness * curvature(excess)
             spectrum = _transform((rho * (z - dual) - f) @ vectors) / divisor
-            x = _back(spectrum) @ vectors.T
+            x = _inverse_transform(spectrum) @ vectors.T
             v = _RELAXATION * x + (1 - _RELAXATION) * z + dual
             before, z = z, v.clamp(0, 1)
             dual = v - z
-            if float((z - before).abs().max()) < _SETTLED:
+            if float((z - before).abs().max()) < _TOLERANCE:
                 break
         return z
 
@@ -169,5 +173,5 @@ def _transform(x: Tensor) -> Tensor:
     return torch.from_numpy(dct(x.numpy(), type=2, norm="ortho", axis=0))
 
 
-def _back(x: Tensor) -> Tensor:
+def _inverse_transform(x: Tensor) -> Tensor:
     return torch.from_numpy(idct(x.numpy(), type=2, norm="ortho", axis=0))

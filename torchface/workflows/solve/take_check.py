@@ -124,14 +124,14 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
         sizes = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
         names = {"m": "metres", "cm": "centimetres", "in": "inches", "mm": "millimetres"}
         return (
-            f"{sizes} they lie {fit.mended:.2g} mm from it, so the take seems to be in {names[fit.unit]}: add "
+            f"{sizes} they lie {fit.corrected:.2g} mm from it, so the take seems to be in {names[fit.unit]}: add "
             f"--unit {fit.unit}, and --align if it is not in the rig's space"
         )
     if fit.cause == "alignment":
         advice = "the frame of --neutral is not at rest: --align does without one" if aligned else "add --align"
-        return f"laid on the rig they lie {fit.mended:.2g} mm from it, so the take is in another space: {advice}"
+        return f"laid on the rig they lie {fit.corrected:.2g} mm from it, so the take is in another space: {advice}"
     if fit.cause == "slip":
-        return f"without the motion of the helmet against the head {fit.mended:.2g} mm are left: add --slip"
+        return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
     tried = "the take is laid on the rig" if aligned else "turning, moving and scaling the take does not help"
     return (
         f"{tried}, so the attachment or the rig is another one's, or labels are mixed up: look at the sites "

@@ -1,4 +1,4 @@
-"""Whether sites that were fitted to a range of motion may be believed; if not, the figure and the likely cause."""
+"""Checks sites that were fitted to a range of motion; errors name the figure and the likely cause."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from torchface.errors import AlignmentError, ValueRangeError
 # Median over the markers. With a head's own rig it is 0.02 to 0.06 mm; with a rig whose neutral is 0.5 or 1 mm and
 # whose shapes are a fifth wrong 0.09 or 0.16; with markers 2 mm off the skin 0.13, since the scale takes most of that
 # up; with the rig of a similar head 0.3 to 0.4, of any other 0.7 to 0.9.
-MOST_OFF_SKIN = 0.3
-# A marker that is so many times farther from its site than usual, and at least so many millimetres, is not on the skin.
-OUTLYING, FAR = 3.0, 4.0
+MAX_OFF_SKIN = 0.3
+# A marker farther from its site than this multiple of the median, and at least so many millimetres, is an outlier.
+_OUTLIER_RATIO, _OUTLIER_DISTANCE = 3.0, 4.0
 _SHOWN = 6
 
 
-def tells_weights(error: Tensor) -> Tensor:
+def inlier_markers(error: Tensor) -> Tensor:
     """Which markers (M,) sit on the skin, by their root mean square distance to their sites (M,), millimetres."""
-    return error <= max(OUTLYING * float(error.median()), FAR)
+    return error <= max(_OUTLIER_RATIO * float(error.median()), _OUTLIER_DISTANCE)
 
 
 def check_sites(
-    labels: Sequence[str], error: Tensor, off_skin: Tensor, spread: float, uncertainty: SiteUncertainty
+    labels: Sequence[str], error: Tensor, off_skin: Tensor, radius: float, uncertainty: SiteUncertainty
 ) -> None:
-    """Raises where sites do not explain their markers, or where the take leaves most of them open.
+    """Raises where sites do not explain their markers, or where the take leaves most of them uncertain.
 
     ``fit_check.check_fit`` judges markers on sites that are given; here the sites could move to wherever they fit best,
     and unit, pose and slip are solved for, so what is left has other causes and smaller limits.
@@ -37,25 +37,25 @@ def check_sites(
         labels: of the M markers.
         error: root mean square distance of each marker to its site, (M,), millimetres.
         off_skin: distance of each marker from its site that lasts over the take, (M,), millimetres.
-        spread: of the sites at rest, mean distance from their centre, millimetres.
+        radius: of the sites at rest, mean distance from their centre, millimetres.
         uncertainty: of sites and shapes.
 
     Raises:
         AlignmentError: markers stay far from the skin: all or most of them, or some.
         ValueRangeError: most sites, or most shapes that the markers see, are uncertain.
     """
-    typical, lasting, most = float(error.median()), float(off_skin.median()), DOUBTFUL_SHARE * spread
-    if not typical <= most:
+    typical, offset, limit = float(error.median()), float(off_skin.median()), DOUBTFUL_SHARE * radius
+    if not typical <= limit:
         raise AlignmentError(
             f"markers: wherever they sit on the rig, they stay {typical:.2g} mm from their sites (median), expected at "
-            f"most {most:.2g} mm: labels are mixed up, or it is the rig of another head"
+            f"most {limit:.2g} mm: labels are mixed up, or it is the rig of another head"
         )
-    if lasting > MOST_OFF_SKIN:
+    if offset > MAX_OFF_SKIN:
         raise AlignmentError(
-            f"markers: they stay {lasting:.2g} mm off the rig's skin all the time (median), expected at most "
-            f"{MOST_OFF_SKIN} mm: it is the rig of another head, or a rig that is not this exact"
+            f"markers: they stay {offset:.2g} mm off the rig's skin all the time (median), expected at most "
+            f"{MAX_OFF_SKIN} mm: it is the rig of another head, or a rig that is not this exact"
         )
-    far = (~tells_weights(error)).nonzero()[:, 0]
+    far = (~inlier_markers(error)).nonzero()[:, 0]
     if len(far):
         worst = far[error[far].argsort(descending=True)].tolist()
         named = _listed([f"{labels[i]} ({float(error[i]):.0f} mm)" for i in worst])
@@ -77,6 +77,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + more
 
 
-def spread_of(points: Tensor) -> float:
+def mean_radius(points: Tensor) -> float:
     """Mean distance of points (M,3) from their centre."""
     return float(torch.linalg.vector_norm(points - points.mean(0), dim=1).mean())

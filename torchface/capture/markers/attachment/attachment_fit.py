@@ -1,4 +1,4 @@
-"""Where markers really sit on a rig: found from a range-of-motion take."""
+"""The sites of markers on a rig, fitted to a range-of-motion take."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.attachment.attachment_check import check_sites, spread_of, tells_weights
-from torchface.capture.markers.attachment.frame_poses import LEAST_SEEN, frame_poses, solve_frames
-from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteRounds
+from torchface.capture.markers.attachment.attachment_check import check_sites, inlier_markers, mean_radius
+from torchface.capture.markers.attachment.frame_poses import MIN_MARKERS, frame_poses, solve_frames
+from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSolver
 from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.helmet_solver import HelmetMotion
 from torchface.capture.markers.marker_solver import check_labels
-from torchface.capture.markers.rest_pose import check_spread
+from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
-_WHOLE_ROUNDS, _SETTLED = 6, 1e-3
+_LAST_ITERATIONS, _TOLERANCE = 6, 1e-3
 _COARSE_FRAMES, _CAREFUL_FRAMES, _JOINT_FRAMES = 240, 60, 120
-_FIRST_POSE_ROUNDS = 8
-_LEAST_MOTION = 0.3
+_FIRST_POSE_ITERATIONS = 8
+_MIN_MOTION = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class AttachmentFit:
-    """What a range-of-motion take told.
+    """The result of :func:`fit_attachment`.
 
     Args:
-        attachment: the sites, labels kept; ``residual`` is what was left at rest, the stand-off included.
+        attachment: the sites, labels kept; ``residual`` is their offset at rest, the stand-off included.
         alignment: the take's similarity, marker space to rig space, of a helmet that does not slip.
-        errors: root mean square distance of each marker to its site's path after each round, (R,M), millimetres.
-        weights: what the rig did in the take, (T,N); 0 in frames that show no marker (or too few to tell a slip).
+        errors: root mean square distance of each marker to its site's path after each iteration, (R,M), millimetres.
+        weights: of the take, (T,N); 0 in frames that show no marker (or too few to solve for a slip).
         standoff: how far markers stand off the skin, millimetres; 0 where it was not asked for.
-        off_skin: distance of each marker from its site, stand-off considered, that lasts over the take, (M,), mm.
+        off_skin: distance of each marker from its site, stand-off considered, averaged over the take, (M,), mm.
         uncertainty: which sites and shapes the take leaves uncertain.
-        motion: the helmet's against the head, where it slips: what :attr:`alignment` delivers is moved by it.
+        motion: the helmet's against the head, where it slips: what :attr:`alignment` gives is moved by it.
     """
 
     attachment: Attachment
@@ -67,20 +67,20 @@ def fit_attachment(
     .. math:: \min_{s,R,t,\,w,\,x} \sum_{t,m} \lVert s R y_{tm} + t - p(x_m, w_t) - h\, n(x_m, w_t) \rVert^2
 
     over the take's similarity, the weights of every frame in [0,1], and every marker's point x on the surface. Solved
-    in turns at first: weights of all frames, the similarity (with the stand-off h), then for each marker the best point
-    of the nearest triangles over the whole take. Then Newton steps of sites, similarity and weights together, which
-    go where turns hardly move; meanwhile markers that do not fit tell no weights and may move to farther triangles.
-    Frames spread over the take serve for these; then all frames, in turns.
+    by alternation at first: weights of all frames, the similarity (with the stand-off h), then for each marker the best
+    point of the nearest triangles over the whole take. Then by Newton steps of sites, similarity and weights together,
+    which converge where alternation hardly moves; markers that do not fit are left out of the weights there and may
+    move to farther triangles. Both use frames spread over the take; last come alternating iterations on all frames.
 
-    The first guess counts as one more observation, right to 4 mm, so that sites which the take does not tell stay near
-    it. A helmet that slips is found by what a rigid motion a frame would explain, and its motion is solved along.
+    The initial guess is a prior with a standard deviation of 4 mm, so that sites which the take does not determine stay
+    near it. A slipping helmet is found by what a rigid motion a frame would explain; its motion is then solved too.
 
     Args:
         rig: the performer's, N shapes.
         rom: markers (T,M,3) of a range of motion, in any space and scale; NaN for not seen. No frame need be neutral.
         initial: roughly where the markers sit; markers match by label.
         standoff: estimate one distance h of all marker centres from the skin; otherwise it is 0.
-        progress: told the share that is done.
+        progress: called with the fraction done.
         insist: also return sites that the take leaves mostly uncertain, or that do not explain the markers.
 
     Returns:
@@ -96,55 +96,55 @@ def fit_attachment(
 
     Source: thesis 4.1.2, algorithm 4, run to convergence; bundle adjustment for the joint steps (Triggs et al. 2000).
     """
-    say = progress or (lambda share: None)
+    report = progress or (lambda fraction: None)
     initial.check(rig.neutral)
     paths = marker_paths(rom, initial)
     motion = SurfaceMotion.of(rig, normals=standoff)
-    start = motion.at(motion.points, initial)[..., 0]
-    rounds = SiteRounds(motion, SiteSearch(motion, initial), start, standoff)
-    pose = _first_pose(paths, start)
+    initial_points = motion.at(motion.points, initial)[..., 0]
+    solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff)
+    pose = _first_pose(paths, initial_points)
     _check_motion(pose.apply(paths))
     shown = paths[~torch.isnan(paths).any(-1).all(1)]
     few = _spread(shown, _COARSE_FRAMES)
     errors: list[Tensor] = []
     first = FitState(replace(initial, residual=None), pose, 0.0, None)
-    state = rounds.in_turns(few, first, errors, lambda share: say(0.3 * share))
-    if rounds.slips(few, state):
-        shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= LEAST_SEEN]
+    state = solver.alternate(few, first, errors, lambda fraction: report(0.3 * fraction))
+    if solver.helmet_slips(few, state):
+        shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= MIN_MARKERS]
         few = _spread(shown, _COARSE_FRAMES)
-        by_frame = replace(first, pose=frame_poses(few, start.expand_as(few), pose.scale[0]))
-        state = rounds.in_turns(few, by_frame, errors, lambda share: say(0.3 + 0.3 * share))
+        by_frame = replace(first, pose=frame_poses(few, initial_points.expand_as(few), pose.scale[0]))
+        state = solver.alternate(few, by_frame, errors, lambda fraction: report(0.3 + 0.3 * fraction))
     for count, careful in ((_CAREFUL_FRAMES, True), (_JOINT_FRAMES, False)):
         some = _spread(shown, count)
-        state = rounds.together(some, rounds.resumed(some, state), errors, careful)
-    say(0.8)
-    uncertainty = rounds.uncertainty(some, state, len(paths) / rom.fps, rig.names)
-    state = rounds.resumed(shown, state)
-    for number in range(_WHOLE_ROUNDS):
-        state = rounds.round(shown, state, LAST_RIDGE)
+        state = solver.solve_jointly(some, solver.on_frames(some, state), errors, careful)
+    report(0.8)
+    uncertainty = solver.uncertainty(some, state, len(paths) / rom.fps, rig.names)
+    state = solver.on_frames(shown, state)
+    for number in range(_LAST_ITERATIONS):
+        state = solver.alternation_step(shown, state, LAST_RIDGE)
         assert state.error is not None
-        settled = float((state.error - errors[-1]).abs().max()) < _SETTLED
+        converged = float((state.error - errors[-1]).abs().max()) < _TOLERANCE
         errors.append(state.error)
-        say(0.8 + 0.2 * (number + 1) / _WHOLE_ROUNDS)
-        if settled and number:
+        report(0.8 + 0.2 * (number + 1) / _LAST_ITERATIONS)
+        if converged and number:
             break
-    say(1.0)
-    found = _result(rounds, paths, state, errors, rig.neutral.fingerprint(), uncertainty)
+    report(1.0)
+    found = _result(solver, paths, state, errors, rig.neutral.fingerprint(), uncertainty)
     if not insist:
         check_attachment(found, rig)
     return found
 
 
 def check_attachment(fit: AttachmentFit, rig: BlendshapeRig) -> None:
-    """Raises where a fit should not be believed.
+    """Raises where a fit does not explain its take.
 
     Raises:
         AlignmentError: the rig does not explain the markers, or not some of them.
         ValueRangeError: the take leaves most sites or shapes uncertain.
     """
     sites = fit.attachment
-    spread = spread_of(sites.on(rig.neutral.faces, rig.vertices))
-    check_sites(sites.labels or (), fit.errors[-1], fit.off_skin, spread, fit.uncertainty)
+    radius = mean_radius(sites.on(rig.neutral.faces, rig.vertices))
+    check_sites(sites.labels or (), fit.errors[-1], fit.off_skin, radius, fit.uncertainty)
 
 
 def marker_paths(take: Take, attachment: Attachment) -> Tensor:
@@ -153,7 +153,7 @@ def marker_paths(take: Take, attachment: Attachment) -> Tensor:
     Raises:
         NameMismatchError: the take has no markers, or one that the attachment does not know.
         ValueRangeError: a marker of the attachment is seen in no frame, or a coordinate is infinite.
-        AlignmentError: the markers lie on a line, so no pose can be told.
+        AlignmentError: the markers lie on a line, so no pose is determined.
     """
     track = take.markers
     labels = tuple(attachment.labels or ())
@@ -173,42 +173,42 @@ def marker_paths(take: Take, attachment: Attachment) -> Tensor:
             f"markers: {len(unseen)} of {len(labels)} are seen in no frame ({names}), expected each at least once; "
             "leave them out of the attachment (Attachment.select)"
         )
-    check_spread(paths.nanmean(0))
+    check_not_collinear(paths.nanmean(0))
     return paths
 
 
 def _result(
-    rounds: SiteRounds,
+    solver: SiteSolver,
     paths: Tensor,
     state: FitState,
     errors: list[Tensor],
     fingerprint: str,
     uncertainty: SiteUncertainty,
 ) -> AttachmentFit:
-    """What was left at rest is told over all frames, with the weights of the sites that were found."""
-    here = rounds.at(state)
-    rows = state.trusted()
+    """The fit's result; the offset at rest is the mean residual over all frames."""
+    affine = solver.at(state)
+    rows = state.inliers()
     slips = len(state.pose.scale) > 1
-    shown = (~torch.isnan(paths).any(-1)).sum(1) >= (LEAST_SEEN if slips else 1)
-    solved, pose = solve_frames(here[rows], paths[shown][:, rows], state.pose, LAST_RIDGE, state.weights)
-    weights = here.new_zeros(len(paths), here.shape[-1] - 1)
+    shown = (~torch.isnan(paths).any(-1)).sum(1) >= (MIN_MARKERS if slips else 1)
+    solved, pose = solve_frames(affine[rows], paths[shown][:, rows], state.pose, LAST_RIDGE, state.weights)
+    weights = affine.new_zeros(len(paths), affine.shape[-1] - 1)
     weights[shown] = solved
     moved = pose.apply(paths[shown])
-    left = (moved - torch.einsum("mcn,tn->tmc", here, with_one(solved))).nanmean(0).nan_to_num(0.0)
-    at_rest = rounds.motion.at(rounds.motion.points[..., :1], state.sites)[..., 0]
+    offset = (moved - torch.einsum("mcn,tn->tmc", affine, with_one(solved))).nanmean(0).nan_to_num(0.0)
+    at_rest = solver.motion.at(solver.motion.points[..., :1], state.sites)[..., 0]
     sites = Attachment(
         state.sites.triangles,
         state.sites.barycentric.float(),
         state.sites.labels,
-        (here[..., 0] - at_rest + left).float(),
+        (affine[..., 0] - at_rest + offset).float(),
         fingerprint,
     )
     helmet = None
     if slips:
-        # The scale is known; a fit of it would shrink what turns to and fro.
+        # The scale is known; fitting it would shrink a rotating take.
         steady = frame_poses(paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3), pose.scale[0])
-        helmet, pose = _helmet_motion(steady, pose, shown, here[..., 0].mean(0)), steady
-    off_skin = left.norm(dim=1)
+        helmet, pose = _helmet_motion(steady, pose, shown, affine[..., 0].mean(0)), steady
+    off_skin = offset.norm(dim=1)
     return AttachmentFit(sites, pose, torch.stack(errors), weights, state.height, off_skin, uncertainty, helmet)
 
 
@@ -216,18 +216,18 @@ def _spread(paths: Tensor, count: int) -> Tensor:
     return paths[:: max(1, len(paths) // count)]
 
 
-def _first_pose(paths: Tensor, start: Tensor) -> Similarity:
-    """The take's mean laid on the first guess, by the markers that agree."""
-    mean, near = paths.nanmean(0), torch.ones(len(start), dtype=torch.bool)
-    for _ in range(_FIRST_POSE_ROUNDS):
-        pose = similarity_transform(mean[None], start[None], near[None].double())
-        apart = (pose.apply(mean)[0] - start).norm(dim=1)
-        near = tells_weights(apart)
+def _first_pose(paths: Tensor, initial_points: Tensor) -> Similarity:
+    """The similarity of the take's mean to the initial guess, over inlier markers."""
+    mean, inlier = paths.nanmean(0), torch.ones(len(initial_points), dtype=torch.bool)
+    for _ in range(_FIRST_POSE_ITERATIONS):
+        pose = similarity_transform(mean[None], initial_points[None], inlier[None].double())
+        distance = (pose.apply(mean)[0] - initial_points).norm(dim=1)
+        inlier = inlier_markers(distance)
     return pose
 
 
 def _helmet_motion(steady: Similarity, pose: Similarity, shown: Tensor, pivot: Tensor) -> HelmetMotion:
-    """What a pose a frame does otherwise than one for all: points were seen at R (p - c) + c + t."""
+    """The difference between a pose a frame and one for all: points were seen at R (p - c) + c + t."""
     rotation = torch.eye(3, dtype=pivot.dtype).repeat(len(shown), 1, 1)
     translation = pivot.new_zeros(len(shown), 3)
     rotation[shown] = steady.rotation @ pose.rotation.transpose(1, 2)
@@ -237,11 +237,11 @@ def _helmet_motion(steady: Similarity, pose: Similarity, shown: Tensor, pivot: T
 
 
 def _check_motion(moved: Tensor) -> None:
-    """Raises where most markers stand still: then nothing tells where they sit."""
-    spread = (moved - moved.nanmean(0)).square().sum(-1).nanmean(0).sqrt()
-    typical = float(spread.median())
-    if not typical >= _LEAST_MOTION:
+    """Raises where most markers do not move: then their sites are not determined."""
+    motion = (moved - moved.nanmean(0)).square().sum(-1).nanmean(0).sqrt()
+    typical = float(motion.median())
+    if not typical >= _MIN_MOTION:
         raise ValueRangeError(
             f"range of motion: half of the markers move less than {typical:.2f} mm (root mean square), expected at "
-            f"least {_LEAST_MOTION} mm: play every expression strongly"
+            f"least {_MIN_MOTION} mm: play every expression strongly"
         )

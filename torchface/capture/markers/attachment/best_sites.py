@@ -21,23 +21,23 @@ from torch import Tensor
 from torchface.geometry.meshes.proximity import triangle_coordinates
 
 # Where few weights move, C is singular; a ten-thousandth of a weight a frame changes no distance that counts.
-_LEAST_MOMENT = 1e-8
+_MIN_MOMENT = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class PathMoments:
-    """What site search needs of a take.
+    """The moments of a take that the site search needs.
 
     Args:
         factor: :math:`L`, (N+1,N+1).
         path: :math:`G L^{-T}`, (M,3,N+1).
-        left: squared distance that no site can change, (M,), mm².
+        residual: squared distance that no site can change, (M,), mm².
         frames: in how many frames each marker was seen, (M,).
     """
 
     factor: Tensor
     path: Tensor
-    left: Tensor
+    residual: Tensor
     frames: Tensor
 
     @staticmethod
@@ -45,31 +45,31 @@ class PathMoments:
         paths: Tensor,
         weights: Tensor,
         on_rig: Tensor | None = None,
-        start: Tensor | None = None,
-        trust: float = 0.0,
+        initial: Tensor | None = None,
+        prior_weight: float = 0.0,
     ) -> PathMoments:
         """Of markers (T,M,3), NaN where not seen, and extended weights (T,N+1), float64.
 
-        Where the sites are believed to be at rest, ``start`` (M,3), counts as a ``trust``-th part of a frame at rest.
+        The initial guess of the sites at rest, ``initial`` (M,3), counts as ``prior_weight`` frames at rest.
 
         A marker that is not seen is put where its present site is (``on_rig``, (T,M,3)). That keeps one C for all
-        markers and moves no site that is the best already; others take a few more rounds to come to theirs.
+        markers and moves no site that is the best already; others take a few more iterations.
         """
         seen = ~torch.isnan(paths[..., 0])
         if on_rig is not None:
             paths = torch.where(seen[..., None], paths, on_rig)
-        if start is not None:
-            paths = torch.cat([paths, trust**0.5 * start[None]])
+        if initial is not None:
+            paths = torch.cat([paths, prior_weight**0.5 * initial[None]])
             rest = torch.zeros_like(weights[:1])
-            rest[:, 0] = trust**0.5
+            rest[:, 0] = prior_weight**0.5
             weights = torch.cat([weights, rest])
         moments = weights.T @ weights
-        moments.diagonal().add_(_LEAST_MOMENT * len(paths))
+        moments.diagonal().add_(_MIN_MOMENT * len(paths))
         factor = torch.linalg.cholesky(moments)
         cross = paths.flatten(1).T @ weights
         path = torch.linalg.solve_triangular(factor, cross.T, upper=False).T.unflatten(0, (-1, 3))
-        left = paths.square().sum((0, 2)) - path.square().sum((1, 2))
-        return PathMoments(factor, path, left.clamp(min=0), seen.sum(0).to(weights))
+        residual = paths.square().sum((0, 2)) - path.square().sum((1, 2))
+        return PathMoments(factor, path, residual.clamp(min=0), seen.sum(0).to(weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathM
     squared = ap2 - 2 * (v * d1 + w * d2) + v * v * ab2 + w * w * ac2 + 2 * v * w * abac
     best = squared.argmin(1, keepdim=True)
     v, w, squared, triangles = (part.gather(1, best)[:, 0] for part in (v, w, squared, candidates))
-    error = ((squared.clamp(min=0) + moments.left) / moments.frames.clamp(min=1)).sqrt()
+    error = ((squared.clamp(min=0) + moments.residual) / moments.frames.clamp(min=1)).sqrt()
     return Sites(triangles, torch.stack([1 - v - w, v, w], dim=1), error)
 
 

@@ -1,16 +1,16 @@
-"""How a take lies in a rig's space: by one similarity, or where the helmet slips by one scale and a motion a frame."""
+"""The pose of a take in a rig's space: one similarity, or where the helmet slips one scale and a motion a frame."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.helmet_solver import rigid_columns, rigid_turn
+from torchface.capture.markers.helmet_solver import rigid_columns, rigid_rotation
 from torchface.capture.markers.rest_pose import pose_step, solve_weights
 from torchface.geometry.similarity import Similarity, similarity_transform
 
-# A frame with fewer markers tells no motion beside weights.
-LEAST_SEEN = 6
+# A frame with fewer markers does not determine a rigid motion beside the weights.
+MIN_MARKERS = 6
 
 
 def frame_poses(paths: Tensor, target: Tensor, scale: Tensor) -> Similarity:
@@ -20,7 +20,7 @@ def frame_poses(paths: Tensor, target: Tensor, scale: Tensor) -> Similarity:
 
 
 def solve_frames(
-    affine: Tensor, paths: Tensor, pose: Similarity, ridge: float, start: Tensor | None
+    affine: Tensor, paths: Tensor, pose: Similarity, ridge: float, initial: Tensor | None
 ) -> tuple[Tensor, Similarity]:
     """Weights of all frames; where every frame has a pose of its own, its motion together with them.
 
@@ -28,29 +28,29 @@ def solve_frames(
         affine: of the sites, (M,3,N+1), millimetres.
         paths: markers (T,M,3), NaN for not seen.
         pose: (1,) or (T,).
-        ridge, start: as in ``solve_weights``.
+        ridge, initial: as in ``solve_weights``.
 
     Returns:
         Weights (T,N) and the pose.
     """
     moved = pose.apply(paths)
     if len(pose.scale) == 1:
-        return solve_weights(affine, moved, ridge, start), pose
+        return solve_weights(affine, moved, ridge, initial), pose
     rest = affine[..., 0]
     pivot = rest.mean(0)
     columns = rigid_columns(rest, pivot)
-    if start is not None:
-        start = torch.cat([start, start.new_zeros(len(start), columns.shape[2])], dim=1)
-    solved = solve_weights(torch.cat([affine, columns], dim=2), moved, ridge, start, unbounded=columns.shape[2])
+    if initial is not None:
+        initial = torch.cat([initial, initial.new_zeros(len(initial), columns.shape[2])], dim=1)
+    solved = solve_weights(torch.cat([affine, columns], dim=2), moved, ridge, initial, unbounded=columns.shape[2])
     weights, motion = solved.split([affine.shape[2] - 1, columns.shape[2]], dim=1)
     return weights, without_motion(pose, motion, pivot)
 
 
 def without_motion(pose: Similarity, motion: Tensor, pivot: Tensor) -> Similarity:
-    """Poses (T,) freed of a rigid motion (T,6), in the columns of ``rigid_columns``, of what they deliver."""
-    back = rigid_turn(motion[:, 3:]).transpose(1, 2)
+    """Poses (T,) less a rigid motion (T,6) of their output, in the columns of ``rigid_columns``."""
+    inverse = rigid_rotation(motion[:, 3:]).transpose(1, 2)
     centred = pose.translation - motion[:, :3] - pivot
-    return Similarity(pose.scale, back @ pose.rotation, (back @ centred[..., None])[..., 0] + pivot)
+    return Similarity(pose.scale, inverse @ pose.rotation, (inverse @ centred[..., None])[..., 0] + pivot)
 
 
 def better_pose(
@@ -60,17 +60,17 @@ def better_pose(
     if len(pose.scale) == 1:
         return pose_step(paths, pose, on_rig, outward)
     moved = pose.apply(paths)
-    gone = torch.isnan(moved)
+    missing = torch.isnan(moved)
     centre = moved.nanmean(1, keepdim=True)
     arm = (moved - centre).nan_to_num(0.0)
-    left = torch.where(gone, 0.0, on_rig - moved)
+    residual = torch.where(missing, 0.0, on_rig - moved)
     rows = arm.flatten()[None]
     if outward is not None:
-        rows = torch.cat([rows, torch.where(gone, 0.0, -outward).flatten()[None]])
-    step = torch.linalg.solve(rows @ rows.T, rows @ left.flatten())
+        rows = torch.cat([rows, torch.where(missing, 0.0, -outward).flatten()[None]])
+    step = torch.linalg.solve(rows @ rows.T, rows @ residual.flatten())
     return scaled(pose, 1 + step[0], centre[:, 0]), float(step[1]) if outward is not None else 0.0
 
 
-def scaled(pose: Similarity, grow: Tensor, centre: Tensor) -> Similarity:
-    """Poses (T,) after which all grows about a centre (T,3)."""
-    return Similarity(pose.scale * grow, pose.rotation, centre + grow * (pose.translation - centre))
+def scaled(pose: Similarity, factor: Tensor, centre: Tensor) -> Similarity:
+    """Poses (T,) scaled about a centre (T,3)."""
+    return Similarity(pose.scale * factor, pose.rotation, centre + factor * (pose.translation - centre))

@@ -1,4 +1,4 @@
-"""A first guess of marker sites without anybody's help: the markers' shape laid on the face."""
+"""An automatic initial guess of marker sites: the markers' mean shape aligned with the face."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.rest_pose import check_spread
+from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
@@ -15,16 +15,16 @@ from torchface.registration.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
-_NEIGHBOURS, _FEWEST = 9, 12
-_LEAST_MOTION = 0.5
-_SMALLEST, _LARGEST = 0.4, 2.0
+_NEIGHBOURS, _MIN_MARKERS = 9, 12
+_MIN_MOTION = 0.5
+_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.4, 2.0
 
 
 def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
-    """Sites for the markers of a range of motion, found by laying their mean positions on the skin that moves.
+    """Sites for the markers of a range of motion, found by aligning their mean positions with the skin that moves.
 
     Rigid alignment from starts in all directions by iterated closest points, the scale within a quarter of 1: units
-    must be right. What it gives is off by millimetres, as a guess by eye; ``fit_attachment`` does the rest.
+    must be right. The result is accurate to millimetres, as a guess by eye; ``fit_attachment`` refines it.
 
     Args:
         rig: the performer's.
@@ -40,29 +40,32 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
     Source: thesis 4.1.2, where the landmarks are picked by hand.
     """
     track = rom.markers
-    if track is None or len(track.names) < _FEWEST:
+    if track is None or len(track.names) < _MIN_MARKERS:
         count = 0 if track is None else len(track.names)
-        raise ValueRangeError(f"markers: found {count}, expected at least {_FEWEST} to tell the pose by their shape")
+        raise ValueRangeError(
+            f"markers: found {count}, expected at least {_MIN_MARKERS} to find the pose by their shape"
+        )
     points = track.values.double().nanmean(0)
     unseen = [name for name, point in zip(track.names, points, strict=True) if not bool(torch.isfinite(point).all())]
     if unseen:
         raise ValueRangeError(f"markers: {', '.join(unseen[:5])} seen in no frame, expected each at least once")
-    check_spread(points)
+    check_not_collinear(points)
     motion = SurfaceMotion.of(rig)
     vertices = motion.points[..., 0]
-    moves = motion.points[..., 1:].norm(dim=1).amax(1) > _LEAST_MOTION
+    moves = motion.points[..., 1:].norm(dim=1).amax(1) > _MIN_MOTION
     faces = motion.faces[motion.skin & moves[motion.faces].all(1)]
     if not len(faces):
-        raise ValueRangeError(f"rig: found no skin that moves by more than {_LEAST_MOTION} mm, expected a face")
+        raise ValueRangeError(f"rig: found no skin that moves by more than {_MIN_MOTION} mm, expected a face")
     normals = vertex_normals(vertices, motion.faces)
     # What faces away from the viewer, such as the inside of lips and lids, carries no marker.
     faces = faces[normals[faces].mean(1)[:, 2] > 0]
     skin = vertices[faces.unique()]
     size = float((points - points.mean(0)).norm(dim=1).mean() / (skin - skin.mean(0)).norm(dim=1).mean())
-    if not _SMALLEST < size < _LARGEST:
+    if not _MIN_SIZE_RATIO < size < _MAX_SIZE_RATIO:
         raise AlignmentError(
-            f"markers: found them spread {size:.2g} times as far as the skin that moves, expected {_SMALLEST} to "
-            f"{_LARGEST} times: is the take's unit right? Else give initial sites (torchface pick --mode markers)"
+            f"markers: found them spread {size:.2g} times as far as the skin that moves, expected {_MIN_SIZE_RATIO} to "
+            f"{_MAX_SIZE_RATIO} times: is the take's unit right? Else give initial sites "
+            "(torchface pick --mode markers)"
         )
     try:
         pose = find_pose(Samples(points, _outward(points)), ScanPoints(vertices, faces)).pose

@@ -1,13 +1,13 @@
-r"""How the squared distance of a take's markers bends when sites, the take's pose and all weights move together.
+r"""The curvature of a take's squared marker distances in sites, pose and all weights together.
 
 To first order a marker's distance to its site becomes :math:`r_{tm} - K_{tm} \theta - B_m d_t`, with :math:`\theta` the
-shifts of all sites along the skin and of the pose, and :math:`d_t` the change of frame t's weights. Each frame's
-weights follow what is best for it, so they are eliminated frame by frame:
+steps of all sites along the skin and of the pose, and :math:`d_t` the change of frame t's weights. The weights are
+eliminated frame by frame:
 
 .. math::
     S = \sum_t K_t^\top K_t - C_t^\top G_t^{-1} C_t, \qquad C_t = B^\top K_t, \quad G_t = B^\top B + \varepsilon I
 
-S is the curvature in :math:`\theta` alone: directions in which it is small are those that the take does not tell.
+S is the curvature in :math:`\theta` alone: directions in which it is small are those that the take does not determine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torchface.geometry.similarity import Similarity
 
 _AT_BOUND = 1e-6
 _FREE_RIDGE = 1e-4
-# Turns and the scale count by how far they move a point this far from the middle, as the shifts of sites do.
+# Rotations and the scale are scaled to the motion of a point this far from the middle, in mm, as the sites are.
 ARM = 50.0
 
 
@@ -33,21 +33,21 @@ class TakeCurvature:
 
     Args:
         information: :math:`S`, (2M+G,2M+G): two tangents of each site, then G columns of the pose.
-        gradient: what pulls at them, (2M+G,).
-        factor: Cholesky factors of :math:`G_t`, (T,N,N); rows of weights that are held are those of the identity.
+        gradient: of them, (2M+G,).
+        factor: Cholesky factors of :math:`G_t`, (T,N,N); rows of weights in the active set are those of the identity.
         cross: :math:`C_t`, (T,N,2M+G).
-        pull: what pulls at the weights, (T,N).
+        weight_gradient: (T,N).
     """
 
     information: Tensor
     gradient: Tensor
     factor: Tensor
     cross: Tensor
-    pull: Tensor
+    weight_gradient: Tensor
 
     @staticmethod
     def of(
-        here: Tensor,
+        affine: Tensor,
         tangents: Tensor,
         moved: Tensor,
         weights: Tensor,
@@ -59,81 +59,86 @@ class TakeCurvature:
         """At sites, pose and weights.
 
         Args:
-            here: affine maps of the sites, (M,3,N+1), millimetres.
+            affine: affine maps of the sites, (M,3,N+1), millimetres.
             tangents: affine maps of two unit tangents of the skin at each site, (M,2,3,N+1).
             moved: markers in rig space, (T,M,3), NaN where not seen.
             weights: (T,N).
             pose_columns: how a unit of each pose parameter moves each marker, (T,M,3,G).
             ridge: mm² a marker for a squared weight of 1.
             slips: six columns of rigid motion a frame follow the weights.
-            bounded: weights at 0 or 1 stay there.
+            bounded: weights at 0 or 1 are in the active set.
         """
-        markers, frames = len(here), len(moved)
-        rest, basis = here[..., 0], here[..., 1:]
+        markers, frames = len(affine), len(moved)
+        rest, basis = affine[..., 0], affine[..., 1:]
         extended = with_one(weights)
         seen = ~torch.isnan(moved).any(-1)
         shown = seen[..., None, None].double()
-        left = torch.where(seen[..., None], moved - torch.einsum("mcn,tn->tmc", here, extended), 0.0)
+        residual = torch.where(seen[..., None], moved - torch.einsum("mcn,tn->tmc", affine, extended), 0.0)
         free = (weights > _AT_BOUND) & (weights < 1 - _AT_BOUND) if bounded else torch.ones_like(weights).bool()
-        ridges = here.new_full((basis.shape[2],), ridge)
-        pull = torch.einsum("mcn,tmc->tn", basis, left) - ridge * markers * weights
+        ridges = affine.new_full((basis.shape[2],), ridge)
+        weight_gradient = torch.einsum("mcn,tmc->tn", basis, residual) - ridge * markers * weights
         if slips:
             rigid = rigid_columns(rest, rest.mean(0))
             basis = torch.cat([basis, rigid], dim=2)
             ridges = torch.cat([ridges, ridges.new_full((6,), _FREE_RIDGE)])
             free = torch.cat([free, free.new_ones(frames, 6)], dim=1)
-            pull = torch.cat([pull, torch.einsum("mcn,tmc->tn", rigid, left)], dim=1)
-        follow = torch.einsum("mkcn,tn->tmck", tangents, extended) * shown
+            weight_gradient = torch.cat([weight_gradient, torch.einsum("mcn,tmc->tn", rigid, residual)], dim=1)
+        site_motion = torch.einsum("mkcn,tn->tmck", tangents, extended) * shown
         columns = -pose_columns * shown
 
         size, poses = 2 * markers, pose_columns.shape[-1]
-        information = here.new_zeros(size + poses, size + poses)
+        information = affine.new_zeros(size + poses, size + poses)
         row = torch.arange(markers)
-        sites = here.new_zeros(markers, 2, markers, 2)
-        sites[row, :, row] = torch.einsum("tmci,tmcj->mij", follow, follow)
+        sites = affine.new_zeros(markers, 2, markers, 2)
+        sites[row, :, row] = torch.einsum("tmci,tmcj->mij", site_motion, site_motion)
         information[:size, :size] = sites.reshape(size, size)
-        between = torch.einsum("tmci,tmcg->mig", follow, columns).reshape(size, poses)
+        between = torch.einsum("tmci,tmcg->mig", site_motion, columns).reshape(size, poses)
         information[:size, size:], information[size:, :size] = between, between.T
         information[size:, size:] = torch.einsum("tmcg,tmch->gh", columns, columns)
 
         own = (basis.transpose(1, 2) @ basis).flatten(1)
         hessian = (seen.double() @ own).unflatten(1, (basis.shape[2], -1)) + torch.diag(ridges * markers)
-        held = torch.diag_embed((~free).double())
-        factor = torch.linalg.cholesky(hessian * free[:, :, None] * free[:, None] + held)
-        to_sites = torch.einsum("mcn,tmck->tnmk", basis, follow).flatten(2)
+        active = torch.diag_embed((~free).double())
+        factor = torch.linalg.cholesky(hessian * free[:, :, None] * free[:, None] + active)
+        to_sites = torch.einsum("mcn,tmck->tnmk", basis, site_motion).flatten(2)
         cross = torch.cat([to_sites, torch.einsum("mcn,tmcg->tng", basis, columns)], dim=2) * free[..., None]
-        pull = pull * free
+        weight_gradient = weight_gradient * free
         half = torch.linalg.solve_triangular(factor, cross, upper=False).flatten(0, 1)
         information = information - half.T @ half
-        outer = torch.cat(
-            [torch.einsum("tmck,tmc->mk", follow, left).flatten(), torch.einsum("tmcg,tmc->g", columns, left)]
+        total = torch.cat(
+            [
+                torch.einsum("tmck,tmc->mk", site_motion, residual).flatten(),
+                torch.einsum("tmcg,tmc->g", columns, residual),
+            ]
         )
-        adapted = torch.cholesky_solve(pull[..., None], factor)[..., 0]
-        return TakeCurvature(information, outer - torch.einsum("tnp,tn->p", cross, adapted), factor, cross, pull)
+        weight_step = torch.cholesky_solve(weight_gradient[..., None], factor)[..., 0]
+        return TakeCurvature(
+            information, total - torch.einsum("tnp,tn->p", cross, weight_step), factor, cross, weight_gradient
+        )
 
-    def step(self, stiffness: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, precision: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """One Newton step of everything, with a quadratic prior on sites and pose.
 
         Args:
-            stiffness: of the prior, (2M+G,), mm² a squared unit.
-            pull: its gradient, (2M+G,).
+            precision: of the prior, (2M+G,), mm² a squared unit.
+            gradient: of the prior, (2M+G,).
 
         Returns:
-            Shifts of sites and pose, (2M+G,), and the change of the weights, (T,N).
+            Steps of sites and pose, (2M+G,), and the change of the weights, (T,N).
         """
-        shift = torch.linalg.solve(self.information + torch.diag(stiffness), self.gradient + pull)
-        return shift, torch.cholesky_solve((self.pull - self.cross @ shift)[..., None], self.factor)[..., 0]
+        step = torch.linalg.solve(self.information + torch.diag(precision), self.gradient + gradient)
+        return step, torch.cholesky_solve((self.weight_gradient - self.cross @ step)[..., None], self.factor)[..., 0]
 
 
 def pose_columns(on_rig: Tensor, pose: Similarity) -> Tensor:
-    """How the pose moves markers that lie at points (T,M,3): (T,M,3,G).
+    """The derivative of markers at points (T,M,3) in the pose: (T,M,3,G).
 
-    One pose: shifts along the axes, turns about them and the scale, about the mean of all points. A pose a frame: the
-    scale alone, about each frame's mean; its motion is among what ``TakeCurvature`` eliminates.
+    One pose: translations along the axes, rotations about them and the scale, about the mean of all points.
+    A pose a frame: the scale alone, about each frame's mean; its motion is among what ``TakeCurvature`` eliminates.
     """
     if len(pose.scale) > 1:
         return ((on_rig - on_rig.mean(1, keepdim=True)) / ARM)[..., None]
     arm = (on_rig - on_rig.mean((0, 1))) / ARM
     axes = torch.eye(3, dtype=on_rig.dtype).expand(*on_rig.shape, 3)
-    turns = torch.linalg.cross(axes, arm[..., None, :].expand_as(axes), dim=-1).transpose(2, 3)
-    return torch.cat([axes, turns, arm[..., None]], dim=3)
+    rotations = torch.linalg.cross(axes, arm[..., None, :].expand_as(axes), dim=-1).transpose(2, 3)
+    return torch.cat([axes, rotations, arm[..., None]], dim=3)

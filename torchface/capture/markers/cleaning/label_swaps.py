@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchface.capture.markers.cleaning.robust_prediction import Prediction
 
-# A stretch goes on over frames that tell nothing, as long as none of the two markers is seen at its own place.
-_LONGEST_SILENCE = 0.25
+# Seconds: a stretch continues over frames without votes while neither marker is an inlier.
+_MAX_GAP = 0.25
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class Swap:
 
 
 def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
-    """Stretches in which two markers are each off their own place and at the other's.
+    """Stretches in which two markers are each at the other's expected place.
 
-    A sample that is off and nearer to another marker's expected place than to any other, within that one's limit,
-    votes for an exchange of the two, unless the other marker is seen at its own place in that frame. Votes of a pair
+    An outlier that is nearer to another marker's expected place than to any other, within that one's limit,
+    votes for an exchange of the two, unless the other marker is an inlier in that frame. Votes of a pair
     in consecutive frames make a stretch; a stretch counts with votes of both markers, or three of one.
 
     Args:
@@ -34,25 +34,25 @@ def find_swaps(seen: Tensor, prediction: Prediction, fps: float) -> list[Swap]:
         prediction: of these markers.
         fps: frames a second.
     """
-    off = prediction.off
-    at_home = ~torch.isnan(prediction.distance) & ~off
-    frame, marker = off.nonzero(as_tuple=True)
+    outlier = prediction.outliers
+    inlier = ~torch.isnan(prediction.distance) & ~outlier
+    frame, marker = outlier.nonzero(as_tuple=True)
     if not len(frame):
         return []
     distance = (seen[frame, marker][:, None] - prediction.expected[frame]).norm(dim=-1)
     distance[torch.arange(len(frame)), marker] = torch.inf
     nearest, other = distance.min(1)
-    good = (nearest <= prediction.limit[other]) & ~at_home[frame, other]
+    good = (nearest <= prediction.limit[other]) & ~inlier[frame, other]
     votes: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for t, a, b in zip(frame[good].tolist(), marker[good].tolist(), other[good].tolist(), strict=True):
         votes.setdefault((min(a, b), max(a, b)), []).append((t, a))
-    silence = max(1, round(_LONGEST_SILENCE * fps))
+    gap = max(1, round(_MAX_GAP * fps))
     swaps = []
-    for (a, b), found in votes.items():  # pairs are few: only those that somebody voted for
-        home = at_home[:, [a, b]].any(1)
+    for (a, b), found in votes.items():  # pairs are few: only those with votes
+        fits = inlier[:, [a, b]].any(1)
         stretch: list[tuple[int, int]] = []
-        for t, voter in [*sorted(found), (len(off) + silence + 1, -1)]:
-            if stretch and (t - stretch[-1][0] > silence or bool(home[stretch[-1][0] + 1 : t].any())):
+        for t, voter in [*sorted(found), (len(outlier) + gap + 1, -1)]:
+            if stretch and (t - stretch[-1][0] > gap or bool(fits[stretch[-1][0] + 1 : t].any())):
                 if len({who for _, who in stretch}) == 2 or len(stretch) >= 3:
                     swaps.append(Swap((a, b), stretch[0][0], stretch[-1][0] + 1))
                 stretch = []

@@ -1,4 +1,4 @@
-"""What is wrong with a marker take, found, named, and repaired where that is safe; the raw take stays as it is."""
+"""Defects of a marker take, found, named, and repaired where that is safe; the raw take is not changed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from torchface.errors import NameMismatchError
 from torchface.take import Take, Track
 
 _SPIKE_SECONDS, _GAP_SECONDS = 0.1, 0.25
-_DISPLACED_SHARE = 0.7
-_LISTED_GAP = 2
-_GRAVEST_FIRST = ("swap", "displaced", "spike", "gap")
+_DISPLACED_FRACTION = 0.7
+_MIN_REPORTED_GAP = 2
+_BY_SEVERITY = ("swap", "displaced", "spike", "gap")
 
 
 @dataclass(frozen=True)
 class Defect:
-    """One thing that is wrong.
+    """One defect.
 
     Args:
         kind: ``swap``, ``spike``, ``displaced`` (it drifts, has fallen off, or carries another's label) or ``gap``.
@@ -44,7 +44,7 @@ class Defect:
 
 @dataclass(frozen=True, eq=False)
 class Cleanup:
-    """What was found and done.
+    """Defects and repairs of a take.
 
     Args:
         take: the repaired take: labels swapped back, bad samples NaN, gaps left open.
@@ -68,14 +68,14 @@ class Cleanup:
                 f"{defect.size:.1f} mm" if defect.size else "",
                 defect.action,
             )
-            for defect in sorted(self.defects, key=lambda defect: _GRAVEST_FIRST.index(defect.kind))
+            for defect in sorted(self.defects, key=lambda defect: _BY_SEVERITY.index(defect.kind))
             if gaps or defect.kind != "gap"
         ]
 
     def summary(self) -> str:
         """How many of each."""
         counts = Counter(defect.kind for defect in self.defects)
-        found = ", ".join(f"{kind}: {counts[kind]}" for kind in _GRAVEST_FIRST if counts[kind])
+        found = ", ".join(f"{kind}: {counts[kind]}" for kind in _BY_SEVERITY if counts[kind])
         share = 100 * float(self.masked.double().mean()) if self.masked.numel() else 0.0
         return f"{found or 'nothing wrong'}; {share:.2f} % of the samples masked"
 
@@ -84,8 +84,8 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     """Finds swapped labels, spikes, markers that drift or fell off, and gaps; repairs what is safe.
 
     The rig predicts every marker from those that agree. Labels that stand at each other's place are swapped back;
-    samples that still do not fit are masked; short gaps are filled, in ``filled`` only, by where the rig has the marker
-    when the whole take is solved at once (with slip: its own frame).
+    samples that still do not fit are masked; short gaps are filled, in ``filled`` only, by the marker's place on the
+    rig after batch smoothing (with slip: from its own frame).
 
     Args:
         solver: rig, attachment, and the take's alignment.
@@ -121,7 +121,7 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     bad, others = _displaced(prediction, labels, take.fps)
     lost = torch.tensor([any(d.kind == "displaced" and label in d.labels for d in others) for label in labels])
     if bool(lost.any()):
-        # A slow drift bends the weights with it at first: only the other markers tell when it began.
+        # A slow drift biases the weights at first: only the other markers show when it began.
         prediction = predict_markers(solver, repaired, slip, lost)
         bad, others = _displaced(prediction, labels, take.fps)
     defects += others
@@ -136,7 +136,7 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
     column = [labels.index(name) for name in track.names]
 
     def delivered(points: Tensor, changed: Tensor) -> Take:
-        # Samples that nothing was done to come back bit for bit.
+        # Unchanged samples come back bit for bit.
         values = torch.where(changed[..., None], back(points), swapped_back(raw, swaps))[:, column]
         values[torch.isnan(points).any(-1)[:, column]] = torch.nan
         return replace(take, markers=Track(track.names, values.to(track.values.dtype), track.confidence))
@@ -150,15 +150,15 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
 def _displaced(prediction: Prediction, labels: Sequence[str], fps: float) -> tuple[Tensor, list[Defect]]:
     """Samples to mask (T,M), and their runs by name: short ones are spikes.
 
-    Runs of one marker between which it is hardly ever seen at its place are one: it drifts or fell off, and the frames
-    between are not to be trusted either.
+    Runs of one marker with few inliers between them are one: it drifts or fell off, and the frames between are masked
+    too.
     """
-    off, seen = prediction.off, ~torch.isnan(prediction.distance)
-    bad = off.clone()
+    outlier, seen = prediction.outliers, ~torch.isnan(prediction.distance)
+    bad = outlier.clone()
     defects = []
     longest = max(1, round(_SPIKE_SECONDS * fps))
-    for m in off.any(0).nonzero()[:, 0].tolist():
-        for first, last in _merged(_runs(off[:, m]), off[:, m], seen[:, m]):
+    for m in outlier.any(0).nonzero()[:, 0].tolist():
+        for first, last in _merged(_runs(outlier[:, m]), outlier[:, m], seen[:, m]):
             short = last - first < longest
             if not short:
                 bad[first : last + 1, m] = seen[first : last + 1, m]
@@ -167,14 +167,14 @@ def _displaced(prediction: Prediction, labels: Sequence[str], fps: float) -> tup
     return bad, defects
 
 
-def _merged(runs: list[tuple[int, int]], off: Tensor, seen: Tensor) -> list[tuple[int, int]]:
-    """Runs joined to the one before where, of the samples seen from its start to the end, most are off."""
+def _merged(runs: list[tuple[int, int]], outlier: Tensor, seen: Tensor) -> list[tuple[int, int]]:
+    """Runs joined to the one before where, of the samples seen from its start to the end, most are outliers."""
     merged: list[tuple[int, int]] = []
     for first, last in runs:
         if merged:
             start, end = merged[-1]
-            share = float(off[start : last + 1].sum()) / max(int(seen[start : last + 1].sum()), 1)
-            if share >= _DISPLACED_SHARE or (first - end <= 2 and share >= 0.5):
+            fraction = float(outlier[start : last + 1].sum()) / max(int(seen[start : last + 1].sum()), 1)
+            if fraction >= _DISPLACED_FRACTION or (first - end <= 2 and fraction >= 0.5):
                 merged[-1] = (start, last)
                 continue
         merged.append((first, last))
@@ -194,22 +194,19 @@ def _fill(
             safe = inside and last - first < longest and bool(torch.isfinite(expected[first : last + 1, m]).all())
             if safe:
                 filled[first : last + 1, m] = expected[first : last + 1, m]
-            if last - first + 1 >= _LISTED_GAP and not bool(bad[first : last + 1, m].all()):
+            if last - first + 1 >= _MIN_REPORTED_GAP and not bool(bad[first : last + 1, m].all()):
                 defects.append(Defect("gap", (labels[m],), first, last, 0.0, "filled" if safe else "left"))
     return filled, defects
 
 
 def _expected_alone(prediction: Prediction, seen: Tensor) -> Tensor:
-    """Where each frame's own markers have the others, (T,M,3); NaN in a frame that shows none."""
+    """Markers (T,M,3) predicted from their own frame; NaN in a frame that shows none."""
     empty = torch.isnan(seen).any(-1).all(1)
     return torch.where(empty[:, None, None], torch.nan, prediction.expected)
 
 
 def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tensor:
-    """Where the rig has each marker when the whole take is solved at once, (T,M,3), in rig space.
-
-    Frames before and after then tell of a gap what its own frame cannot.
-    """
+    """Markers (T,M,3) on the rig after batch smoothing, in rig space: neighbouring frames bridge a gap."""
     if bool(torch.isnan(seen).any(-1).all()):
         return solver.rest.double().expand_as(seen)
     alignment = solver.alignment
