@@ -6,13 +6,10 @@ intensity are found without labels.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
@@ -22,7 +19,9 @@ from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.action_units.classifier_evaluation import cross_validation, labelled_intensities, level_agreement
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import headed, save_picture, sheet
+from train.runner import metric_lines, run
 
 
 @dataclass(frozen=True)
@@ -60,13 +59,13 @@ class Trained:
     metrics: dict[str, float]
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+def train(settings: Settings, progress: Progress | None = None) -> Trained:
     """Reads, stabilises, aligns, labels, fits, evaluates and saves.
 
     Raises:
         TorchfaceError: there are not as many labels as videos, or a video or its labels cannot be used.
     """
-    say = say or (lambda line: None)
+    progress = progress or silent
     labels = _labels(settings.video, settings.labels)
     test_labels = _labels(settings.test_video, settings.test_labels) if settings.test_video else []
     groups = performed_groups(labels)
@@ -75,8 +74,8 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
     for path, own in zip(settings.video, labels, strict=True):
         reference = videos[0].neutral if videos else None
         videos.append(read_regions(open_video(path), own, names, reference, settings.size))
-        say(f"{path.name}: {own.frames} frames, {len(own.performed)} repetitions")
-    classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, say)
+        progress(f"{path.name}: {own.frames} frames, {len(own.performed)} repetitions")
+    classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, progress)
     metrics: dict[str, float] = {}
     if settings.folds:
         accuracy = cross_validation(videos, labels, groups, settings.training, settings.folds, "repetitions")
@@ -87,7 +86,7 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
         truth = labelled_intensities(video, own, groups, settings.training)
         found = level_agreement(classify(classifier, video), truth, settings.training.levels)
         metrics |= {f"{path.stem}, {name}": value for name, value in found.items()}
-        say(f"{path.name}: {found['within_one']:.1%} within one level")
+        progress(f"{path.name}: {found['within_one']:.1%} within one level")
     save(classifier, settings, metrics, labels)
     picture = levels_picture(videos[0], labelled_intensities(videos[0], labels[0], groups, settings.training), groups)
     save_picture(picture, settings.out / "levels.png")
@@ -165,15 +164,5 @@ def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLab
     return [load_action_labels(path) for path in paths]
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for name, value in trained.metrics.items():
-        print(f"{name:44} {value:8.2%}")
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics, "8.2%"))

@@ -5,13 +5,10 @@ The folder holds pictures with a ``.pts`` beside each, as ``torchface annotate``
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
@@ -19,7 +16,9 @@ from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.annotated_frames import AnnotatedFrame, load_annotated_frames
 from torchface.landmarks.images.appearance_level import sample_pixels
 from torchface.landmarks.images.shape_modes import planar_pose
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_picture, sheet
+from train.runner import run
 
 _OFF = 0.03
 _TO_REST = 0.5
@@ -59,17 +58,17 @@ class Trained:
     errors: Tensor
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+def train(settings: Settings, progress: Progress | None = None) -> Trained:
     """Loads, splits, fits, evaluates on left-out frames, fits on all, saves.
 
     Raises:
         TorchfaceError: the folder holds no annotated frames, or too few.
     """
-    say = say or (lambda line: None)
+    progress = progress or silent
     frames = load_annotated_frames(settings.data)
     if settings.folds < 0 or settings.folds == 1:
         raise TorchfaceError(f"folds: found {settings.folds}, expected 0, or 2 and more")
-    say(f"{len(frames)} annotated frames")
+    progress(f"{len(frames)} annotated frames")
     landmarks = torch.stack([frame.landmarks for frame in frames])
     folds = min(settings.folds, len(frames))
     before, after, found = torch.zeros(0), torch.zeros(0), landmarks.clone()
@@ -81,11 +80,9 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
             trial = AppearanceModel.fit([frame.image for frame in learn], landmarks[~rows], settings.model)
             for row in torch.nonzero(rows)[:, 0].tolist():  # pictures differ in size
                 found[row] = trial(frames[row].image[None], start[row : row + 1])[0]
-            say(f"measured {fold + 1} of {folds}")
+            progress("measuring on left-out frames", fold + 1, folds)
         before, after = relative_errors(start, landmarks), relative_errors(found, landmarks)
-    model = AppearanceModel.fit(
-        [frame.image for frame in frames], landmarks, settings.model, lambda done, total: say(f"{done} of {total}")
-    )
+    model = AppearanceModel.fit([frame.image for frame in frames], landmarks, settings.model, progress)
     save(model, settings, frames, before, after)
     if len(after):
         pictures = [_picture(frame, shape) for frame, shape in zip(frames, found, strict=True)]
@@ -159,16 +156,14 @@ def _picture(frame: AnnotatedFrame, found: Tensor) -> Tensor:
     return caption(sample_pixels(image[None], places)[0].unflatten(1, (300, 240)), frame.name)
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    if len(trained.errors):
-        print(f"left-out frames: {trained.errors.mean():.4f} of the eyes' distance, {trained.errors.max():.4f} worst")
-        print(f"at the start:    {trained.start_errors.mean():.4f}")
+def _lines(_: Settings, trained: Trained) -> list[str]:
+    if not len(trained.errors):
+        return []
+    return [
+        f"left-out frames: {trained.errors.mean():.4f} of the eyes' distance, {trained.errors.max():.4f} worst",
+        f"at the start:    {trained.start_errors.mean():.4f}",
+    ]
 
 
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, _lines)

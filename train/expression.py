@@ -5,21 +5,20 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture
 from torchface.synthetic import draw_identities, performer
 from train.expression_table import Comparison, People, compare, picture
+from train.runner import run
 
 # Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
 _HALF, _NOTHING = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
@@ -69,19 +68,19 @@ class Trained:
     comparison: Comparison | None
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+def train(settings: Settings, progress: Progress | None = None) -> Trained:
     """Loads, aligns, leaves one out after the other, fits, saves.
 
     Raises:
         TorchfaceError: there is neither a folder nor a number of performers, or people do not fit each other.
     """
-    say = say or (lambda line: None)
-    people = gather(settings, say)
-    say(f"{len(people.who)} people, {len(people.names)} expressions")
+    progress = progress or silent
+    people = gather(settings, progress)
+    progress(f"{len(people.who)} people, {len(people.names)} expressions")
     comparison = None
     if settings.compared:
         template = None if settings.template is None else load_rig(settings.template)
-        comparison = compare(people, lambda rest: fit(rest, settings), template, settings.pictured, say)
+        comparison = compare(people, lambda rest: fit(rest, settings), template, settings.pictured, progress)
     model = fit(people, settings)
     save(model, people, comparison, settings)
     return Trained(model, comparison)
@@ -100,7 +99,7 @@ def fit(people: People, settings: Settings) -> ExpressionRegression:
     )
 
 
-def gather(settings: Settings, say: Callable[[str], None]) -> People:
+def gather(settings: Settings, progress: Progress) -> People:
     """The people of a folder, or performers."""
     if (settings.pairs is None) == (settings.performers == 0):
         raise TorchfaceError("train.expression: expected either --pairs DIR or --performers COUNT")
@@ -109,7 +108,7 @@ def gather(settings: Settings, say: Callable[[str], None]) -> People:
         rigs = {}
         for number, identity in enumerate(identities):
             rigs[f"performer{number:03d}"] = selected(performer(identity, texture=False), settings.expressions)
-            say(f"made {number + 1} of {settings.performers}")
+            progress("making performers", number + 1, settings.performers)
     else:
         rigs = {path.name: read(path, settings) for path in entries(settings.pairs)}
     first = next(iter(rigs.values()))
@@ -210,15 +209,5 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
             save_picture(picture(people, comparison, row), folder / f"{name}.png")
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    if trained.comparison is not None:
-        print(trained.comparison)
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda _, trained: [] if trained.comparison is None else [str(trained.comparison)])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import BlendshapeRig, Mesh
 from torchface.modeling import ExpressionRegression, transfer_deformation
+from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
 from torchface.viz.figures.face_views import clay_colors, frame_face
@@ -98,7 +99,7 @@ def compare(
     fit: Callable[[People], ExpressionRegression],
     template: BlendshapeRig | None = None,
     keep: int = 0,
-    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Comparison:
     """Table 1 of the thesis: each person is predicted from the others.
 
@@ -107,13 +108,14 @@ def compare(
         fit: learns from those who are left.
         template: whose shapes are transferred; the mean of those who are left, if absent.
         keep: for how many people, the first, predictions are kept for pictures.
-        say: told of each person.
+        progress: told each step and how far it is.
 
     Source: thesis 3.3.4, table 1.
     """
+    progress = progress or silent
     squared = torch.zeros(len(people.who), len(people.names), len(METHODS), dtype=torch.float64)
     predicted = {}
-    for i, name in enumerate(people.who):
+    for i in range(len(people.who)):
         rest = people.without(i)
         source = rest.mean_rig() if template is None else template.select(people.names)
         neutral = people.template.with_vertices(people.neutrals[i])
@@ -127,8 +129,7 @@ def compare(
         squared[i] = (told - people.offsets[i]).double().square().sum((-1, -2)).T
         if i < keep:
             predicted[i] = told
-        if say is not None:
-            say(f"{name}: {' '.join(f'{value:.0f}' for value in squared[i].sum(0).tolist())} mm²")
+        progress("predicting each person from the others", i + 1, len(people.who))
     return Comparison(squared, people.names, predicted)
 
 

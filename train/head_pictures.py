@@ -11,6 +11,7 @@ from torch import Tensor
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.model_quality import ModelQuality
+from torchface.progress import Progress
 from torchface.rendering.compositing import save_picture
 from torchface.viz.figures.model_figures import (
     color_modes_picture,
@@ -30,7 +31,7 @@ def draw(
     quality: ModelQuality | None,
     learn: Samples | None,
     test: Samples | None,
-    say: Callable[[str], None],
+    progress: Progress,
 ) -> None:
     """Writes the pictures into a folder.
 
@@ -40,7 +41,7 @@ def draw(
         seed: draws random heads.
         quality: its curves, if it was measured.
         learn, test: the heads that it has learned from and others, where there are any.
-        say: told which picture is drawn.
+        progress: told each step and how far it is.
     """
     folder.mkdir(parents=True, exist_ok=True)
     known, others = (
@@ -61,6 +62,6 @@ def draw(
         pictures["color_modes"] = lambda: color_modes_picture(model)
     if quality is not None:
         pictures["quality"] = lambda: quality_picture(quality)
-    for number, (name, picture) in enumerate(pictures.items(), 1):
-        say(f"drawing {name}.png, picture {number} of {len(pictures)}")
+    for number, (name, picture) in enumerate(pictures.items()):
+        progress("drawing pictures", number, len(pictures))
         save_picture(picture(), folder / f"{name}.png")

@@ -17,6 +17,7 @@ from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.modeling import color_casts, texture_areas, without_cast
+from torchface.progress import Progress
 from torchface.registration import find_scans
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
@@ -73,7 +74,7 @@ def registered(folder: Path) -> Source:
     return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number])), key)
 
 
-def gather(source: Source, held_out: int, work: Path, template: Mesh | None, say: Callable[[str], None]) -> Gathered:
+def gather(source: Source, held_out: int, work: Path, template: Mesh | None, progress: Progress) -> Gathered:
     """Writes all meshes into two files; where an earlier run has stopped, it goes on.
 
     Args:
@@ -81,7 +82,7 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, say
         held_out: how many of them, the last, are kept for the test.
         work: the folder of the files.
         template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
-        say: told of progress.
+        progress: told each step and how far it is.
 
     Raises:
         TopologyError: a mesh has another topology than the template.
@@ -105,14 +106,13 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, say
                     f"expected the template's topology, {size} vertices and {len(template.faces)} triangles"
                 )
             if colored and mesh.colors is None:
-                say(f"{source.names[number]} has no colours: the model will have none")
+                progress(f"{source.names[number]} has no colours: the model will have none")
                 colored = False
             if shapes.done == number:
                 shapes.append(mesh.vertices)
             if colored and mesh.colors is not None and colors.done == number:
                 colors.append(mesh.colors)
-            if (number + 1) % max(1, count // 20) == 0:
-                say(f"read {number + 1} of {count}")
+            progress("reading heads", number + 1, count)
     return Gathered(template, MeshSequence(files[0]), MeshSequence(files[1]) if colored else None, held_out)
 
 
@@ -160,7 +160,7 @@ class Balanced:
         return without_cast(self.colors.read(begin, end), self.casts[begin:end])
 
 
-def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, say: Callable[[str], None]) -> Samples:
+def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, progress: Progress) -> Samples:
     """The colours, freed from casts that are told from some thousands of vertices, weighted by their texels."""
     if not white_balance:
         return colors
@@ -170,7 +170,7 @@ def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, say: C
     some = torch.cat([colors.read(*block)[:, chosen] for block in blocks(colors)])
     casts = color_casts(some, weights[chosen])
     brightest = float(casts.mean(1).abs().max().exp())
-    say(f"casts taken off; the strongest exposure is {brightest:.2f} times the mean")
+    progress(f"casts taken off; the strongest exposure is {brightest:.2f} times the mean")
     return Balanced(colors, casts)
 
 

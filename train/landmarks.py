@@ -6,8 +6,7 @@ A folder of iBUG's kind holds pictures with a ``.pts`` beside each; a dlib ``.xm
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -15,7 +14,6 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
@@ -25,7 +23,9 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import box_around, relative_errors
+from torchface.progress import Progress, silent
 from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, face_pictures
+from train.runner import metric_lines, run
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _LUMA = torch.tensor([0.299, 0.587, 0.114])
@@ -86,7 +86,7 @@ class Faces:
 NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2))
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> tuple[LandmarkTrees, Tensor]:
+def train(settings: Settings, progress: Progress | None = None) -> tuple[LandmarkTrees, Tensor]:
     """Loads or renders, splits, fits, evaluates and saves; the model, and its errors on the faces held out.
 
     A checkpoint is kept in ``out`` until the model is saved: a run that was killed goes on from there.
@@ -94,13 +94,13 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> tuple
     Raises:
         TorchfaceError: neither data nor performers, too few faces, or a file that cannot be used.
     """
-    say = say or (lambda line: None)
-    learn, test = split(settings, say)
-    say(f"{len(learn)} faces to learn from, {len(test)} to test on")
+    progress = progress or silent
+    learn, test = split(settings, progress)
+    progress(f"{len(learn)} faces to learn from, {len(test)} to test on")
     settings.out.mkdir(parents=True, exist_ok=True)
     checkpoint = settings.out / "checkpoint.safetensors"
     model = LandmarkTrees.fit(
-        learn.images, learn.boxes, learn.landmarks, settings.trees, _every(50, "trees", say), checkpoint=checkpoint
+        learn.images, learn.boxes, learn.landmarks, settings.trees, progress, checkpoint=checkpoint
     )
     errors = evaluate(model, test)
     _save(model, settings, errors, len(learn))
@@ -108,24 +108,26 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> tuple
     return model, errors
 
 
-def split(settings: Settings, say: Callable[[str], None] | None = None) -> tuple[Faces, Faces]:
+def split(settings: Settings, progress: Progress | None = None) -> tuple[Faces, Faces]:
     """The faces to learn from, and those to test on."""
-    say = say or (lambda line: None)
+    progress = progress or silent
     if not settings.data and settings.performers < 1:
         raise TorchfaceError("found neither data nor performers, expected --data DIR... or --performers NUMBER")
     real = NO_FACES
     for path in settings.data:
         real = real + load_faces(path)
-        say(f"{path}: {len(real)} faces so far")
+        progress(f"{path}: {len(real)} faces so far")
     kept = settings.held_out if settings.data else 0
     if settings.data and len(real) <= kept:
         raise TorchfaceError(f"data: found {len(real)} faces, expected more than the {kept} held out")
     learn, test = real[: len(real) - kept], real[len(real) - kept :]
     if settings.performers:
-        learn = learn + rendered_faces(settings.performers, settings.seed, settings.pictures, say, settings.workers)
+        learn = learn + rendered_faces(
+            settings.performers, settings.seed, settings.pictures, progress, settings.workers
+        )
         if not settings.data:
             seed = settings.seed + 1_000_000
-            test = rendered_faces(settings.held_out, seed, settings.pictures, say, settings.workers)
+            test = rendered_faces(settings.held_out, seed, settings.pictures, progress, settings.workers)
     return learn, test
 
 
@@ -163,12 +165,13 @@ def rendered_faces(
     count: int,
     seed: int,
     settings: PictureSettings | None = None,
-    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     workers: int = 1,
 ) -> Faces:
     """Pictures of made-up people; how many processes render them does not change them."""
+    progress = progress or silent
     parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]
-    progress = None if say is None else _every(1, f"parts of {_PART} pictures", say)
+    progress = progress or silent
     pictures: list[FacePicture] = []
     with ExitStack() as stack:
         rendered: Iterable[list[FacePicture]] = map(_rendered_part, parts)
@@ -176,10 +179,9 @@ def rendered_faces(
             # Spawned: what a process inherits of torch's threads may not survive a fork.
             pool = ProcessPoolExecutor(workers, get_context("spawn"))
             rendered = stack.enter_context(pool).map(_rendered_part, parts)
-        for number, part in enumerate(rendered):
+        for part in rendered:
             pictures += part
-            if progress is not None:
-                progress(number + 1, len(parts))
+            progress("rendering portraits", len(pictures), count)
     if not pictures:
         return NO_FACES
     return Faces(
@@ -230,14 +232,6 @@ def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
     return Faces([stored], box_around(landmarks)[None], landmarks[None])
 
 
-def _every(count: int, what: str, say: Callable[[str], None]) -> Callable[[int, int], None]:
-    def progress(done: int, total: int) -> None:
-        if done % count == 0 or done == total:
-            say(f"{done} of {total} {what}")
-
-    return progress
-
-
 def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) -> None:
     effective = asdict(settings) | {"data": [path.name for path in settings.data], "out": settings.out.name}
     own = f"{settings.performers} rendered pictures of the embedded performer; no person's face."
@@ -278,16 +272,5 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
     )
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        settings = tyro.cli(Settings, description=__doc__)
-        train(settings, print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for key, value in zoo.describe(settings.out.resolve()).metrics.items():
-        print(f"{key:60} {value:8.2f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))

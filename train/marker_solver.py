@@ -5,21 +5,20 @@ Without a rig it is that of the embedded performer with 100 markers.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-import tyro
 
-from torchface import Attachment, BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface import Attachment, BlendshapeRig, load_rig, zoo
 from torchface.capture import MarkerSolver
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
+from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.weight_curves import perform
+from train.runner import metric_lines, run
 
 
 @dataclass(frozen=True)
@@ -53,16 +52,16 @@ class Settings:
     licence: str = ""
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> MarkerSolver:
+def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
     """Builds the solver, tests it on a made-up take, saves it."""
-    say = say or (lambda line: None)
-    say("reading the rig")
+    progress = progress or silent
+    progress("reading the rig")
     rig = performer(texture=False) if settings.rig is None else load_rig(settings.rig, part=settings.part)
     attachment = (
         place_markers(rig, settings.markers) if settings.attachment is None else Attachment.load(settings.attachment)
     )
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
-    say("solving a made-up take")
+    progress("solving a made-up take")
     metrics = measure(solver, rig, settings)
     effective = {key: value for key, value in asdict(settings).items() if value is not None}
     effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
@@ -107,16 +106,5 @@ def measure(solver: MarkerSolver, rig: BlendshapeRig, settings: Settings) -> dic
     }
 
 
-def main() -> None:
-    """Parses flags, builds, prints."""
-    try:
-        settings = tyro.cli(Settings, description=__doc__)
-        train(settings, print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for key, value in zoo.describe(settings.out.resolve()).metrics.items():
-        print(f"{key:50} {value:8.3f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))

@@ -8,13 +8,10 @@ started again, a run goes on where it was.
 from __future__ import annotations
 
 import shutil
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-import tyro
 
 from torchface import TorchfaceError, zoo
 from torchface.errors import ValueRangeError
@@ -22,9 +19,11 @@ from torchface.geometry.sample_batches import SampleRange, Samples, blocks
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.streamed_training import fit_sequence
+from torchface.progress import Progress, silent
 from train.head_pictures import draw
 from train.head_samples import Source, balanced_colors, gather, laid, performers, registered
 from train.head_templates import ict_head_model, load_template
+from train.runner import metric_lines, run
 
 _TESTED_PERFORMERS = 20
 _MANY, _FOLDS, _FEWEST_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
@@ -90,45 +89,45 @@ class Trained:
     quality: ModelQuality | None
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+def train(settings: Settings, progress: Progress | None = None) -> Trained:
     """Loads, aligns, splits, fits, evaluates, saves, draws.
 
     Raises:
         TopologyError: a mesh has another topology than the first.
         TorchfaceError: neither scans nor performers, too few of them, all the same, or more components than they hold.
     """
-    say = say or (lambda line: None)
+    progress = progress or silent
     _check_one_source(settings)
     if settings.ict is not None:
-        return _ict(settings, settings.ict, say)
+        return _ict(settings, settings.ict, progress)
     source, held_out = _source(settings)
     template, rig = (None, None) if settings.template is None else load_template(settings.template, settings.part)
     work = settings.out.parent / f".{settings.out.name}.training"
     work.mkdir(parents=True, exist_ok=True)
-    gathered = gather(source, held_out, work, template, say)
+    gathered = gather(source, held_out, work, template, progress)
     count = len(gathered.shapes) - gathered.held_out
-    say(f"{count} heads to learn from, {gathered.held_out} to test on")
-    say("laying the heads on each other")
+    progress(f"{count} heads to learn from, {gathered.held_out} to test on")
+    progress("laying the heads on each other")
     learn, test = laid(gathered, settings.scale)
-    say("fitting the shape")
-    shape = fit_sequence(learn, settings.components, work / "shape", _counting(say, "shape"))
+    progress("fitting the shape")
+    shape = fit_sequence(learn, settings.components, work / "shape", progress)
     if settings.variance is not None:
         shape = shape.truncate(variance=settings.variance)
     color, test_colors = None, None
     if gathered.colors is not None:
-        say("fitting the colours")
+        progress("fitting the colours")
         balanced = balanced_colors(
-            gathered.colors, gathered.template, settings.white_balance and not settings.performers, say
+            gathered.colors, gathered.template, settings.white_balance and not settings.performers, progress
         )
         learned = SampleRange(balanced, 0, count)
         test_colors = SampleRange(balanced, count, len(gathered.shapes))
         try:
-            color = fit_sequence(learned, settings.color_components, work / "color", _counting(say, "colours"))
+            color = fit_sequence(learned, settings.color_components, work / "color", progress)
         except ValueRangeError as error:
-            say(f"no model of colours: {error}")
+            progress(f"no model of colours: {error}")
             test_colors = None
     model = HeadModel.on(gathered.template, shape, color, rig)
-    say("measuring")
+    progress("measuring")
     quality = None
     if count >= 3:
         some = min(count, _MEASURED)
@@ -139,17 +138,17 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> Train
     folds = 0
     if not gathered.held_out and count >= _FEWEST_FOLDS:
         folds = min(count, _FOLDS)
-        say(f"leaving heads out in {folds} turns")
+        progress(f"leaving heads out in {folds} turns")
         metrics |= cross_validated(learn, folds, settings.components)
     save(model, settings, metrics, count, gathered.held_out, folds)
-    draw(model, settings.pictures or settings.out / "pictures", settings.seed, quality, learn, test, say)
+    draw(model, settings.pictures or settings.out / "pictures", settings.seed, quality, learn, test, progress)
     shutil.rmtree(work, ignore_errors=True)
     return Trained(model, metrics, quality)
 
 
-def _ict(settings: Settings, folder: Path, say: Callable[[str], None]) -> Trained:
+def _ict(settings: Settings, folder: Path, progress: Progress) -> Trained:
     """The model of ICT-FaceKit's own modes: nothing is learned, so nothing is held out."""
-    say("reading the modes and the expressions")
+    progress("reading the modes and the expressions")
     model = ict_head_model(folder, settings.part, settings.components)
     spread = model.shape.modes.square().sum((0, 2)).sqrt()
     metrics = {
@@ -157,7 +156,7 @@ def _ict(settings: Settings, folder: Path, say: Callable[[str], None]) -> Traine
         "heads from the mean, root mean square mm": float(spread.mean()),
     }
     save(model, settings, metrics, 0, 0, 0)
-    draw(model, settings.pictures or settings.out / "pictures", settings.seed, None, None, None, say)
+    draw(model, settings.pictures or settings.out / "pictures", settings.seed, None, None, None, progress)
     return Trained(model, metrics, None)
 
 
@@ -300,25 +299,5 @@ def _spread(numbers: range, most: int = 60) -> list[int]:
     return sorted({numbers[round(i)] for i in torch.linspace(0, len(numbers) - 1, most).tolist()})
 
 
-def _counting(say: Callable[[str], None], what: str) -> Callable[[int, int], None]:
-    """Says where a fit is, twenty times at most."""
-
-    def count(done: int, total: int) -> None:
-        if done % max(1, total // 20) == 0:
-            say(f"{what}: {done} of {total} blocks")
-
-    return count
-
-
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for key, value in trained.metrics.items():
-        print(f"{key:40} {value:8.3f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, load_take
 from torchface.capture.priors import resampled
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
@@ -50,7 +51,7 @@ def read_takes(
     fps: float | None = None,
     rig: BlendshapeRig | None = None,
     attachment: Attachment | None = None,
-    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> PriorTakes:
     """All takes of a folder, by name.
 
@@ -59,14 +60,14 @@ def read_takes(
         fps: frame rate to bring all takes to; that of the first if absent.
         rig: of the performer of marker takes.
         attachment: where the markers sit on the rig.
-        say: told which file is read.
+        progress: told each step and how far it is.
 
     Raises:
         FileFormatError: there are no takes, or one cannot be read.
         NameMismatchError: two takes have different shapes, or a take has markers and there is no rig or attachment.
         ValueRangeError: a take holds NaN, or neither weights nor markers.
     """
-    say = say or (lambda line: None)
+    progress = progress or silent
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with takes")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
@@ -76,14 +77,14 @@ def read_takes(
     weights: list[Tensor] = []
     solved = 0
     for path in paths:
-        say(f"reading {path.name}")
+        progress(f"reading {path.name}")
         take = load_take(path)
         if take.weights is None and take.markers is not None:
             if rig is None or attachment is None:
                 raise NameMismatchError(
                     f"{path}: found markers, expected weights, or the rig and the attachment that solve them"
                 )
-            say(f"solving {path.name}")
+            progress(f"solving {path.name}")
             take = solve_markers(rig, attachment, take, SolveSettings(align=True)).take
             solved += 1
         if take.weights is None:

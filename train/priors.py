@@ -7,16 +7,14 @@ instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's o
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 
-from torchface import Attachment, BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface import Attachment, BlendshapeRig, load_rig, zoo
 from torchface.capture.priors import (
     DynamicsPrior,
     DynamicsSettings,
@@ -28,10 +26,12 @@ from torchface.capture.priors import (
     face_halves,
 )
 from torchface.errors import ValueRangeError
+from torchface.progress import Progress, silent
 from torchface.synthetic import performer
 from train.prior_pictures import calibration_picture, choice_picture, curves_picture, save_figure
 from train.prior_takes import PriorTakes, made_up, read_takes, renamed, split
 from train.prior_trials import filmed, one_step, solve_error, with_strength
+from train.runner import metric_lines, run
 
 Kind = Literal["shape", "reciprocal", "dynamics", "both"]
 _WINDOWS = (2, 3, 4, 6, 8)
@@ -110,7 +110,7 @@ class Material:
     silent: tuple[str, ...]
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> dict[str, dict[str, float]]:
+def train(settings: Settings, progress: Progress | None = None) -> dict[str, dict[str, float]]:
     """Loads, names, splits, chooses, fits, evaluates, saves, draws.
 
     Returns:
@@ -120,20 +120,20 @@ def train(settings: Settings, say: Callable[[str], None] | None = None) -> dict[
         TorchfaceError: neither takes nor performances; too few takes, too short ones, ones with NaN or with different
             shapes; marker takes without rig and attachment.
     """
-    say = say or (lambda line: None)
-    material = _material(settings, say)
+    progress = progress or silent
+    material = _material(settings, progress)
     both = settings.kind == "both"
     measured = {}
     if settings.kind != "dynamics":
         out = settings.out.with_name(f"{settings.out.name}_shape") if both else settings.out
-        measured[out.name] = _shape(settings, out, material, say)
+        measured[out.name] = _shape(settings, out, material, progress)
     if settings.kind in ("dynamics", "both"):
         out = settings.out.with_name(f"{settings.out.name}_dynamics") if both else settings.out
-        measured[out.name] = _dynamics(settings, out, material, say)
+        measured[out.name] = _dynamics(settings, out, material, progress)
     return measured
 
 
-def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str], None]) -> dict[str, float]:
+def _shape(settings: Settings, out: Path, material: Material, progress: Progress) -> dict[str, float]:
     """A shape prior; its strength is chosen with the last of the takes to learn from, left out for that."""
     learn, test, names = material.learn, material.test, material.learn.names
     fitting, choosing = _for_choice(learn)
@@ -151,7 +151,7 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
         widths = {1.0: []}
     least, chosen = float("inf"), next(iter(widths))
     if trial is not None and (settings.strength is None or len(widths) > 1):
-        say("choosing the strength by trial solves")
+        progress("choosing the strength by trial solves")
         without = solve_error(trial, None, noise)
         points["none"] = [(_STRENGTHS[0], without), (_STRENGTHS[-1], without)]
         for factor, own in widths.items():
@@ -162,7 +162,7 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
             best = min(points[label], key=lambda point: point[1])
             if best[1] < least:
                 least, chosen, strength = best[1], factor, best[0]
-    say("fitting the shape prior")
+    progress("fitting the shape prior")
     prior = with_strength(_fitted(settings.kind, learn, widths[chosen], settings.seed), strength)
     metrics = {"strength": strength, **_densities(prior)}
     together = torch.cat(test.weights)
@@ -197,7 +197,7 @@ def _shape(settings: Settings, out: Path, material: Material, say: Callable[[str
     return metrics
 
 
-def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[str], None]) -> dict[str, float]:
+def _dynamics(settings: Settings, out: Path, material: Material, progress: Progress) -> dict[str, float]:
     """A dynamics prior; its window is chosen with the last of the takes to learn from, left out for that."""
     learn, test = material.learn, material.test
     how = DynamicsSettings(inducing=settings.inducing, iterations=settings.iterations, seed=settings.seed)
@@ -215,7 +215,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[
         for candidate in _WINDOWS:
             if shortest <= candidate + 8:
                 continue
-            say(f"trying a window of {candidate} frames")
+            progress(f"trying a window of {candidate} frames")
             found = one_step(fitted(fitting, candidate), choosing.weights, settings.input_noise).metrics()
             for key, values in tried.items():
                 values.append((candidate, found[key]))
@@ -225,7 +225,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[
                 f"takes: the shortest has {shortest} frames, expected more than {_WINDOWS[0] + 8}, or a window"
             )
         window = int(min(scores, key=lambda point: point[1])[0])
-    say(f"fitting the dynamics prior with a window of {window} frames")
+    progress(f"fitting the dynamics prior with a window of {window} frames")
     prior = fitted(learn, window)
     trial = one_step(prior, test.weights, settings.input_noise)
     metrics = {"window": float(window)} | {f"held out, {key}": value for key, value in trial.metrics().items()}
@@ -248,7 +248,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, say: Callable[[
     return metrics
 
 
-def _material(settings: Settings, say: Callable[[str], None]) -> Material:
+def _material(settings: Settings, progress: Progress) -> Material:
     """The takes under the names that the priors are for; what cannot work is refused before anything is learned."""
     if (settings.takes is None) == (settings.performances <= 0):
         raise ValueRangeError(
@@ -260,7 +260,7 @@ def _material(settings: Settings, say: Callable[[str], None]) -> Material:
         takes = made_up(settings.performances, settings.frames, settings.seed, settings.fps)
     else:
         attachment = None if settings.attachment is None else Attachment.load(settings.attachment)
-        takes = read_takes(settings.takes, settings.fps, rig, attachment, say)
+        takes = read_takes(settings.takes, settings.fps, rig, attachment, progress)
     names: Sequence[str] = settings.names or (takes.names if rig is None else rig.names)
     if rig is None:
         rig = performer(texture=False)
@@ -268,9 +268,9 @@ def _material(settings: Settings, say: Callable[[str], None]) -> Material:
             names = rig.names
     takes, silent = renamed(takes, names)
     if silent:
-        say(f"the takes say nothing of {', '.join(silent)}; these stay at 0")
+        progress(f"the takes say nothing of {', '.join(silent)}; these stay at 0")
     learn, test = split(takes, settings.held_out)
-    say(f"{sum(map(len, learn.weights))} frames of {len(learn.weights)} takes to learn from, "
+    progress(f"{sum(map(len, learn.weights))} frames of {len(learn.weights)} takes to learn from, "
         f"{sum(map(len, test.weights))} of {len(test.weights)} to test on")  # fmt: skip
     return Material(learn, test, rig, silent)
 
@@ -370,17 +370,9 @@ def _save(
     )
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        measured = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for name, metrics in measured.items():
-        print(name)
-        for key, value in metrics.items():
-            print(f"  {key:50} {value:8.4f}")
+def _lines(_: Settings, measured: dict[str, dict[str, float]]) -> list[str]:
+    return [line for name, metrics in measured.items() for line in (name, *metric_lines(metrics, "8.4f"))]
 
 
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, _lines)

@@ -5,14 +5,11 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 
 from torchface import Mesh, TorchfaceError, load_mesh, zoo
 from torchface.landmarks import (
@@ -29,9 +26,11 @@ from torchface.landmarks import (
     unwrap,
 )
 from torchface.landmarks.scans.detector_evaluation import ScanErrors, error_table, landmark_errors, picture
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
+from train.runner import metric_lines, run
 
 _TESTED_PERFORMERS = 20
 _VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
@@ -84,22 +83,22 @@ class Trained:
     errors: list[ScanErrors]
 
 
-def train(settings: Settings, say: Callable[[str], None] | None = None) -> Trained:
+def train(settings: Settings, progress: Progress | None = None) -> Trained:
     """Loads, aligns, splits, fits, evaluates and saves.
 
     Raises:
         TorchfaceError: neither scans nor performers are asked for, no scan is annotated, or one cannot be used.
     """
-    say = say or (lambda line: None)
-    learn, test = _split(settings, say)
-    say(f"{len(learn)} scans to learn from, {len(test)} to test on")
-    detector = fit(learn, settings.appearance, settings.size, settings.detector, say)
+    progress = progress or silent
+    learn, test = _split(settings, progress)
+    progress(f"{len(learn)} scans to learn from, {len(test)} to test on")
+    detector = fit(learn, settings.appearance, settings.size, settings.detector, progress)
     errors, pictures = [], []
     for scan in test:
         found = scan_landmarks(detector, scan.mesh)
         errors.append(landmark_errors(found, scan.mesh, scan.truth, scan.name))
         pictures.append(picture(found, scan.truth))
-        say(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
+        progress(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
     save(detector, settings, errors, len(learn))
     if pictures:
         save_picture(sheet(pictures[:9], 3), settings.out / "held_out.png")
@@ -111,12 +110,12 @@ def fit(
     appearance: Literal["texture", "relief"] = "texture",
     size: int = 1024,
     detector: DetectorSettings | None = None,
-    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> UVLandmarkDetector:
     """Learns the face frame, unwraps every scan as it will be found again, learns the filters and the lines."""
-    say = say or (lambda line: None)
+    progress = progress or silent
     points = torch.stack([scan.truth.twelve() for scan in scans])
-    say("learning the face frame")
+    progress("learning the face frame")
     frame = FaceFrame.fit([scan.mesh for scan in scans], points)
     layout = CylinderLayout().resized(size)
     images, traced, pixels, lines = [], [], [], []
@@ -127,7 +126,7 @@ def fit(
         pixels.append(layout.pixels(head.pose.apply(truth[None])[0]))
         known = scan.truth.lines.items()
         lines.append({name: layout.pixels(head.pose.apply(line[None].double())[0]) for name, line in known})
-        say(f"unwrapped {len(images)} of {len(scans)}")
+        progress("unwrapping scans", len(images), len(scans))
     return UVLandmarkDetector.fit(
         torch.stack(images),
         torch.stack(pixels).float(),
@@ -137,20 +136,20 @@ def fit(
         frame,
         lines,
         torch.stack(traced),
-        lambda done, total: say(f"scored {done} of {total}"),
+        progress,
     )
 
 
 def scanned_performers(
-    count: int, seed: int, say: Callable[[str], None] | None = None, voxel: float = _VOXEL
+    count: int, seed: int, progress: Progress | None = None, voxel: float = _VOXEL
 ) -> list[AnnotatedScan]:
     """Raw textured scans of embedded performers with closed eyes, and the truth about them."""
+    progress = progress or silent
     settings, scans = ScannerSettings(voxel=voxel), []
     for i, identity in enumerate(draw_identities(count, torch.Generator().manual_seed(seed))):
         scan = scan_head(eyes_closed(performer(identity)), 1000 * seed + i, settings)
         scans.append(AnnotatedScan(f"performer {i:03d}", scan.mesh, scan.annotation))
-        if say is not None:
-            say(f"scanned {i + 1} of {count}")
+        progress("scanning performers", i + 1, count)
     return scans
 
 
@@ -184,7 +183,7 @@ def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErro
     )
 
 
-def _split(settings: Settings, say: Callable[[str], None]) -> tuple[list[AnnotatedScan], list[AnnotatedScan]]:
+def _split(settings: Settings, progress: Progress) -> tuple[list[AnnotatedScan], list[AnnotatedScan]]:
     """Scans to learn from, and those to test on."""
     given = settings.scans is not None and settings.annotations is not None
     if given == (settings.performers > 0):
@@ -194,7 +193,7 @@ def _split(settings: Settings, say: Callable[[str], None]) -> tuple[list[Annotat
         )
     if settings.scans is None or settings.annotations is None:
         more = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out
-        scans = scanned_performers(settings.performers + more, settings.seed, say)
+        scans = scanned_performers(settings.performers + more, settings.seed, progress)
         return scans[: settings.performers], scans[settings.performers :]
     annotations = load_annotations(settings.annotations)
     names, held_out = sorted(annotations), settings.held_out or 0
@@ -208,15 +207,5 @@ def _split(settings: Settings, say: Callable[[str], None]) -> tuple[list[Annotat
     return scans[:split], scans[split:]
 
 
-def main() -> None:
-    """Parses flags, trains, prints."""
-    try:
-        trained = train(tyro.cli(Settings, description=__doc__), print)
-    except TorchfaceError as error:
-        sys.exit(str(error))
-    for key, value in error_table(trained.errors).items():
-        print(f"{key:40} {value:8.2f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(Settings, train, __doc__, lambda _, trained: metric_lines(error_table(trained.errors), "8.2f"))

@@ -36,7 +36,7 @@ path, checkpoint, out = sys.argv[1:4]
 begin, clock, limit = time.perf_counter(), time.process_time(), int(sys.argv[4])
 seen = []
 
-def progress(done, total):
+def progress(step, done, total):
     seen.append(done)
     print(json.dumps({"done": done, "total": total}), flush=True)
 

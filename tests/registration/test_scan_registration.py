@@ -232,7 +232,7 @@ def test_parts_that_share_no_vertex_follow(
 
 def test_progress_is_told_a_line_a_step(mask: Mesh, scan: Mesh, landmarks: Landmarks) -> None:
     lines: list[str] = []
-    result = register(mask, scan, landmarks, progress=lines.append)
+    result = register(mask, scan, landmarks, progress=lambda step, *_: lines.append(step))
     assert sum("bending" in line for line in lines) == len(result.record.stages)
     assert lines[0] == "checking the scan"
 

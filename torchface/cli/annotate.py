@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -48,7 +48,7 @@ def annotate(
         from torchface.viz.browser.browser_page import import_viser
 
         import_viser()
-    with steps(quiet) as step:
+    with progress_bars(quiet) as progress:
 
         def track(film: VideoFile) -> tuple[Tensor, Tensor | None]:
             from torchface import zoo
@@ -61,11 +61,10 @@ def annotate(
                 raise NameMismatchError(
                     f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
                 )
-            step(f"tracking {film.path.name}")
-            found = track_landmarks(film, LandmarkTracker(model, face=face))
+            found = track_landmarks(film, LandmarkTracker(model, face=face), progress)
             return found.values, found.confidence
 
-        step("reading")
+        progress("reading")
         annotation = prepare_annotation(video, out, track, count)
     if not browser:
         for path in write_proposals(annotation):

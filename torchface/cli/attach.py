@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, steps, told
+from torchface.cli.progress import Quiet, print_lines, progress_bars
 
 
 def attach(
@@ -50,8 +50,8 @@ def attach(
     from torchface.workflows.attach_markers import attach as find_sites
     from torchface.workflows.marker_input import MarkerOptions
 
-    with steps(quiet) as step:
+    with progress_bars(quiet) as progress:
         options = MarkerOptions(unit, labels, frames)
-        report = find_sites(rig, rom, out, initial, standoff, picture, part, step, options, insist)
-    told(report.lines())
+        report = find_sites(rig, rom, out, initial, standoff, picture, part, progress, options, insist)
+    print_lines(report.lines())
     print(out)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 from torchface.errors import ValueRangeError
 
 
@@ -37,8 +37,8 @@ def calibrate(
     match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", corners.strip())
     if match is None:
         raise ValueRangeError(f"--corners: found {corners!r}, expected columns x rows such as 9x6")
-    with steps(quiet) as step:
-        report = run(images, Board(int(match[1]), int(match[2]), square), out, step)
+    with progress_bars(quiet) as progress:
+        report = run(images, Board(int(match[1]), int(match[2]), square), out, progress)
     for line in report.lines():
         console.print(line, highlight=False, markup=False)
     for path in (report.picture, out):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def demo(
@@ -35,11 +35,11 @@ def demo(
     from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
     from torchface.workflows.demo.main_job import run_demo, scene_from
 
-    with steps(quiet) as step:
-        step("preparing head and take")
+    with progress_bars(quiet) as progress:
+        progress("preparing head and take")
         scene = scene_from(template, take, target, seed)
-        result = run_demo(scene, out, seed, progress=step)
-        page = write_demo_page(result, out, step)
+        result = run_demo(scene, out, seed, progress=progress)
+        page = write_demo_page(result, out, progress)
     console.print(_table(scene.title, scene_rows(result)))
     console.print(_table("against the truth", result_rows(result), ("", "whole take", "frame by frame")))
     console.print(_table("solver.onnx", result.solver.rows()))

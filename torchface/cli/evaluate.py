@@ -8,7 +8,7 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def evaluate(
@@ -63,9 +63,9 @@ def evaluate(
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     choice = True if align else False if as_is else None
     settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
-    with steps(quiet) as step:
-        found = run(result, truth, out, settings, step)
-        step("drawing")
+    with progress_bars(quiet) as progress:
+        found = run(result, truth, out, settings, progress)
+        progress("drawing")
         page = write_evaluation_page(found, out, height)
     table = Table(title=f"{found.result} against {found.truth}, millimetres")
     for head in ("region", "mean", "median", "95 %", "largest", "total", "vertices"):

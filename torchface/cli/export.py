@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport
@@ -58,11 +58,11 @@ def _write_solver(
     from torchface.attachment import Attachment
     from torchface.io import load_rig
 
-    with steps(quiet) as step:
-        step("reading the rig")
+    with progress_bars(quiet) as progress:
+        progress("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
         where.check(loaded.neutral, attachment, rig)
-        step("exporting and checking")
+        progress("exporting and checking")
         report = export(loaded, where, out)
     table = Table(show_header=False)
     for row in report.rows():
@@ -87,14 +87,14 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     from torchface.errors import FileFormatError
     from torchface.onnx import export_action_units
 
-    with steps(quiet) as step:
-        step("reading the classifier")
+    with progress_bars(quiet) as progress:
+        progress("reading the classifier")
         classifier = zoo.get_model(model)
         if not isinstance(classifier, ActionUnitClassifier):
             raise FileFormatError(
                 f"{model}: found a {type(classifier).__name__}, expected a classifier of action units"
             )
-        step("exporting and checking")
+        progress("exporting and checking")
         report = export_action_units(classifier, out)
     table = Table(show_header=False)
     for row in report.rows():
@@ -140,14 +140,14 @@ def video_solver(
     from torchface.onnx import export_video_solver
     from torchface.workflows.track.track_models import load_priors
 
-    with steps(quiet) as step:
-        step("reading rig, camera and priors")
+    with progress_bars(quiet) as progress:
+        progress("reading rig, camera and priors")
         loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
         priors = load_priors(loaded, prior, dynamics, fps)
         film = None if landmarks is None else load_take(landmarks).landmarks
         if landmarks is not None and film is None:
             raise FileFormatError(f"{landmarks}: found no landmarks, expected the landmarks.csv of torchface track")
-        step("exporting and checking")
+        progress("exporting and checking")
         report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=film)
     table = Table(show_header=False)
     for row in report.rows():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
@@ -25,8 +25,8 @@ def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
     from torchface import zoo
     from torchface.onnx import export_model as export
 
-    with steps(quiet) as step:
-        step("loading the model")
+    with progress_bars(quiet) as progress:
+        progress("loading the model")
         record = zoo.describe(name)
         model = zoo.get_model(name)
         facts = {
@@ -38,7 +38,7 @@ def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
             "recipe": record.recipe,
             "sha256": record.sha256,
         }
-        step("exporting and checking")
+        progress("exporting and checking")
         report = export(model, out, facts)
     table = Table(show_header=False)
     for row in report.rows():

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def fit(
@@ -63,7 +63,7 @@ def fit(
     from torchface.workflows.rig_names import naming_lines
 
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
-    with steps(quiet) as step:
+    with progress_bars(quiet) as progress:
         made = fit_photographs(
             photographs,
             landmarks,
@@ -74,7 +74,7 @@ def fit(
             settings,
             face,
             texture_size,
-            step,
+            progress,
             landmark_model,
             names,
             part,

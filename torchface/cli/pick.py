@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def pick(
@@ -63,12 +63,12 @@ def pick(
         return found if part is None else submesh(found, region(found, part)).mesh
 
     import_viser()
-    with steps(quiet) as step:
-        step("reading")
+    with progress_bars(quiet) as progress:
+        progress("reading")
         head = read()
         target = None if scan is None else load_mesh(scan, scan_unit)
         wanted = free_set(names) if names else IBUG_68 if landmarks == "68" else TWELVE
-        step("opening the page")
+        progress("opening the page")
         picker = Picker(head, target, out, wanted, mode, mesh.stem, port)
     console.print("Open this page; Ctrl+C ends.")
     print(picker.url, flush=True)

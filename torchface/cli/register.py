@@ -6,11 +6,10 @@ from math import isnan
 from pathlib import Path
 
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console
+from torchface.cli.progress import Quiet, console, progress_bars
 
 _MOST_ROWS = 40
 _NAMED = 3
@@ -58,36 +57,25 @@ def register(
     from torchface.registration.corpus.scan_record import CorpusEntry
     from torchface.workflows.register_scans import register_scans
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=quiet) as progress:
-        scanning = progress.add_task("registering", total=None, rate="")
-        sheet = progress.add_task("contact sheet", total=None, rate="", visible=False)
+    def tell_skipped(entry: CorpusEntry) -> None:
+        if not entry.registered and not quiet:
+            console.print(f"[yellow]skipped[/] {escape(entry.scan.name)}: {escape(entry.error)}", highlight=False)
 
-        new = 0
-
-        def registered(done: int, total: int, entry: CorpusEntry) -> None:
-            nonlocal new
-            new += not entry.reused
-            elapsed = progress.tasks[scanning].elapsed
-            rate = f"{60 * new / elapsed:.1f} a minute" if elapsed and new else ""
-            progress.update(scanning, completed=done, total=total, rate=rate)
-            if not entry.registered:
-                progress.console.print(
-                    f"[yellow]skipped[/] {escape(entry.scan.name)}: {escape(entry.error)}", highlight=False
-                )
-
-        def drawn(done: int, total: int) -> None:
-            progress.update(sheet, completed=done, total=total, visible=True)
-
+    with progress_bars(quiet) as progress:
         done = register_scans(
-            template, scans, out, landmarks, jobs, cluster, part, unit, detector, texture_size, model, registered, drawn
+            template,
+            scans,
+            out,
+            landmarks,
+            jobs,
+            cluster,
+            part,
+            unit,
+            detector,
+            texture_size,
+            model,
+            progress,
+            tell_skipped,
         )
     entries = done.report.entries
     reused = sum(entry.reused for entry in entries)

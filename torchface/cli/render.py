@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, steps
+from torchface.cli.progress import Quiet, progress_bars
 
 
 def render(
@@ -40,10 +40,10 @@ def render(
     from torchface.viz.figures.face_views import clay_colors, face_views
     from torchface.workflows.posed_mesh import load_posed, pose_weights
 
-    with steps(quiet) as step:
-        step("reading")
+    with progress_bars(quiet) as progress:
+        progress("reading")
         posed = load_posed(path, pose_weights(weights), take, frame, part)
-        step("rendering")
+        progress("rendering")
         colors = clay_colors(posed.mesh) if clay else None
         picture = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
         save_picture(picture, out)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, steps, told
+from torchface.cli.progress import Quiet, console, print_lines, progress_bars
 
 _MOST_NAMES = 12
 
@@ -42,13 +42,13 @@ def retarget(
     """
     from torchface.workflows.retarget_weights import retarget_weights
 
-    with steps(quiet) as step:
-        done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, step)
+    with progress_bars(quiet) as progress:
+        done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, progress)
     driven = len(done.shapes.to_names) - len(done.shapes.still)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
     for what, names in (("nothing drives", done.shapes.still), ("drives nothing:", done.shapes.unused)):
         if names:
             more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
             console.print(f"{what} {', '.join(names[:_MOST_NAMES])}{more}", highlight=False)
-    told(f"warning: {warning}" for warning in done.warnings)
+    print_lines(f"warning: {warning}" for warning in done.warnings)
     print(out)

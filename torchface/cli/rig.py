@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def rig(
@@ -67,8 +67,8 @@ def rig(
     from torchface.workflows.rig_names import naming_lines
 
     options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names)
-    with steps(quiet) as step:
-        report = rig_actor(scan, template, out, landmarks, examples, detail, options, step)
+    with progress_bars(quiet) as progress:
+        report = rig_actor(scan, template, out, landmarks, examples, detail, options, progress)
     for line in [*report.lines(), *naming_lines(report.rig, names)]:
         console.print(line, highlight=False, markup=False)
     print(out)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, steps, told
+from torchface.cli.progress import Quiet, print_lines, progress_bars
 
 
 def solve(
@@ -89,9 +89,9 @@ def solve(
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
     options = MarkerOptions(unit, labels, frames)
-    with steps(quiet) as step:
+    with progress_bars(quiet) as progress:
         done = solve_take(
-            rig, take, attachment, out, animation, settings, part, report, stream, camera, step, options, live_link
+            rig, take, attachment, out, animation, settings, part, report, stream, camera, progress, options, live_link
         )
-    told(done.lines())
+    print_lines(done.lines())
     print(out)

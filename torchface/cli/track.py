@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as Remaining
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def track(
@@ -80,21 +78,10 @@ def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> N
     from torchface.workflows.track.track_video import TrackSettings, track_video
 
     assert isinstance(settings, TrackSettings)
-    with _bars(quiet) as progress:
-        tasks: dict[str, TaskID] = {}
-        first: dict[str, int] = {}
-
-        def told(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what], first[what] = progress.add_task(what, total=total, rate=""), done
-            elapsed = progress.tasks[tasks[what]].elapsed
-            rate = f"{(done - first[what]) / elapsed:.0f} frames a second" if elapsed else ""
-            progress.update(tasks[what], completed=done, total=total, rate=rate)
-
-        tracked = track_video(video, rig, out, settings, told)
-        report = progress.add_task("report", total=1, rate="")
+    with progress_bars(quiet) as progress:
+        tracked = track_video(video, rig, out, settings, progress)
+        progress("writing the report")
         page = write_track_page(tracked, out, settings.texture)
-        progress.update(report, completed=1)
     for line in tracked.lines():
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for path in (*tracked.products.values(), page):
@@ -108,26 +95,9 @@ def _live(
     from torchface.workflows.track.track_video import TrackSettings
 
     assert isinstance(settings, TrackSettings)
-    with _bars(quiet) as progress:
-        task = progress.add_task(f"sending to {address}", total=None, rate="")
-
-        def told(done: int, rate: float) -> None:
-            progress.update(task, completed=done, rate=f"{rate:.0f} frames a second")
-
-        report = track_live(camera, rig, address, out, settings, seconds, told)
+    with progress_bars(quiet) as progress:
+        report = track_live(camera, rig, address, out, settings, seconds, progress)
     for line in report.lines():
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if report.path is not None:
         print(report.path)
-
-
-def _bars(quiet: bool) -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        Remaining(),
-    )
-    return Progress(*columns, console=console, disable=quiet)

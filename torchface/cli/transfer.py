@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def transfer(
@@ -39,12 +39,11 @@ def transfer(
     from torchface.workflows.rig_names import naming_lines, renamed
 
     check_out(out)
-    with steps(quiet) as step:
-        step("reading the template")
+    with progress_bars(quiet) as progress:
+        progress("reading the template")
         source = load_rig(template, part=part)
-        step("transferring")
-        transferred = transfer_with_report(source, load_mesh(neutral, unit=unit))
-        step("writing the rig")
+        transferred = transfer_with_report(source, load_mesh(neutral, unit=unit), progress=progress)
+        progress("writing the rig")
         save_rig(renamed(transferred.rig, names), out)
     console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
     for line in naming_lines(transferred.rig, names):

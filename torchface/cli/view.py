@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, steps
+from torchface.cli.progress import Quiet, console, progress_bars
 
 
 def view(
@@ -37,15 +37,15 @@ def view(
     import_viser()  # what is missing should be said before a large rig is read
     if out is None:
         out = Path("edited_weights.csv") if weights is None else weights.with_name(f"{weights.stem}_edited.csv")
-    with steps(quiet) as step:
-        step("reading the rig")
+    with progress_bars(quiet) as progress:
+        progress("reading the rig")
         loaded = load_rig(rig, part=part)
         detail = load_detail_maps(rig) if rig.suffix.lower() == ".glb" else None
         take = None
         if weights is not None:
-            step("reading the take")
+            progress("reading the take")
             take = load_take(weights)
-        step("opening the page")
+        progress("opening the page")
         viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
     console.print("Open this page; Ctrl+C ends.")
     print(viewer.url, flush=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.sample_batches import MovedSamples, Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.progress import Progress, silent
 
 _TOLERANCE = 1e-3
 _MOST_ROUNDS = 20
@@ -36,7 +36,7 @@ def generalised_procrustes(
     scale: bool = False,
     weights: Tensor | None = None,
     start: Tensor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Procrustes:
     r"""The rigid motions that lay shapes on their common mean.
 
@@ -50,7 +50,7 @@ def generalised_procrustes(
         scale: estimate :math:`s`; otherwise sizes stay, and differ.
         weights: of the vertices, (V,); equal if absent.
         start: where the mean is to lie, (V,3); where the first shape lies if absent.
-        progress: called with (rounds done, rounds at most).
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: no (M,V,3), or a start or weights that do not fit.
@@ -58,6 +58,7 @@ def generalised_procrustes(
 
     Source: Gower 1975; thesis 3.2.4.
     """
+    progress = progress or silent
     count, vertices, channels = shapes.shape
     if channels != 3 or count < 1:
         raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected (M,V,3)")
@@ -86,8 +87,7 @@ def generalised_procrustes(
         # What the mean as a whole has drifted by is taken back: the frame is the start's.
         found = similarity_transform(found[None], mean[None], _one(weights), scale=False).apply(found)[0]
         moved, mean, rounds = float((found - mean).norm(dim=1).mean()), found, rounds + 1
-        if progress is not None:
-            progress(rounds, _MOST_ROUNDS)
+        progress("aligning the shapes", rounds)
     pose = Similarity(*(torch.cat(t) for t in zip(*((p.scale, p.rotation, p.translation) for p in poses), strict=True)))
     return Procrustes(pose, mean, rounds)
 

@@ -14,6 +14,7 @@ from torchface.geometry.meshes.operators import edges, vertex_normals
 from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.registration.completion import completed_colors, completed_form
 from torchface.registration.hair_and_cloth import Cover
 from torchface.registration.model_fit import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
@@ -83,7 +84,7 @@ def register(
     model: ShapeModel | HasShape | None = None,
     schedule: Schedule = DEFAULT_SCHEDULE,
     texture_size: int = 1024,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Registration:
     r"""The scan's face in the template's topology, by non-rigid iterated closest points.
 
@@ -108,7 +109,7 @@ def register(
         schedule: which steps, see ``Schedule``.
         texture_size: texels a side of the texture that is made where the scan has colours and the template
             texture coordinates; 0 makes none.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Returns:
         ``Registration(mesh, pose, distance (V,), matched (V,), record)``.
@@ -122,20 +123,20 @@ def register(
 
     Source: Amberg, Romdhani, Vetter 2007; thesis 3.2.3, equation 7 and Algorithm 1.
     """
-    begin, say = time.perf_counter(), progress or (lambda line: None)
+    begin, progress = time.perf_counter(), progress or silent
     if texture_size < 0 or texture_size > 16384:
         raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")
     check_template(template)
     shape = None if model is None else shape_model(model, template)
-    say("checking the scan")
+    progress("checking the scan")
     prepared = prepare_scan(scan, template)
-    say("laying the template on the scan")
+    progress("laying the template on the scan")
     start = _start(template, scan, prepared, landmarks, detector, schedule)
     laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
     contacts = contact_pull(laid, template)
     fit, stages_left = None, schedule.stages
     if shape is not None:
-        say("fitting the model")
+        progress("fitting the model")
         fit = _model_fit(shape, template, laid, start, schedule)
         laid, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
     deformer = Deformer(laid, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
@@ -143,11 +144,11 @@ def register(
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
     for number, stage in enumerate(stages_left, 1):
-        say(f"bending, stage {number} of {len(stages_left)}")
+        progress("bending the template", number - 1, len(stages_left))
         deformer.hidden = cover.hidden(deformer.current, settled=stage.reach <= _SETTLED)
         stages.append(deformer.run(stage, number))
     deformer.unfold()
-    say("measuring")
+    progress("measuring")
     nearest = _nearest(start.surface, deformer.current)
     matched = cover.without_islands(_matched(deformer, start.surface, nearest, schedule))
     met = float(matched[deformer.exposed].double().mean())
@@ -158,7 +159,7 @@ def register(
         )
     unseen = ~cover.features & ~matched
     if unseen.any():
-        say("completing what the scan does not show")
+        progress("completing what the scan does not show")
         nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
         matched &= ~unseen
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
@@ -166,7 +167,7 @@ def register(
     notes += _final_notes(template, scan, deformer, texture_size)
     colors = _scan_colors(scan, start.prepared)
     if colors is not None:
-        say("resampling the scan's colours")
+        progress("resampling the scan's colours")
         mesh = _colored(mesh, template, colors, nearest, matched, unseen, texture_size)
     record = RegistrationRecord(
         start.by,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -109,7 +110,7 @@ def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attach
 
 
 def cleaned_fit(
-    rig: BlendshapeRig, take: Take, start: Attachment, standoff: bool, progress: Callable[[str], None] | None = None
+    rig: BlendshapeRig, take: Take, start: Attachment, standoff: bool, progress: Progress | None = None
 ) -> tuple[AttachmentFit, Cleanup]:
     """Sites from a range of motion that may have swapped labels, spikes and markers that drift: fitted, and where
     something is wrong with the take cleaned with these sites and fitted again. What does not fit is not refused.
@@ -117,14 +118,12 @@ def cleaned_fit(
     Raises:
         TorchfaceError: take and first guess do not fit each other, or the take shows no motion.
     """
-    say = progress or (lambda line: None)
-    say("finding where the markers sit")
-    fit = fit_attachment(rig, take, start, standoff, insist=True)
-    say("looking for what is wrong with the take")
+    progress = progress or silent
+    fit = fit_attachment(rig, take, start, standoff, progress, insist=True)
+    progress("looking for what is wrong with the take")
     cleanup = clean_take(MarkerSolver(rig, fit.attachment, fit.alignment), take, slip=fit.motion is not None)
     if any(defect.kind != "gap" for defect in cleanup.defects):
-        say("finding where the markers sit, without it")
-        fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, insist=True)
+        fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, progress, insist=True)
     return fit, cleanup
 
 
@@ -146,7 +145,7 @@ def attach(
     standoff: bool = False,
     picture: Path | None = None,
     part: str | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     options: MarkerOptions = AS_THEY_ARE,
     insist: bool = False,
 ) -> AttachReport:
@@ -157,17 +156,17 @@ def attach(
         ValueRangeError: the take leaves most sites or shapes uncertain, unless ``insist``.
         TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     check_writable(out, picture)
-    say("reading the rig")
+    progress("reading the rig")
     loaded = load_rig(rig, part=part)
-    say("reading the range of motion")
+    progress("reading the range of motion")
     start = None if initial is None else load_sites(initial, loaded.neutral, rig)
     take, start, notes = read_range_of_motion(rom, start, options)
     if start is None:
-        say("looking for the pose in which the markers lie on the face")
+        progress("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
-    fit, cleanup = cleaned_fit(loaded, take, start, standoff, say)
+    fit, cleanup = cleaned_fit(loaded, take, start, standoff, progress)
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
@@ -176,7 +175,7 @@ def attach(
         notes = [*notes, str(error)]
     faces, vertices = loaded.neutral.faces, loaded.vertices
     before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
-    say("writing")
+    progress("writing")
     make_folder(out.parent)
     fit.attachment.save(out)
     if picture is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.camera_files import save_calibration
 from torchface.io.images.image_files import load_image
 from torchface.io.video import open_video
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_picture, sheet
 
 _VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
@@ -113,16 +114,14 @@ class CalibrationReport:
         return lines + [f"  left out {name}: {reason}" for name, reason in self.left_out]
 
 
-def calibrate(
-    paths: Sequence[Path], board: Board, out: Path, progress: Callable[[str], None] | None = None
-) -> CalibrationReport:
+def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress | None = None) -> CalibrationReport:
     """Calibrates a camera from pictures, or a video, of a checkerboard held at various angles, and writes it.
 
     Args:
         paths: image files of one size, or one video.
         board: the checkerboard.
         out: the ``.toml`` to write; beside it a picture of the corners found, and of views without distortion.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Raises:
         FileFormatError: ``out`` is no ``.toml``, or a file is broken.
@@ -131,17 +130,17 @@ def calibrate(
 
     Source: Zhang 2000; thesis 4.2.4.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     if out.suffix.lower() != ".toml":
         raise FileFormatError(f"{out}: found the ending {out.suffix!r}, expected .toml")
     if not out.parent.is_dir():
         raise FileFormatError(f"{out}: found no folder {out.parent}, expected an existing one")
     if not paths:
         raise FileFormatError("calibrate: found no picture, expected some of a checkerboard, or a video")
-    views, left_out = find_boards(_pictures(paths), board, say)
-    say(f"calibrating from {len(views)} views")
+    views, left_out = find_boards(_pictures(paths), board, progress)
+    progress(f"calibrating from {len(views)} views")
     report = calibrate_views(views, board, left_out)
-    say("writing the calibration and the overlay")
+    progress("writing the calibration and the overlay")
     picture = out.with_suffix(".png")
     save_calibration(report.calibration, out)
     save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), picture)
@@ -149,14 +148,14 @@ def calibrate(
 
 
 def find_boards(
-    pictures: Iterator[tuple[str, Tensor]], board: Board, progress: Callable[[str], None]
+    pictures: Iterator[tuple[str, Tensor]], board: Board, progress: Progress
 ) -> tuple[list[View], list[tuple[str, str]]]:
     """The views with the whole board, and the names of the other pictures with the reason why not.
 
     Args:
         pictures: names and images, uint8 (H,W), of one size.
         board: the checkerboard.
-        progress: called with a line before each picture.
+        progress: told how many pictures are done.
 
     Raises:
         ShapeError: the pictures differ in size.
@@ -165,7 +164,7 @@ def find_boards(
     left_out: list[tuple[str, str]] = []
     first: tuple[str, torch.Size] | None = None
     for name, image in pictures:  # OpenCV searches one picture at a time
-        progress(f"looking for the board: {name}")
+        progress("looking for the board", len(views) + len(left_out))
         first = first or (name, image.shape)
         if image.shape != first[1]:
             raise ShapeError(

@@ -16,6 +16,7 @@ from torchface.io import load_mesh, load_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.modeling import HeadModel, MorphableModel
+from torchface.progress import Progress, silent
 from torchface.registration.corpus.register_corpus import CorpusReport, register_corpus
 from torchface.registration.corpus.scan_record import CorpusEntry, read_distances
 from torchface.rendering.clay_shading import render
@@ -60,14 +61,14 @@ def register_scans(
     detector: str | Path | None = None,
     texture_size: int = 1024,
     model: str | Path | None = None,
-    progress: Callable[[int, int, CorpusEntry], None] | None = None,
-    drawing: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+    finished: Callable[[CorpusEntry], None] | None = None,
 ) -> RegisteredScans:
     """Registers and draws; see ``torchface register --help`` for the arguments.
 
     Args:
-        progress: called for each scan, as ``register_corpus`` does.
-        drawing: called with (faces drawn, scans).
+        progress: told each step and how far it is.
+        finished: called with each scan's entry, as ``register_corpus`` does.
 
     Raises:
         AlignmentError: not one scan could be registered; table and contact sheet are written all the same.
@@ -82,13 +83,14 @@ def register_scans(
         jobs,
         cluster,
         progress,
+        finished=finished,
         landmarks=landmarks,
         unit=unit,
         detector=None if detector is None else zoo.find(detector),
         model=learned,
         texture_size=texture_size,
     )
-    picture = contact_sheet(report, mesh, drawing)
+    picture = contact_sheet(report, mesh, progress)
     save_picture(picture, report.out / CONTACT_SHEET)
     if not report.registered:
         raise AlignmentError(
@@ -112,19 +114,18 @@ def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
     return model
 
 
-def contact_sheet(report: CorpusReport, template: Mesh, progress: Callable[[int, int], None] | None = None) -> Tensor:
+def contact_sheet(report: CorpusReport, template: Mesh, progress: Progress | None = None) -> Tensor:
     """All registered faces from the front as the template looks, their lines and distances to the scan; (3,H,W).
 
     Args:
         report: of the corpus.
         template: gives the direction that is the front: a scan may be turned any way.
-        progress: called with (faces drawn, scans).
+        progress: told each step and how far it is.
     """
-    cells = []
+    progress, cells = progress or silent, []
     for number, entry in enumerate(report.entries, 1):
         cells.append(_cell(entry, template, report.out))
-        if progress is not None:
-            progress(number, len(report.entries))
+        progress("drawing the contact sheet", number, len(report.entries))
     columns = max(4, round((len(cells) * 1.8) ** 0.5))
     return sheet(cells, min(columns, len(cells)))
 

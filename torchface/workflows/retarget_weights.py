@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_t
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import load_rig, load_take, save_animation
+from torchface.progress import Progress, silent
 from torchface.take import Take, Track
 from torchface.workflows.weight_files import check_live_link, write_weights
 
@@ -38,7 +38,7 @@ def retarget_weights(
     animation: Path | None = None,
     part: str | None = None,
     live_link: Path | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Retargeted:
     """Reads, maps, writes; see ``torchface retarget --help`` for the arguments.
 
@@ -47,9 +47,9 @@ def retarget_weights(
         NameMismatchError: the names do not fit.
         TorchfaceError: any file is broken.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     check_writable(out, live_link, animation)
-    say("reading")
+    progress("reading")
     played = load_take(weights)
     if played.weights is None:
         raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
@@ -66,7 +66,7 @@ def retarget_weights(
     except NameMismatchError as error:
         raise NameMismatchError(f"{table or weights}: {error}") from error
     moved = retarget_take(played, shapes)
-    say("writing")
+    progress("writing")
     written = write_weights(moved, out, live_link)
     if animation is not None:
         make_folder(animation.parent)

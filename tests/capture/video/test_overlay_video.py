@@ -43,7 +43,7 @@ def test_every_frame_with_a_face_is_painted(tmp_path: Path, film: LitFilm) -> No
         film.cameras,
         tmp_path / "painted.avi",
         film.video.fps,
-        progress=lambda done, of: told.append((done, of)),
+        progress=lambda _, done, of: told.append((done, of)),
     )
     before = torch.cat(list(open_video(film.video.path).color_chunks(8)))
     after = torch.cat(list(open_video(painted.path).color_chunks(8)))
@@ -78,7 +78,7 @@ def test_frames_are_taken_as_they_come(tmp_path: Path, film: LitFilm) -> None:
             assert ahead[0] <= done[0] + 2
             yield frame
 
-    def progress(count: int, _: int) -> None:
+    def progress(step: str, count: int = 0, total: int = 0) -> None:
         done[0] = count
 
     path = tmp_path / "painted.avi"

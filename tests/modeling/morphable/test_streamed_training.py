@@ -38,7 +38,7 @@ def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch:
     if lanczos:
         monkeypatch.setattr(module, "_WHOLE_SPECTRUM", 10)
     steps: list[tuple[int, int]] = []
-    ours = fit_sequence(InMemory(values), 10, progress=lambda *step: steps.append(step))
+    ours = fit_sequence(InMemory(values), 10, progress=lambda _, done, of: steps.append((done, of)))
     whole = MorphableModel.fit(values, 10)
     assert (ours.components - whole.components).abs().max() < 1e-6
     assert (ours.standard_deviations / whole.standard_deviations - 1).abs().max() < 1e-6

@@ -187,7 +187,7 @@ def test_errors_fall_and_the_record_is_that_of_the_rig(template: BlendshapeRig, 
     weights = torch.tensor([[0.9, 0.3, 0.0], [0.0, 0.5, 0.8]], dtype=torch.float64)
     goal, rounds = person(weights), []
     made = rig_from_examples(
-        template, person.neutral, goal, weights, SHORT, progress=lambda done, of: rounds.append((done, of))
+        template, person.neutral, goal, weights, SHORT, progress=lambda _, done, of: rounds.append((done, of))
     )
     assert rounds == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert made.errors.shape == (5, 2)

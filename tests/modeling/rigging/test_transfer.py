@@ -110,7 +110,9 @@ def test_shapes_that_move_the_same_vertices_are_solved_together_and_alike() -> N
     rig = hill_rig()
     twice = BlendshapeRig(rig.neutral, torch.cat([rig.deltas, 0.5 * rig.deltas]), [*"abcdef"])
     counts: list[tuple[int, int]] = []
-    together = transfer_deformation(twice, other_face(rig), progress=lambda done, total: counts.append((done, total)))
+    together = transfer_deformation(
+        twice, other_face(rig), progress=lambda _, done, total: counts.append((done, total))
+    )
     assert counts[-1] == (6, 6)
     assert farthest(together.deltas[:3], transfer_deformation(rig, other_face(rig)).deltas) < 1e-6
 

@@ -15,7 +15,6 @@ from torchface.io import load_mesh, save_mesh
 from torchface.mesh import Mesh
 from torchface.registration import Level, Schedule, Stage
 from torchface.registration.corpus.register_corpus import register_corpus
-from torchface.registration.corpus.scan_record import CorpusEntry
 
 pytestmark = [pytest.mark.cluster, pytest.mark.slow]
 
@@ -55,10 +54,10 @@ def test_a_lost_node_costs_no_scan(
     (folder / "bad.ply").write_bytes(b"junk")
     lost: list[int] = []
 
-    def lose_a_node(number: int, total: int, entry: CorpusEntry) -> None:
-        if number == 3 and not lost:
+    def lose_a_node(step: str, done: int = 0, total: int = 0) -> None:
+        if done == 3 and not lost:
             cluster.remove_node(cluster.second, allow_graceful=False)
-            lost.append(number)
+            lost.append(done)
 
     settings: dict[str, Any] = {"landmarks": folder, "schedule": SHORT, "texture_size": 0}
     found = register_corpus(

@@ -98,10 +98,10 @@ def test_only_what_has_changed_is_registered_again(
         (own / f"s{i}.ply").unlink()
     first = run(template, own, out)
     assert not any(entry.reused for entry in first.entries)
-    told: list[tuple[int, int, CorpusEntry]] = []
-    again = run(template, own, out, progress=lambda *what: told.append(what))
+    told: list[tuple[int, int]] = []
+    again = run(template, own, out, progress=lambda _, done, total: told.append((done, total)))
     assert all(entry.reused for entry in again.entries)
-    assert [(number, total) for number, total, _ in told] == [(1, 3), (2, 3), (3, 3)]
+    assert told == [(3, 3)]
     assert [e.median_distance for e in again.registered] == [e.median_distance for e in first.registered]
     (out / "s0.glb").write_bytes((out / "s0.glb").read_bytes()[:-5])  # somebody has damaged a result
     os.utime(own / "s1.ljson", (1, 1))
@@ -166,13 +166,13 @@ def test_processes_give_the_same_and_one_that_dies_takes_only_its_scan(
 ) -> None:
     killed: list[int] = []
 
-    def kill_one(number: int, total: int, entry: CorpusEntry) -> None:
+    def kill_one(entry: CorpusEntry) -> None:
         victims = [child for child in multiprocessing.active_children() if child.pid is not None]
         if not killed and victims and entry.registered:
             killed.append(victims[0].pid or 0)
             os.kill(killed[0], signal.SIGKILL)
 
-    first = run(template, scans, tmp_path, jobs=2, progress=kill_one)
+    first = run(template, scans, tmp_path, jobs=2, finished=kill_one)
     assert killed
     assert len(first.entries) == COUNT + 1
     lost = [entry for entry in first.skipped if entry.name != "bad"]
@@ -248,8 +248,8 @@ def test_mistakes_are_told_before_anything_is_done(
 
 
 def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: CorpusReport) -> None:
-    def second(number: int, total: int, entry: CorpusEntry) -> None:
+    def second(entry: CorpusEntry) -> None:
         with pytest.raises(ValueRangeError, match="another run writing"):
             run(template, scans, done.out)
 
-    run(template, scans, done.out, progress=second)
+    run(template, scans, done.out, finished=second)

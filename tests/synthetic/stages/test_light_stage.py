@@ -72,7 +72,7 @@ def test_a_film_is_a_file_with_its_truth(tmp_path: Path) -> None:
     settings = replace(PLAIN, noise=0.01, width=64, height=48)
     film = film_under_light(
         tmp_path / "film.avi", rig, torch.zeros(3, len(rig.names)), light, 10.0, torch.Generator().manual_seed(0),
-        settings, progress=lambda done, of: told.append((done, of)),
+        settings, progress=lambda _, done, of: told.append((done, of)),
     )  # fmt: skip
     video = open_video(film.video.path)
     assert (video.width, video.height, video.fps, video.count) == (64, 48, 10.0, 3)

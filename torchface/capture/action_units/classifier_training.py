@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +22,7 @@ from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.capture.action_units.scikit import scikit
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
+from torchface.progress import Progress, silent
 
 _CHUNK = 256
 _REST_FRAMES = 2  # at either end of a repetition
@@ -73,7 +74,7 @@ def fit_classifier(
     labels: Sequence[ActionLabels],
     groups: Sequence[RegionGroup] = GROUPS,
     settings: TrainingSettings | None = None,
-    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ActionUnitClassifier:
     """Learns from one or several performers.
 
@@ -82,25 +83,25 @@ def fit_classifier(
         labels: of each video, with what was performed.
         groups: which regions tell which units.
         settings: how.
-        say: is told what is being done.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: videos and labels differ in number or length.
         NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
         MissingExtraError: scikit-learn is not installed.
     """
-    settings, say = settings or TrainingSettings(), say or (lambda line: None)
+    settings, progress = settings or TrainingSettings(), progress or silent
     check_training(videos, labels, groups)
     size = videos[0].patterns.shape[-1]
     names = group_regions(groups)
     patterns, rest = merged_videos(videos, names)
     sizes, parts = [], []
     for group in groups:
-        say(f"{group.name}: labelling {len(patterns)} frames")
+        progress(f"{group.name}: labelling {len(patterns)} frames")
         own = patterns[:, [names.index(name) for name in group.regions]]
         known = label_group(own, labels, group, settings)
         still = rest[:, [names.index(name) for name in group.regions]]
-        part = _fit_group(group, own, still, known, size, settings, say)
+        part = _fit_group(group, own, still, known, size, settings, progress)
         sizes.append(GroupSize(len(part.components), len(part.intensities)))
         parts.append(part)
     model = ActionUnitClassifier(groups, sizes, size)
@@ -177,7 +178,7 @@ def _fit_group(
     known: GroupClasses,
     size: int,
     settings: TrainingSettings,
-    say: Callable[[str], None],
+    progress: Progress,
 ) -> GroupClassifier:
     probe = GroupClassifier(group, size, 1, 2)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -186,7 +187,7 @@ def _fit_group(
         features.append(group_features(probe, patterns, rest, settings.warp_amplitude, generator))
         classes.append(known.classes)
     samples, truth = torch.cat(features), torch.cat(classes)
-    say(f"{group.name}: principal components of {samples.shape[1]} features")
+    progress(f"{group.name}: principal components of {samples.shape[1]} features")
     mean = samples.double().mean(0)
     components, deviations = principal_components(samples, mean, settings.variance)
     part = GroupClassifier(group, size, len(components), len(known.table))
@@ -195,7 +196,7 @@ def _fit_group(
     part.deviations.copy_(deviations)
     part.intensities.copy_(known.table)
     reduced = (samples - part.mean) @ part.components.T / part.deviations
-    say(f"{group.name}: {len(known.table)} classes of {len(components)} components")
+    progress(f"{group.name}: {len(known.table)} classes of {len(components)} components")
     part.machine.fit(reduced, truth, settings.penalty)
     return part
 

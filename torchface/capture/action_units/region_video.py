@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -17,6 +17,7 @@ from torchface.capture.action_units.stabilization import PointTracker, steady_tr
 from torchface.errors import ShapeError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile, open_video
+from torchface.progress import Progress, silent
 
 SIZE = 48
 _CHUNK = 64
@@ -48,7 +49,7 @@ def read_regions(
     reference: Tensor | None = None,
     size: int = SIZE,
     method: Method = "dis",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> RegionVideo:
     """Stabilises a video, cuts its regions out, thresholds the pattern and lays it on a reference's.
 
@@ -59,7 +60,7 @@ def read_regions(
         reference: another performer's neutral patterns (R,h,w), on which these are laid; as they are if absent.
         size: pixels a side of a region.
         method: of the flow that lays them on the reference.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         FileFormatError: the video cannot be decoded.
@@ -68,6 +69,7 @@ def read_regions(
         AlignmentError: helmet or markers cannot be followed.
         NameMismatchError: a region has no box.
     """
+    progress = progress or silent
     video = video if isinstance(video, VideoFile) else open_video(video)
     grid = region_grid(labels.regions, names, size, video.width, video.height)
     _check_length(video, labels, video.count)
@@ -87,8 +89,7 @@ def read_regions(
         regions = sample_regions(chunk.float() / 255, grid, transforms[done : done + len(chunk)])
         patterns.append(levels.pattern(regions).half())
         done += len(chunk)
-        if progress is not None:
-            progress(done, labels.frames)
+        progress(f"reading regions of {video.path.name}", done, labels.frames)
     whole = torch.cat(patterns).float()
     return RegionVideo(tuple(names), whole, neutral, whole[labels.neutral].clone(), video.fps)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from torchface.capture.action_units.shape_table import ShapeTable
 from torchface.errors import NameMismatchError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile
+from torchface.progress import Progress
 
 _CHUNK = 256
 
@@ -52,7 +53,7 @@ def action_unit_curves(
     units: Sequence[str] | None = None,
     windows: Mapping[str, int] = WINDOWS,
     at_rest: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ActionUnitCurves:
     r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
 
@@ -69,7 +70,7 @@ def action_unit_curves(
         units: which of the classifier's may lead the solve; all if absent.
         windows: frames at 60 a second over which each unit is smoothed.
         at_rest: lead also where no unit is seen; otherwise the markers take over there, as in the source.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from torchface.capture.priors.motion_features import face_regions, motion_basis,
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.extra_packages import import_extra
+from torchface.progress import Progress, silent
 
 _FOLDS = 4  # of a single take
 _LEARNING_RATE = 0.1
@@ -67,7 +68,7 @@ def fit_dynamics_prior(
     groups: Sequence[Sequence[int]] | None = None,
     input_noise: float = 0.0,
     settings: DynamicsSettings | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> DynamicsPrior:
     """Learns from takes, with cross-validation over takes that are left out in turn.
 
@@ -84,7 +85,7 @@ def fit_dynamics_prior(
         input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
             for windows of solved weights should expect as much noise as these have, or it keeps their errors.
         settings: of the learning.
-        progress: called with what is being done.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: no takes, of another number of shapes, or too short for the window.
@@ -95,7 +96,7 @@ def fit_dynamics_prior(
     """
     names, settings = tuple(names), settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
-    report = progress or (lambda line: None)
+    progress = progress or silent
     import_gpytorch()
     _check(takes, names, window, fps, input_noise)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -116,7 +117,7 @@ def fit_dynamics_prior(
     kernels: list[Kernel] = []
     chosen: list[CrossValidated] = []
     for number, group in enumerate(regions):
-        report(f"process {number + 1} of {len(regions)}")
+        progress("fitting Gaussian processes", number, len(regions))
         active = torch.zeros_like(feature_scale)
         active[:, list(group)] = 1.0
         kernels.append(
@@ -126,7 +127,7 @@ def fit_dynamics_prior(
         chosen.append(
             cross_validated(kernels[-1], inducing, inputs, targets, max(settings.correlation_time * fps, 1.0))
         )
-    report("noise")
+    progress("fitting the noise")
     process_mean, process_variance = torch.zeros_like(steps), torch.zeros_like(steps)
     weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in regions]
     for group, one, row in zip(regions, chosen, weights, strict=True):

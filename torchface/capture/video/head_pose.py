@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -12,6 +11,7 @@ from torchface.capture.video.pose_filter import PoseFilter, PoseFilterSettings, 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import Pose, pose_covariance
 from torchface.geometry.cameras.robust_pnp import RobustPose, robust_pnp
+from torchface.progress import Progress, silent
 
 STABLE_LANDMARKS = (0, 1, 15, 16, 27, 28, 29, 30, 33, 36, 39, 42, 45)
 """Of the 68, those that expression moves by less than 1.2 mm, root mean square over 11,000 frames of real takes, on
@@ -205,7 +205,7 @@ def track_pose(
     intrinsics: Tensor,
     confidence: Tensor | None = None,
     settings: PoseSettings | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> HeadPoses:
     """Head poses of a whole video, each from its frame and those before, as :class:`PoseTracker` gives them.
 
@@ -215,7 +215,7 @@ def track_pose(
         intrinsics: K, (3,3).
         confidence: from 0, (T,68); equal if absent.
         settings: see :class:`PoseSettings`.
-        progress: called with the number of frames done.
+        progress: told each step and how far it is.
 
     Returns:
         ``HeadPoses(rotation (T,3,3), translation (T,3), errors (T,), found (T,))``; gaps up to ``longest_gap`` frames
@@ -227,13 +227,13 @@ def track_pose(
 
     Source: thesis 4.2.4 and 4.2.5.
     """
+    progress = progress or silent
     chosen = settings or PoseSettings()
     tracker, steps = PoseTracker(points, intrinsics, chosen), []
     _check_landmarks(landmarks, confidence)
     for t, frame in enumerate(landmarks):  # a frame's draws start from the pose before
         steps.append(tracker.step(frame, None if confidence is None else confidence[t]))
-        if progress is not None:
-            progress(t + 1)
+        progress("finding the head's pose", t + 1, len(landmarks))
     poses = HeadPoses(
         torch.stack([step.rotation for step in steps]),
         torch.stack([step.translation for step in steps]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -13,6 +13,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.io.video import VideoFile, write_video
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import FacePaint, overlay
 
@@ -27,7 +28,7 @@ def overlay_video(
     path: str | Path,
     fps: float,
     calibration: CameraCalibration | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> VideoFile:
     """Writes a video in which the face wears a texture, in the light that was found; a chunk at a time.
 
@@ -43,7 +44,7 @@ def overlay_video(
         path: of the video; ``.avi`` and ``.mkv`` are lossless.
         fps: frames a second.
         calibration: of a lens that bends the frames.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: meshes, cameras and frames differ in number or size.
@@ -51,6 +52,7 @@ def overlay_video(
 
     Source: thesis 4.2.11.
     """
+    progress = progress or silent
     if meshes.ndim != 3 or meshes.shape[1:] != mesh.vertices.shape or len(meshes) != len(cameras):
         raise ShapeError(
             f"overlay_video: found meshes {tuple(meshes.shape)} and {len(cameras)} cameras, expected "
@@ -67,8 +69,7 @@ def overlay_video(
                 found = bool(torch.isfinite(meshes[done]).all())
                 yield (overlay(frame, meshes[done], paint, light, cameras[done], calibration) if found else frame)[None]
                 done += 1
-                if progress is not None:
-                    progress(done, len(meshes))
+                progress("drawing the overlay", done, len(meshes))
         if done < len(meshes):
             raise ShapeError(f"overlay_video: found {done} frames for {len(meshes)} meshes, expected as many")
 

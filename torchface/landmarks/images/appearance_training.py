@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torchface.landmarks.images.appearance_model import COUNT, AppearanceModel, 
 from torchface.landmarks.images.face_warp import FaceGrid, face_grid, face_triangles, with_forehead
 from torchface.landmarks.images.ibug import MIRROR_68
 from torchface.landmarks.images.shape_modes import learn_shape_modes, similarity_modes
+from torchface.progress import Progress, silent
 
 _FEWEST = 3
 _NOSE_BRIDGE = 29
@@ -23,7 +24,7 @@ def learn_appearance(
     images: Sequence[Tensor],
     landmarks: Tensor,
     settings: AppearanceSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> AppearanceModel:
     """Learns a person from some annotated frames, fifteen or so that span what the face does.
 
@@ -31,12 +32,13 @@ def learn_appearance(
         images: (H,W) or (3,H,W), uint8, or floats in [0,1]; sizes may differ.
         landmarks: (M,68,2) pixels.
         settings: how.
-        progress: is told how many images are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: images and landmarks do not fit each other, or fewer than three images.
         ValueRangeError: a landmark is NaN, infinite or far outside its image, or all shapes are the same.
     """
+    progress = progress or silent
     settings = settings or AppearanceSettings()
     grey = [_checked(image, number) for number, image in enumerate(images)]
     _check_landmarks(grey, landmarks)
@@ -63,8 +65,7 @@ def learn_appearance(
     for number, (image, truth) in enumerate(zip(grey, landmarks, strict=True)):  # sizes differ
         for level, grid, found in zip(model.levels, grids, textures, strict=True):
             found.append(_textures(model, level, grid, image[None], truth[None]))
-        if progress is not None:
-            progress(number + 1, len(grey))
+        progress("warping the images", number + 1, len(grey))
     for level, found in zip(model.levels, textures, strict=True):
         _learn_textures(model, level, torch.stack(found))
     return model.eval()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from torchface.landmarks.images.consensus import Consensus, ConsensusSettings, c
 from torchface.landmarks.images.face_box import FaceDetector, HaarDetector, find_face, find_faces, grey_pixels, overlaps
 from torchface.landmarks.images.ibug import box_around
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.progress import Progress, silent
 from torchface.take import Track
 
 COUNT = 68
@@ -258,14 +259,14 @@ class LandmarkTracker:
 def track_landmarks(
     video: VideoFile | str | Path | Iterable[Tensor],
     tracker: LandmarkTracker,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Track:
     """Landmarks of one face in all frames.
 
     Args:
         video: a file, or frames, uint8 (H,W) or (3,H,W) each.
         tracker: what finds them; it goes on from its last frame.
-        progress: is told how many frames are done, and of how many (0 where that is not known).
+        progress: told each step and how far it is.
 
     Returns:
         Names ``"0"`` to ``"67"``, values (T,68,2) in pixels, NaN where the face is lost, confidence (T,68).
@@ -274,6 +275,7 @@ def track_landmarks(
         FileFormatError: the video cannot be decoded, changes size, or has a variable frame rate.
         ShapeError: frames of another kind.
     """
+    progress = progress or silent
     if isinstance(video, str | Path):
         video = open_video(video)
     frames = video.frames() if isinstance(video, VideoFile) else video
@@ -281,8 +283,7 @@ def track_landmarks(
     found = []
     for frame in frames:  # a frame's box is the one before's
         found.append(tracker.step(frame))
-        if progress is not None:
-            progress(len(found), max(total, len(found)) if total else 0)
+        progress("tracking landmarks", len(found), max(total, len(found)) if total else 0)
     if not found:
         return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
     return Track(

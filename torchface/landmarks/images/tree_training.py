@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from torchface.files.states import pack_state, read_state
 from torchface.files.whole_files import write_file
 from torchface.landmarks.images.ibug import MIRROR_68
 from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees, similarity_to, start_shapes
+from torchface.progress import Progress, silent
 
 _ROWS = 4096  # samples whose pixels are read at once
 _MOST_PIXELS = 2**33
@@ -92,7 +93,7 @@ def fit_trees(
     boxes: Tensor,
     landmarks: Tensor,
     settings: TreeSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     mirror: Sequence[int] | None = None,
     checkpoint: Path | None = None,
 ) -> LandmarkTrees:
@@ -106,7 +107,7 @@ def fit_trees(
         boxes: x, y, width, height of the faces, (M,4) pixels.
         landmarks: (M,L,2), pixels; NaN where one is not known.
         settings: how trees are grown.
-        progress: is told how many trees are done, and of how many.
+        progress: told each step and how far it is.
         mirror: which landmark each becomes in a mirrored picture; iBUG's where there are 68, else nothing is mirrored.
         checkpoint: a file that is written after every cascade; where it is there, from the same pictures and settings,
             learning goes on from it, to the same result. It may be deleted afterwards.
@@ -132,7 +133,7 @@ def fit_trees(
     for cascade in range(done, settings.cascades):
         # A generator a cascade, so that what goes on from a checkpoint draws what it would have drawn.
         drawn = torch.Generator().manual_seed(1_000_003 * settings.seed + cascade + 1)
-        shapes = _grow_cascade(model, cascade, samples, shapes, settings, drawn, progress)
+        shapes = _grow_cascade(model, cascade, samples, shapes, settings, drawn, progress or silent)
         if checkpoint is not None:
             _save(checkpoint, signature, model, shapes, cascade + 1)
     return model.eval()
@@ -224,7 +225,7 @@ def _grow_cascade(
     shapes: Tensor,
     settings: TreeSettings,
     generator: torch.Generator,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
 ) -> Tensor:
     """Learns one cascade; the shapes (N,L,2) after it."""
     mean = model.mean
@@ -252,8 +253,7 @@ def _grow_cascade(
     total = settings.cascades * settings.trees
     for tree in range(settings.trees):  # each learns what those before it left
         _grow_tree(model, cascade, tree, grey, residual, likely, settings, generator)
-        if progress is not None:
-            progress(cascade * settings.trees + tree + 1, total)
+        progress("growing trees", cascade * settings.trees + tree + 1, total)
     step = ((before - residual) @ basis).view_as(shapes)
     return shapes + step @ turn.transpose(1, 2)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.hog import similarity, unit_windows
+from torchface.progress import Progress, silent
 
 _NEVER = 2.0  # no cosine is that large
 
@@ -41,7 +42,7 @@ def score_statistics(
     filters: Tensor,
     landmarks: Tensor,
     settings: DetectorSettings,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ScoreStatistics:
     """Scores every filter in all images but its own.
 
@@ -50,10 +51,11 @@ def score_statistics(
         filters: (L,M,bins,side,side).
         landmarks: pixels, (M,L,2); NaN where one is not known.
         settings: thresholds.
-        progress: called with the number of images done and in all.
+        progress: told each step and how far it is.
 
     Source: thesis 3.2.2.
     """
+    progress = progress or silent
     count, names = landmarks.shape[:2]
     sums = torch.zeros(2, names, count, 3, dtype=torch.float64)
     height, width = maps[0].shape[1:]
@@ -75,8 +77,7 @@ def score_statistics(
                 chosen = torch.where(kept & region, scores, 0.0)
                 moments = [(kept & region).sum(1), chosen.sum(1), chosen.square().sum(1)]
                 sums[which, k, others] += torch.stack([m.double() for m in moments], dim=-1)
-        if progress is not None:
-            progress(i + 1, count)
+        progress("scoring images", i + 1, count)
     number, total, squares = sums.unbind(-1)
     mean = total / number.clamp(min=1)
     spread = (squares / number.clamp(min=1) - mean**2).clamp(min=1e-4).sqrt()

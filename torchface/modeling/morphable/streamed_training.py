@@ -16,6 +16,7 @@ from torchface.files.whole_files import read_file, write_file
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.morphable.principal_components import check_count, check_rank, gram_spectrum, signs
+from torchface.progress import Progress, silent
 
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
@@ -26,7 +27,7 @@ def fit_sequence(
     samples: Samples,
     components: int | None = None,
     checkpoint: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> MorphableModel:
     r"""What :meth:`MorphableModel.fit` learns, from samples that are read in blocks.
 
@@ -39,7 +40,7 @@ def fit_sequence(
         components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
         checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
             samples and folder, the fit continues; in the end the files are removed.
-        progress: called with (blocks done, blocks).
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: fewer than two samples.
@@ -48,6 +49,7 @@ def fit_sequence(
 
     Source: thesis 3.2.4, equation 8; Lehoucq, Sorensen, Yang 1998 (Lanczos).
     """
+    report = progress or silent
     count, vertices, channels = samples.shape
     check_count(count, components)
     if components is None and count > _WHOLE_SPECTRUM:
@@ -57,8 +59,7 @@ def fit_sequence(
     steps = iter(range(1, work + 1))
 
     def step() -> None:
-        if progress is not None:
-            progress(next(steps), work)
+        report("fitting principal components", next(steps), work)
 
     mean, floor = _mean(samples, parts, step)
     gram = torch.zeros(count, count, dtype=torch.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,6 +21,7 @@ from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
 from torchface.modeling.photographs.texture_fit import ColorFit
 from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mirror
 
@@ -75,7 +76,7 @@ def fit_images(
     transfers: int = 1,
     texture_size: int = 1024,
     masked: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ImageFit:
     r"""The head whose landmarks are seen where photographs show them.
 
@@ -100,7 +101,7 @@ def fit_images(
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
         masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Returns:
         The head, what it took to find it, and how sure it is; see ``ImageFit``. Solved in float64 on the CPU.
@@ -113,7 +114,7 @@ def fit_images(
 
     Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     vertices = checked_landmark_vertices(model, rig, landmark_vertices)
     sizes = checked_sizes(landmarks, image_size)
     if images is not None:
@@ -124,7 +125,7 @@ def fit_images(
     deltas = _in_place(rig, mean)
     curves = contour_curves(mean, model.faces.cpu(), vertices)
     points = LinearPoints.of(mean, torch.cat([modes, deltas]), vertices, curves)
-    say("placing the cameras")
+    progress("placing the cameras")
     pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
     twins = len(modes) + _twins(rig.names)
     problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, twins)
@@ -134,10 +135,10 @@ def fit_images(
         torch.arange(LANDMARKS).expand(len(found), -1),
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
     )
-    say("fitting identity and expression")
+    progress("fitting identity and expression")
     problem, state = solve_either(problem, start)
     for turn in range(transfers):
-        say(f"transferring the shapes that show, {turn + 1} of {transfers}")
+        progress("transferring the shapes that show", turn, transfers)
         weights = state.coefficients[len(modes) :].float()
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)
@@ -147,7 +148,7 @@ def fit_images(
     fit = _result(problem, state, rig.neutral, mean, modes, deltas, sizes)
     if images is None:
         return fit
-    say("laying the photographs on the head")
+    progress("laying the photographs on the head")
     skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size, masked)
     return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
 

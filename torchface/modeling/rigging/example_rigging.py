@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +16,7 @@ from torchface.modeling.rigging.example_shapes import example_shares, personal_p
 from torchface.modeling.rigging.shape_transfer import ShapeTransfer
 from torchface.modeling.rigging.transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.optim import box_qp
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 
 _EXACT = 0.01  # millimetres a vertex; a rig that misses examples by less has nothing to tell of how good weights are
@@ -102,7 +102,7 @@ def rig_from_examples(
     weights: Tensor,
     schedule: RiggingSchedule | None = None,
     contact_weight: float = CONTACT_WEIGHT,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ExampleRig:
     r"""Learns a person's own shapes from a few expressions, keeping what the template's names mean.
 
@@ -127,7 +127,7 @@ def rig_from_examples(
         weights: roughly what each example is in the template's shapes, (M,N), in [0,1].
         schedule: rounds, stiffness and pull; those of the paper if absent.
         contact_weight: as in ``transfer_deformation``.
-        progress: called with (rounds done, rounds).
+        progress: told each step and how far it is.
 
     Returns:
         The rig, in the neutral's dtype; solved in float64 on the CPU. The same input gives the same result.
@@ -139,6 +139,7 @@ def rig_from_examples(
 
     Source: thesis 3.3.3, equations 27 to 29; Li, Weise and Pauly 2010.
     """
+    progress = progress or silent
     _check(template, neutral, examples, weights, contact_weight)
     job = _Rigging(template, neutral, examples, weights, schedule or RiggingSchedule(), contact_weight)
     for number in range(job.schedule.rounds):
@@ -146,8 +147,7 @@ def rig_from_examples(
         job.solve_shapes(beta)
         job.solve_weights(gamma)
         job.errors.append(job.example_errors())
-        if progress is not None:
-            progress(number + 1, job.schedule.rounds)
+        progress("learning from examples", number + 1, job.schedule.rounds)
     transfer = job.transfer
     return ExampleRig(
         rig=transfer.rig(template, neutral, job.prior + job.personal),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +23,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.following_parts import PartLinks, part_links
 from torchface.modeling.rigging.seams import Seams, find_seams
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 
 STILL = 0.01
@@ -77,15 +78,15 @@ class ShapeTransfer:
             together.setdefault(shape if alone else moving.numpy().tobytes(), []).append(shape)
         return list(together.values())
 
-    def transfer(self, progress: Callable[[int, int], None] | None = None) -> Tensor:
+    def transfer(self, progress: Progress | None = None) -> Tensor:
         """How far each vertex goes in every shape, (N,V,3), in the source's frame."""
+        progress = progress or silent
         moved = torch.zeros_like(self.deltas)
         done = 0
         for group in self.groups():  # a loop over factorisations: shapes that move other vertices need another
             moved[group] = self._solve(group, moved)
             done += len(group)
-            if progress is not None:
-                progress(done, len(moved))
+            progress("transferring shapes", done, len(moved))
         return moved
 
     def follower(self, shape: int) -> Follower:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +14,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.penetration import inner_parts
 from torchface.modeling.rigging.shape_transfer import ShapeTransfer
+from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 
 CONTACT_WEIGHT = 30.0
@@ -67,7 +67,7 @@ def transfer_deformation(
     source: BlendshapeRig,
     target: Mesh,
     contact_weight: float = CONTACT_WEIGHT,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> BlendshapeRig:
     r"""Gives a new face the shapes of a template rig.
 
@@ -83,7 +83,7 @@ def transfer_deformation(
         source: the template: N shapes, V vertices, millimetres.
         target: the new neutral, of the same topology, millimetres.
         contact_weight: how firmly lids and lips keep their gap; 0 leaves that out, and lets parts come through.
-        progress: called with (shapes done, N).
+        progress: told each step and how far it is.
 
     Returns:
         A rig of ``target`` with the source's names; solved in float64 on the CPU. Triangles without area are
@@ -105,7 +105,7 @@ def transfer_with_report(
     source: BlendshapeRig,
     target: Mesh,
     contact_weight: float = CONTACT_WEIGHT,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> TransferredRig:
     """The same as ``transfer_deformation``, with a report in place of a warning."""
     _check(source, target, contact_weight)

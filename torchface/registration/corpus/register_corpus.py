@@ -6,15 +6,17 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.registration.corpus.cluster import import_ray, on_cluster
 from torchface.registration.corpus.processes import in_processes
 from torchface.registration.corpus.scan_job import CorpusJob
@@ -64,8 +66,9 @@ def register_corpus(
     out: str | Path,
     jobs: int = 1,
     cluster: str | None = None,
-    progress: Callable[[int, int, CorpusEntry], None] | None = None,
+    progress: Progress | None = None,
     *,
+    finished: Callable[[CorpusEntry], None] | None = None,
     landmarks: str | Path | None = None,
     unit: str | None = None,
     schedule: Schedule = DEFAULT_SCHEDULE,
@@ -89,7 +92,8 @@ def register_corpus(
             asks for more must call under ``if __name__ == "__main__"``.
         cluster: the address of a Ray cluster, or ``"auto"`` on one of its machines, instead of ``jobs``; scans and
             ``out`` must lie where all its machines see them.
-        progress: called with (scans done, scans, the last one's entry), finished ones included.
+        progress: told how many scans are done, and of how many; those of an earlier run count at once.
+        finished: called with each scan's entry, those of an earlier run first.
         landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
             is registered without landmarks.
         unit: of the scans' files; if absent metres for glTF, millimetres for the others.
@@ -130,14 +134,20 @@ def register_corpus(
         None if model is None else LinearShape.of(shape_model(model, template)),
     )
     tasks = _tasks(job, files, marks)
+    progress = progress or silent
     with _only_run(folder):
         for left_over in folder.glob(".*.part"):
             left_over.unlink(missing_ok=True)
-        entries: dict[str, CorpusEntry] = {}
-        for entry in _entries(job, tasks, jobs, cluster):
+        kept = [entry for task in tasks if (entry := finished_entry(task, job.out)) is not None]
+        entries = {entry.name: entry for entry in kept}
+        progress("registering scans", len(entries), len(tasks))
+        todo = [task for task in tasks if task.name not in entries]
+        for entry in chain(kept, _registered(job, todo, jobs, cluster)):
             entries[entry.name] = entry
-            if progress is not None:
-                progress(len(entries), len(tasks), entry)
+            if finished is not None:
+                finished(entry)
+            if not entry.reused:
+                progress("registering scans", len(entries), len(tasks))
         ordered = tuple(entries[task.name] for task in tasks)
         write_summary(ordered, folder / SUMMARY)
     return CorpusReport(ordered, folder, folder / SUMMARY)
@@ -163,22 +173,12 @@ def find_scans(scans: Sequence[str | Path]) -> list[Path]:
     return list(found)
 
 
-def _entries(job: CorpusJob, tasks: list[CorpusTask], jobs: int, cluster: str | None) -> Iterator[CorpusEntry]:
-    todo = []
-    for task in tasks:
-        entry = finished_entry(task, job.out)
-        if entry is None:
-            todo.append(task)
-        else:
-            yield entry
+def _registered(job: CorpusJob, todo: list[CorpusTask], jobs: int, cluster: str | None) -> Iterable[CorpusEntry]:
     if not todo:
-        return
+        return []
     if cluster is not None:
-        yield from on_cluster(job, todo, cluster)
-    elif jobs > 1:
-        yield from in_processes(job, todo, jobs)
-    else:
-        yield from map(job.run, todo)
+        return on_cluster(job, todo, cluster)
+    return in_processes(job, todo, jobs) if jobs > 1 else map(job.run, todo)
 
 
 def _tasks(job: CorpusJob, files: list[Path], marks: Path | None) -> list[CorpusTask]:

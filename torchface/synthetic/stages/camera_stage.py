@@ -5,7 +5,7 @@ A real video file, the markers as C3D beside it, a description of what was perfo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.action_labels import ActionLabels, Box, save_action_labels
 from torchface.io.take_files import save_take
 from torchface.io.video import VideoFile, write_video
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import both_sides, mean_vertices
 from torchface.synthetic.head.performer import performer
@@ -89,7 +90,7 @@ def film_session(
     identity: Tensor | None,
     generator: torch.Generator,
     settings: StageSettings = StageSettings(),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     attachment: Attachment | None = None,
 ) -> FilmedSession:
     """Paints a performer, sets markers, films a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
@@ -100,7 +101,7 @@ def film_session(
         identity: of the performer, (K,); the mean if absent.
         generator: where all randomness comes from.
         settings: how.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
         attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
 
     Raises:
@@ -123,8 +124,7 @@ def film_session(
         performed=performance.performed,
     )
     frames = film(rig, performance.weights, paint, attachment, camera, rotation, translation, settings.flaws, generator)
-    if progress is not None:
-        frames = _counted(frames, len(performance.weights), progress)
+    frames = _counted(frames, len(performance.weights), progress or silent)
     video = write_video(frames, folder / f"{name}.avi", performance.fps)
     take_path, labels_path = folder / f"{name}.c3d", folder / f"{name}.toml"
     save_take(recording.take, take_path)
@@ -134,10 +134,10 @@ def film_session(
     )
 
 
-def _counted(frames: Iterator[Tensor], total: int, progress: Callable[[int, int], None]) -> Iterator[Tensor]:
+def _counted(frames: Iterator[Tensor], total: int, progress: Progress) -> Iterator[Tensor]:
     for done, frame in enumerate(frames):
         yield frame
-        progress(done + 1, total)
+        progress("rendering the video", done + 1, total)
 
 
 def stage_markers(rig: BlendshapeRig, count: int = 40) -> Attachment:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.video import VideoFile, write_video
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight
@@ -89,7 +90,7 @@ def film_under_light(
     fps: float,
     generator: torch.Generator,
     settings: LightStageSettings = LightStageSettings(),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> LitFilm:
     """Films a performance in colour; the head turns slowly from side to side.
 
@@ -101,12 +102,13 @@ def film_under_light(
         fps: frames a second.
         generator: of motion and noise.
         settings: how.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: the weights are not (T,N), or the rig has no skin.
         FileFormatError: the file cannot be written.
     """
+    progress = progress or silent
     if weights.ndim != 2 or weights.shape[1] != len(rig.names) or len(weights) == 0:
         raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
     cameras = turning_cameras(rig, len(weights), fps, generator, settings)
@@ -117,8 +119,7 @@ def film_under_light(
             linear = lit_picture(mesh, camera, light, settings)
             noise = settings.noise * linear.sqrt() * torch.randn(linear.shape, generator=generator)
             yield (to_srgb((linear + noise).clamp(0, 1)) * 255).round().to(torch.uint8)[None]
-            if progress is not None:
-                progress(t + 1, len(cameras))
+            progress("rendering the video", t + 1, len(cameras))
 
     return LitFilm(write_video(pictures(), path, fps), rig, weights, cameras, light)
 

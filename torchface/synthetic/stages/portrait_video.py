@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.rotations import rotation_matrix
+from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
@@ -79,7 +79,7 @@ def film_portrait(
     weights: Tensor,
     generator: torch.Generator,
     settings: PortraitSettings = PortraitSettings(),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> PortraitFilm:
     """Films a performer whose head turns and sways from frame to frame, before a wall with spots.
 
@@ -88,11 +88,12 @@ def film_portrait(
         weights: (T,N).
         generator: of poses, wall and noise.
         settings: how.
-        progress: is told how many frames are done, and of how many.
+        progress: told each step and how far it is.
 
     Raises:
         ShapeError: the weights are not (T,N), or the rig has no landmarks.
     """
+    progress = progress or silent
     if weights.ndim != 2 or weights.shape[1] != len(rig.names):
         raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
     ids = None if rig.neutral.annotations is None else rig.neutral.annotations.landmarks
@@ -116,8 +117,7 @@ def film_portrait(
         picture = _blurred(picture, settings.blur) + settings.noise * torch.randn(size, generator=generator)
         frames.append((255 * picture.clamp(0, 1)).round().to(torch.uint8))
         landmarks.append(camera.project(posed[ids]))
-        if progress is not None:
-            progress(number + 1, len(weights))
+        progress("rendering the video", number + 1, len(weights))
     return PortraitFilm(torch.stack(frames), torch.stack(landmarks).float(), weights)
 
 

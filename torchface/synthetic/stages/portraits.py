@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,6 +13,7 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.ibug import box_around
+from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
@@ -89,7 +90,7 @@ def face_pictures(
     count: int,
     seed: int,
     settings: PictureSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     first: int = 0,
 ) -> Iterator[FacePicture]:
     """Draws people, poses, expressions, lights and backgrounds, one picture at a time.
@@ -98,9 +99,10 @@ def face_pictures(
         count: how many pictures.
         seed: decides them; a picture does not depend on how many are asked for.
         settings: what is drawn how widely.
-        progress: is told how many are done, and of how many.
+        progress: told each step and how far it is.
         first: number of the first picture; several calls make what one would.
     """
+    progress = progress or silent
     settings = settings or PictureSettings()
     someone = None
     for number in range(first, first + count):  # each has a surface of its own
@@ -109,8 +111,7 @@ def face_pictures(
             someone = _draw_person(settings, person)
         generator = torch.Generator().manual_seed(1_000_003 * seed + number)
         yield replace(_picture(someone, settings, generator), person=number // settings.each)
-        if progress is not None:
-            progress(number + 1 - first, count)
+        progress("rendering portraits", number + 1 - first, count)
 
 
 def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Person:

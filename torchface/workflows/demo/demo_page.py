@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING
 from torchface.rendering.compositing import caption, headed, sheet
 from torchface.shape_names import ARKIT, mapping
@@ -88,20 +89,20 @@ def _told_apart(result: DemoResult) -> Tensor:
     return torch.tensor(told or list(range(len(result.rig.names))))
 
 
-def write_demo_page(result: DemoResult, out: Path, progress: Callable[[str], None] | None = None) -> Path:
+def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = None) -> Path:
     """Renders the report of a demo into a folder and returns the page's path."""
-    say = progress or (lambda line: None)
+    progress = progress or silent
     scene = result.scene
     names, told = result.rig.names, _told_apart(result)
     telling = _telling_frame(result)
     active = scene.weights[:, told].std(0).argsort(descending=True)[:_ACTIVE]
     active = told[active]
-    say("writing the performance for the page")
+    progress("writing the performance for the page")
     markup = _player(result, out, telling, [names[i] for i in active.tolist()])
-    say("rendering the rig")
+    progress("rendering the rig")
     rig_picture = _rig_picture(result)
     frame_picture = _frame_picture(result, telling)
-    say("drawing curves and markers")
+    progress("drawing curves and markers")
     solved, single = result.solved, result.frame_by_frame
     first = _busiest(scene.weights[:, active], round(_CURVE_SECONDS * scene.fps))
     curves = compared_curves(

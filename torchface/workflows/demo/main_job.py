@@ -7,7 +7,6 @@ to disk as C3D, comes back, is solved with the transferred rig, and what came ba
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.transfer import TransferReport, transfer_with_report
 from torchface.onnx import SolverReport, export_solver
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
@@ -43,8 +43,6 @@ from torchface.synthetic.stages.makeup_layout import MakeupLayout, makeup_layout
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.take import Take
-
-Progress = Callable[[str], None]
 
 FLAWS = StageFlaws(noise=0.3, missing=0.02, gaps=1.0, gap_seconds=0.4)
 """What a well run stage leaves: 0.3 mm noise, one sample in fifty lost, a short gap a marker and minute."""
@@ -207,12 +205,12 @@ def run_demo(
         out: the folder; made if absent.
         seed: of noise and gaps.
         flaws: of the stage.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Returns:
         A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     out.mkdir(parents=True, exist_ok=True)
     files = {
         "template rig": out / "template.glb",
@@ -224,34 +222,33 @@ def run_demo(
         "animated rig": out / "animation.glb",
         "solver for applications": out / "solver.onnx",
     }
-    say("transferring the template's shapes to the new head")
-    transferred = transfer_with_report(scene.template, scene.head)
+    transferred = transfer_with_report(scene.template, scene.head, progress=progress)
     rig = transferred.rig
     save_rig(scene.template, files["template rig"])
     save_mesh(replace(scene.head, texture=None), files["new head"])
     save_rig(rig, files["transferred rig"])
-    say("filming the markers")
+    progress("filming the markers")
     layout = _layout(scene.truth)
     attachment = place_markers(scene.truth) if layout is None else layout.attachment
     attachment.save(files["marker sites"])
     generator = torch.Generator().manual_seed(seed)
     recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
     save_take(recording.take, files["marker take"])
-    say("solving the take")
+    progress("solving the take")
     marker_solver = MarkerSolver(rig, attachment)
     filmed = load_take(files["marker take"])
     started = time.perf_counter()
     solved = WholeTakeSolver(marker_solver).solve_take(filmed)
     seconds = time.perf_counter() - started
     single = marker_solver.solve_take(filmed)
-    say("writing weights, animation and solver")
+    progress("writing weights, animation and solver")
     live = bool(mapping(rig.names, ARKIT).any())
     (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
     save_animation(rig, solved, files["animated rig"])
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
     seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
     solver = export_solver(rig, attachment, files["solver for applications"], markers=seen)
-    say("comparing with the truth")
+    progress("comparing with the truth")
     face = face_mask(scene.head)
 
     def compared(take: Take) -> Solved:

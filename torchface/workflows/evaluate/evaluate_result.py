@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from torchface.evaluation import (
     shape_errors,
     vertex_errors,
 )
+from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.viz.figures.heat_maps import round_maximum
 from torchface.workflows.evaluate.animated_meshes import AnimatedMesh, load_animated
@@ -64,7 +65,7 @@ def evaluate(
     truth: Sequence[Path],
     out: Path,
     settings: EvaluationSettings = EvaluationSettings(),
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Reads, compares and writes tables and a summary; see ``torchface evaluate --help`` for the arguments.
 
@@ -78,21 +79,21 @@ def evaluate(
         ValueRangeError: there is nothing to compare, or too much.
         TorchfaceError: any file is broken.
     """
-    say = progress or (lambda line: None)
-    say("reading")
+    progress = progress or silent
+    progress("reading result and truth")
     found = load_animated(result, settings.rig, settings.part)
     scans: ScanTruth | None = None
     if settings.scans:
-        scans = scan_truth(found, truth, out / "registered", settings.landmarks, settings.unit, say)
+        scans = scan_truth(found, truth, out / "registered", settings.landmarks, settings.unit, progress)
         true = scans.animated
     else:
         if len(truth) != 1:
             raise ValueRangeError(f"truth: found {len(truth)} files, expected one, or a folder; or scans (--scans)")
         true = load_animated(truth[0], settings.truth_rig or settings.rig, settings.part)
         true.require_topology_of(found, "; raw scans need --scans, other rigs --truth-rig")
-    say("comparing")
+    progress("comparing")
     evaluation = compare(found, true, settings, scans)
-    say("writing")
+    progress("writing")
     out.mkdir(parents=True, exist_ok=True)
     write_tables(evaluation, out)
     return evaluation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
 from torchface.mesh import Mesh
+from torchface.progress import Progress
 from torchface.registration import register_corpus
 from torchface.workflows.evaluate.animated_meshes import AnimatedMesh
 
@@ -103,7 +104,7 @@ def scan_truth(
     out: Path,
     landmarks: Path | None = None,
     unit: str | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ScanTruth:
     """Registers scans; those that ``out`` holds from an earlier run are taken as they are.
 
@@ -113,24 +114,22 @@ def scan_truth(
         out: the folder of registered meshes and their records.
         landmarks: a folder of landmark files named as the scans.
         unit: of the scans; each format's own if absent.
-        progress: told which scan is registered.
+        progress: told each step and how far it is.
 
     Raises:
         TopologyError: the result is meshes without a rig.
         AlignmentError: a scan could not be registered.
         FileFormatError: there is no scan.
     """
-    say = progress or (lambda line: None)
     if result.rig is None:
         raise TopologyError(
             f"{result.path}: found meshes without a rig, expected the rig whose neutral is laid on the scans (--rig)"
         )
-    say("registering the scans")
     report = register_corpus(
         result.neutral,
         scans,
         out,
-        progress=lambda done, count, entry: say(f"registering the scans, {done} of {count}"),
+        progress=progress,
         landmarks=landmarks,
         unit=unit,
         texture_size=0,

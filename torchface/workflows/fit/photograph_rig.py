@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
+from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
@@ -79,7 +80,7 @@ def fit_photographs(
     settings: FitSettings | None = None,
     face: int | None = None,
     texture_size: int = 1024,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     landmark_model: str | Path = DEFAULT_LANDMARKS,
     names: Naming | None = None,
     part: str | None = None,
@@ -100,7 +101,7 @@ def fit_photographs(
         settings: how landmarks are trusted.
         face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
         texture_size: texels a side; 0 makes no texture.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
         landmark_model: finds landmarks where no file gives them; by name or folder.
         names: of the written shapes; see ``rig_names.renamed``.
         part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
@@ -114,17 +115,17 @@ def fit_photographs(
         NameMismatchError: landmarks do not tell which photograph or face they are of.
         TorchfaceError: landmarks or model are of no use; see ``fit_images``.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     check_out(out)
-    say("reading the model")
+    progress("reading the model")
     heads, rig = matching(load_head_model(model), template, part)
-    say(f"reading {len(photographs)} photographs")
+    progress(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
     found: list[FoundLandmarks] = []
     if landmarks or not photographs:
         marks = torch.stack(landmarks_of(photographs, landmarks, face))
     else:
-        say(f"finding the landmarks of {len(photographs)} photographs")
+        progress(f"finding the landmarks of {len(photographs)} photographs")
         found = find_in_photographs(photographs, images, landmark_model, face)
         marks = torch.stack([one.trusted for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
@@ -144,16 +145,15 @@ def fit_photographs(
         settings=settings,
         texture_size=texture_size,
         masked=not everything,
-        progress=say,
+        progress=progress,
     )
     if not found:
         remarks += landmark_lines(photographs, images, marks, fit, landmark_model, bare)
-    say(f"transferring {len(rig.names)} shapes")
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
     worn = dressed_as(fit.mesh, rig.neutral, unseen)
-    transferred = transfer_with_report(rig, worn)
-    say("writing the rig and the overlays")
+    transferred = transfer_with_report(rig, worn, progress=progress)
+    progress("writing the rig and the overlays")
     save_rig(renamed(transferred.rig, names), out)
     pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn

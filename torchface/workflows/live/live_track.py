@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io.weights.live_link_stream import LiveLinkSender, parse_address
 from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.live.live_frames import Camera, PlayedVideo
@@ -117,7 +117,7 @@ def track_live(
     out: Path | None = None,
     settings: TrackSettings = _DEFAULT,
     seconds: float | None = None,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> LiveReport:
     """Solves what a camera sees and sends it in Live Link Face's packets, until it ends or is interrupted.
 
@@ -128,12 +128,13 @@ def track_live(
         out: a folder for the curves of what was sent; none are kept without.
         settings: models, calibration, face.
         seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
-        progress: told how many frames are sent, and how many a second.
+        progress: told how many frames are sent.
 
     Raises:
         ValueRangeError: the address is none, the rig lacks landmarks, or no frame came.
         FileFormatError: the camera or the video cannot be opened.
     """
+    progress = progress or silent
     parse_address(address)
     actor = load_actor(rig, settings.part)
     source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
@@ -155,8 +156,7 @@ def track_live(
                     now = time.perf_counter()
                     latency.append(1000 * (now - came))
                     rows.append(solved)
-                    if progress is not None:
-                        progress(len(rows), len(rows) / max(now - begin, 1e-9))
+                    progress(f"sending to {address}", len(rows))
                     if seconds is not None and now - begin >= seconds:
                         break
             except KeyboardInterrupt:  # how people end what has no end of its own

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from torchface.modeling import (
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.scanned_examples import seen_example
+from torchface.progress import Progress, silent
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rendering.compositing import save_picture
@@ -140,7 +140,7 @@ def rig_actor(
     examples: Path | None = None,
     detail: Path | None = None,
     options: RigOptions | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ActorReport:
     """Registers the neutral scan, transfers the shapes, learns from examples, bakes normal maps, writes the rig.
 
@@ -157,24 +157,24 @@ def rig_actor(
         detail: a folder of high-resolution scans, named for the one shape that each shows at full strength, and
             ``neutral``.
         options: how the files are read and what is made of them.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Raises:
         FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
         AlignmentError: not one example, or not one scan of details, could be used.
         TorchfaceError: neutral scan, template or an option is of no use.
     """
-    options, say = options or RigOptions(), progress or (lambda line: None)
+    options, progress = options or RigOptions(), progress or silent
     check_out(out)
-    say("reading the template")
+    progress("reading the template")
     rig = load_rig(template, part=options.part)
     shown = weights_row(options.pose, rig.names, "pose") if options.pose else torch.zeros(len(rig.names))
     expressions = [] if examples is None else expressions_in(examples, rig.names)
     if examples is not None and not expressions:
         raise FileFormatError(f"{examples}: found no scan of an expression, expected {LAYOUT}")
     fine = [] if detail is None else _detail_scans(detail, rig)
-    job = _Actor(rig, options, say)
-    say("registering the neutral scan")
+    job = _Actor(rig, options, progress)
+    progress("registering the neutral scan")
     model = None if options.model is None else load_shape_model(options.model)
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
@@ -183,8 +183,7 @@ def rig_actor(
     parts = inner_parts(rig)
     neutral = place_parts(rig, neutral, parts)
     neutral = dressed_as(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
-    say(f"transferring {len(rig.names)} shapes")
-    transferred = transfer_with_report(rig, neutral)
+    transferred = transfer_with_report(rig, neutral, progress=progress)
     actor: BlendshapeRig = transferred.rig
     learned: ExampleRig | None = None
     used: tuple[str, ...] = ()
@@ -192,9 +191,9 @@ def rig_actor(
         learned, used = job.learned(actor, neutral, registration.matched, expressions)
         actor = clear_parts(learned.rig, parts)
     maps = job.baked(actor, fine)
-    say("writing the rig")
+    progress("writing the rig")
     save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
-    say("drawing the registration")
+    progress("drawing the registration")
     picture = out.with_name(f"{out.stem}{PICTURE}")
     save_picture(registration_sheet(load_mesh(scan, options.unit), registration), picture)
     names = {label: baked for label, (_, baked) in maps.items()}
@@ -214,8 +213,8 @@ def rig_actor(
 class _Actor:
     """The steps, and what had to be skipped on the way."""
 
-    def __init__(self, template: BlendshapeRig, options: RigOptions, say: Callable[[str], None]) -> None:
-        self.template, self.options, self.say = template, options, say
+    def __init__(self, template: BlendshapeRig, options: RigOptions, progress: Progress) -> None:
+        self.template, self.options, self.progress = template, options, progress
         self.skipped: list[str] = []
 
     @staticmethod
@@ -243,8 +242,8 @@ class _Actor:
     ) -> tuple[ExampleRig, tuple[str, ...]]:
         """The rig from the examples that could be registered, and their names."""
         vertices, weights, used = [], [], []
-        for number, expression in enumerate(expressions, 1):
-            self.say(f"registering example {number} of {len(expressions)}, {expression.name}")
+        for number, expression in enumerate(expressions):
+            self.progress("registering examples", number, len(expressions))
             # The transferred rig in that expression is nearer to the scan than the actor at rest.
             guess = self.posed(actor, expression.weights)
             try:
@@ -261,15 +260,16 @@ class _Actor:
             used.append(expression.name)
         if not used:
             raise AlignmentError(f"examples: none of {len(expressions)} could be used; {self.skipped[0]}")
-        self.say(f"learning from {len(used)} examples")
-        rig = rig_from_examples(self.template, neutral, torch.stack(vertices), torch.stack(weights), _SCANNED)
+        rig = rig_from_examples(
+            self.template, neutral, torch.stack(vertices), torch.stack(weights), _SCANNED, progress=self.progress
+        )
         return rig, tuple(used)
 
     def baked(self, actor: BlendshapeRig, fine: list[Expression]) -> dict[str, tuple[tuple[str, ...], NormalMap]]:
         """For each scan of details the shapes that it shows (none: the neutral) and the map."""
         maps: dict[str, tuple[tuple[str, ...], NormalMap]] = {}
-        for number, one in enumerate(fine, 1):
-            self.say(f"baking normal map {number} of {len(fine)}, {one.name}")
+        for number, one in enumerate(fine):
+            self.progress("baking normal maps", number, len(fine))
             shapes = tuple(actor.names[i] for i in one.weights.nonzero()[:, 0].tolist())
             try:
                 scan = load_mesh(one.path, self.options.unit)

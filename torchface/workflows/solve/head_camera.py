@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from torchface.capture.action_units.shape_table import built_in_tables
 from torchface.capture.markers import gamma_curves
 from torchface.errors import NameMismatchError
 from torchface.io.action_labels import load_action_labels
+from torchface.progress import Progress
 from torchface.take import Take, Track
 
 _SAME_RATE = 1e-3
@@ -59,7 +59,7 @@ class Predicted:
 
 
 def predicted_curves(
-    camera: HeadCamera, take: Take, names: tuple[str, ...], progress: Callable[[str], None] | None = None
+    camera: HeadCamera, take: Take, names: tuple[str, ...], progress: Progress | None = None
 ) -> Predicted:
     """Classifies the video and brings what it says to the take's frames.
 
@@ -70,13 +70,12 @@ def predicted_curves(
         camera: video, classifier, labels, table.
         take: whose frames are meant.
         names: of the rig's shapes.
-        progress: called with a line before each step.
+        progress: told each step and how far it is.
 
     Raises:
         NameMismatchError: the model is no classifier, or no table fits the rig.
         TorchfaceError: the video or a file beside it cannot be used.
     """
-    say = progress or (lambda line: None)
     classifier = zoo.get_model(camera.classifier)
     if not isinstance(classifier, ActionUnitClassifier):
         raise NameMismatchError(
@@ -84,8 +83,7 @@ def predicted_curves(
         )
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
-    say("reading the video")
-    return laid_beside(action_unit_curves(classifier, camera.video, labels, table, names), take)
+    return laid_beside(action_unit_curves(classifier, camera.video, labels, table, names, progress=progress), take)
 
 
 def laid_beside(curves: ActionUnitCurves, take: Take) -> Predicted:

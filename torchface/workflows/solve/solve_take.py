@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, save_animation
 from torchface.io.weights.live_link_stream import parse_address
 from torchface.onnx.live_solver import LiveMarkerSolver
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.temporal import OneEuroFilter
@@ -75,7 +75,7 @@ def solve_markers(
     take: Take,
     settings: SolveSettings = SolveSettings(),
     predicted: Predicted | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Solution:
     """A take's weights: laid on the rig, cleaned, freed of slip and of what is left at rest, solved.
 
@@ -85,19 +85,19 @@ def solve_markers(
         take: markers, in any space.
         settings: which of these steps.
         predicted: what a head camera saw, for the hybrid solve.
-        progress: told what begins.
+        progress: told each step and how far it is.
 
     Raises:
         AlignmentError: the rig does not explain the markers, unless the settings insist.
         TorchfaceError: take and attachment do not fit each other, or the settings do not fit the take.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     whole = predicted is None and not settings.frame_by_frame
     coverage = check_coverage(attachment, take, len(rig.names), settings.insist)
     empty = empty_frames(take)
     alignment = None
     if settings.align or settings.neutral is not None:
-        say("laying the take on the rig")
+        progress("laying the take on the rig")
         alignment = align_take(rig, attachment, take, settings.neutral)
     terms = {"sparsity": settings.sparsity, "ridge": settings.ridge}
     solver = MarkerSolver(rig, attachment, alignment, **terms)
@@ -108,10 +108,10 @@ def solve_markers(
         warnings.append(f"{_frames_text(numbers)} show no marker; their weights come from the frames before and after")
     cleanup = None
     if settings.clean:
-        say("looking for what is wrong with the take")
+        progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
         take = cleanup.take if whole else cleanup.filled
-    say("solving")
+    progress("solving")
     motion = None
     steady, space = take, alignment
     assert take.markers is not None
@@ -178,7 +178,7 @@ def solve_take(
     report: Path | None = None,
     stream: str | None = None,
     camera: HeadCamera | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     options: MarkerOptions = AS_THEY_ARE,
     live_link: Path | None = None,
 ) -> SolveReport:
@@ -188,30 +188,30 @@ def solve_take(
         ValueRangeError: the take holds no markers.
         TorchfaceError: any file is broken or does not fit the others.
     """
-    say = progress or (lambda line: None)
+    progress = progress or silent
     check_writable(out, live_link, animation, report)
     if stream is not None:
         parse_address(stream)
-    say("reading the rig")
+    progress("reading the rig")
     loaded = load_rig(rig, part=part)
     check_live_link(loaded.names, live_link)
     if stream is not None:
         check_live_link(loaded.names, stream)
     where = Attachment.load(attachment)
     where.check(loaded.neutral, attachment, rig)
-    say("reading the take")
+    progress("reading the take")
     played, notes = read_markers(take, where.labels or (), options)
     span = frame_span(options.frames, len(played))
     if settings.neutral is not None:
         settings = replace(settings, neutral=_within(settings.neutral, span))
-    predicted = None if camera is None else predicted_curves(camera, played, loaded.names, say).frames(span)
+    predicted = None if camera is None else predicted_curves(camera, played, loaded.names, progress).frames(span)
     played = played.frames(span)
     started = time.perf_counter()
-    solution = solve_markers(loaded, where, played, settings, predicted, say)
+    solution = solve_markers(loaded, where, played, settings, predicted, progress)
     seconds = time.perf_counter() - started
     solved = solution.take
     assert solved.weights is not None
-    say("writing")
+    progress("writing")
     written = write_weights(solved, out, live_link)
     if animation is not None:
         make_folder(animation.parent)
@@ -233,10 +233,10 @@ def solve_take(
     if report is not None:
         from torchface.workflows.solve.solve_page import write_solve_page  # matplotlib takes its time
 
-        say("writing the report")
+        progress("writing the report")
         write_solve_page(report, take.name, done, loaded, solution)
     if stream is not None:
-        say(f"sending to {stream}")
+        progress(f"sending to {stream}")
         done = replace(done, sent=_sent(loaded, solution, settings, stream, predicted is not None))
     return done
 

@@ -18,6 +18,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import write_video
 from torchface.io.video.decoding import opencv
+from torchface.progress import Progress, silent
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces
@@ -33,17 +34,16 @@ _LARGEST_SIDE = 480
 _SUBPIXEL = 4  # binary digits of OpenCV's drawing coordinates
 
 
-def write_overlay(
-    tracked: Tracked, path: Path, texture: Path | None, progress: Callable[[str, int, int], None] | None = None
-) -> None:
+def write_overlay(tracked: Tracked, path: Path, texture: Path | None, progress: Progress | None = None) -> None:
     """Writes the overlay of a whole video; it appears when it is complete.
 
     Args:
         tracked: what was solved.
         path: of the video to write.
         texture: a picture to put on the face; without, the mesh is shown and the landmarks on it.
-        progress: told how far it is.
+        progress: told each step and how far it is.
     """
+    progress = progress or silent
     draw = mesh_drawer(tracked) if texture is None else paint_drawer(tracked, texture)
 
     def drawn() -> Iterator[Tensor]:
@@ -52,8 +52,7 @@ def write_overlay(
             for frame in chunk[: len(tracked.frames) - at]:  # each frame has a surface of its own
                 yield draw(at, frame)[None]
                 at += 1
-                if progress is not None:
-                    progress("overlay", at, len(tracked.frames))
+                progress("drawing the overlay", at, len(tracked.frames))
 
     write_video(drawn(), path, tracked.video.fps)
 

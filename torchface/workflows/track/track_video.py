@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.face_box import find_faces
 from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.track_files import (
@@ -45,7 +45,6 @@ from torchface.workflows.track.track_state import TrackedFrames, TrackState, dig
 
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
-Progress = Callable[[str, int, int], None]
 """Told what is being done, how many frames of it are done, and of how many."""
 
 _VERSION = torchface.__version__  # another one may track and solve differently
@@ -92,6 +91,7 @@ def track_video(
             the take is too short for the dynamics prior.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
+    progress = progress or silent
     film = open_video(video)
     film.check()
     actor = load_actor(rig, settings.part)
@@ -218,7 +218,7 @@ def actor_digest(rig: BlendshapeRig) -> str:
     return digest(*(digest(data.hex()) for data in numbers), *rig.names)
 
 
-def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress | None) -> int:
+def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:
     """Landmarks of all frames into the state; how many faces the first frame shows."""
     tracker = LandmarkTracker(models.trees, models.appearance, face=face)
     kept, at, faces = state.done, 0, 0
@@ -233,8 +233,7 @@ def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, p
             found = []
             for number, frame in enumerate(chunk):  # a frame's box is the one before's
                 found.append(tracker.step(frame))
-                if progress is not None:
-                    progress("landmarks", at + number + 1, max(film.count, at + number + 1))
+                progress("tracking landmarks", at + number + 1, max(film.count, at + number + 1))
             last = TrackedFrames(
                 torch.stack([one.landmarks for one in found]),
                 torch.stack([one.confidence for one in found]),
@@ -242,23 +241,20 @@ def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, p
             )
             state.append(last)
         at += len(chunk)
-        if progress is not None and at <= kept:
-            progress("landmarks", at, max(film.count, at))
+        if at <= kept:
+            progress("tracking landmarks", at, max(film.count, at))
     return faces
 
 
-def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress | None) -> PointLight:
+def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) -> PointLight:
     kept = kept_light(state, key)
     if kept is not None:
         return kept
-    if progress is not None:
-        progress("light", 0, 1)
+    progress("estimating the light")
     begin = time.perf_counter()
     found = video_light(tracked)
     tracked.seconds["light"] = time.perf_counter() - begin
     keep_light(state, key, found)
-    if progress is not None:
-        progress("light", 1, 1)
     return found
 
 
@@ -285,12 +281,11 @@ def _solve(
     poses: HeadPoses,
     confidence: Tensor,
     whole_take: bool,
-    progress: Progress | None,
+    progress: Progress,
 ) -> VideoSolution:
     rotation, translation = poses.rotation.to(landmarks), poses.translation.to(landmarks)
     if whole_take and solver.dynamics is not None:
-        if progress is not None:
-            progress("weights", 0, len(landmarks))
+        progress("solving for weights")
         return solve_whole_take(solver, landmarks, rotation, translation, confidence)
     enough = torch.isfinite(landmarks).all(-1).sum(1) >= FEWEST_STABLE
     first = int(enough.nonzero()[0, 0])
@@ -298,8 +293,7 @@ def _solve(
     for t in range(first, len(landmarks)):  # a frame leans on the one before
         state = solver.step(state, landmarks[t], rotation[t], translation[t], confidence[t])
         states.append(state)
-        if progress is not None:
-            progress("weights", t + 1, len(landmarks))
+        progress("solving for weights", t + 1, len(landmarks))
     states = [states[0]] * first + states
     weights, turned, moved = (
         torch.stack([getattr(one, name) for one in states]).detach().to(landmarks)

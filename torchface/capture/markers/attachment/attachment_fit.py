@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,6 +19,7 @@ from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 
@@ -59,7 +59,7 @@ def fit_attachment(
     rom: Take,
     initial: Attachment,
     standoff: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
     insist: bool = False,
 ) -> AttachmentFit:
     r"""The marker sites that explain a range-of-motion take best.
@@ -80,7 +80,7 @@ def fit_attachment(
         rom: markers (T,M,3) of a range of motion, in any space and scale; NaN for not seen. No frame need be neutral.
         initial: roughly where the markers sit; markers match by label.
         standoff: estimate one distance h of all marker centres from the skin; otherwise it is 0.
-        progress: called with the fraction done.
+        progress: told each step and how far it is.
         insist: also return sites that the take leaves mostly uncertain, or that do not explain the markers.
 
     Returns:
@@ -96,7 +96,7 @@ def fit_attachment(
 
     Source: thesis 4.1.2, algorithm 4, run to convergence; bundle adjustment for the joint steps (Triggs et al. 2000).
     """
-    report = progress or (lambda fraction: None)
+    progress = progress or silent
     initial.check(rig.neutral)
     paths = marker_paths(rom, initial)
     motion = SurfaceMotion.of(rig, normals=standoff)
@@ -108,16 +108,16 @@ def fit_attachment(
     few = _spread(shown, _COARSE_FRAMES)
     errors: list[Tensor] = []
     first = FitState(replace(initial, residual=None), pose, 0.0, None)
-    state = solver.alternate(few, first, errors, lambda fraction: report(0.3 * fraction))
+    state = solver.alternate(few, first, errors, progress)
     if solver.helmet_slips(few, state):
         shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= MIN_MARKERS]
         few = _spread(shown, _COARSE_FRAMES)
         by_frame = replace(first, pose=frame_poses(few, initial_points.expand_as(few), pose.scale[0]))
-        state = solver.alternate(few, by_frame, errors, lambda fraction: report(0.3 + 0.3 * fraction))
+        state = solver.alternate(few, by_frame, errors, progress)
+    progress("refining sites and weights together")
     for count, careful in ((_CAREFUL_FRAMES, True), (_JOINT_FRAMES, False)):
         some = _spread(shown, count)
         state = solver.solve_jointly(some, solver.on_frames(some, state), errors, careful)
-    report(0.8)
     uncertainty = solver.uncertainty(some, state, len(paths) / rom.fps, rig.names)
     state = solver.on_frames(shown, state)
     for number in range(_LAST_ITERATIONS):
@@ -125,10 +125,9 @@ def fit_attachment(
         assert state.error is not None
         converged = float((state.error - errors[-1]).abs().max()) < _TOLERANCE
         errors.append(state.error)
-        report(0.8 + 0.2 * (number + 1) / _LAST_ITERATIONS)
+        progress("refining sites over the whole take", number + 1)
         if converged and number:
             break
-    report(1.0)
     found = _result(solver, paths, state, errors, rig.neutral.fingerprint(), uncertainty)
     if not insist:
         check_attachment(found, rig)

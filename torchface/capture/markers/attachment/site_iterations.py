@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,6 +24,7 @@ from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, Si
 from torchface.capture.markers.rest_pose import transformed_pose
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.geometry.similarity import Similarity
+from torchface.progress import Progress
 
 # A high ridge at first: while sites are wrong by millimetres the weights must not explain them away. It falls by a
 # constant factor an iteration to where it only keeps the problem definite (mm² a marker).
@@ -76,16 +76,14 @@ class SiteSolver:
         """Affine maps of the sites (M,3,N+1)."""
         return self.motion.at(self.motion.lifted(state.height), state.sites)
 
-    def alternate(
-        self, few: Tensor, state: FitState, errors: list[Tensor], report: Callable[[float], None]
-    ) -> FitState:
+    def alternate(self, few: Tensor, state: FitState, errors: list[Tensor], progress: Progress) -> FitState:
         """Alternating iterations with a falling ridge."""
         for number in range(_ALTERNATING_ITERATIONS):
             ridge = _FIRST_RIDGE * (LAST_RIDGE / _FIRST_RIDGE) ** (number / (_ALTERNATING_ITERATIONS - 1))
             state = self.alternation_step(few, state, ridge)
             assert state.error is not None
             errors.append(state.error)
-            report((number + 1) / _ALTERNATING_ITERATIONS)
+            progress("finding the markers' sites", number + 1, _ALTERNATING_ITERATIONS)
         return state
 
     def alternation_step(self, paths: Tensor, state: FitState, ridge: float) -> FitState:

@@ -1,0 +1,22 @@
+"""How long work tells what it is doing and how far it is: one signature for every function."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called as work goes on: ``progress("rendering")``, or ``progress("rendering", 3, 20)`` after 3 of 20 images."""
+
+    def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
+        """Tells how far the work is.
+
+        Args:
+            step: what is being done; the next step's name ends this one.
+            done: how many items of it are finished.
+            total: of how many; 0 where that is not known, or where there is nothing to count.
+        """
+
+
+def silent(step: str, done: int = 0, total: int = 0) -> None:
+    """The progress of work that nobody watches."""
