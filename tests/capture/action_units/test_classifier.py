@@ -198,7 +198,7 @@ def test_what_is_never_performed_is_named(regions: RegionVideo, session: FilmedS
     with pytest.raises(NameMismatchError, match="9 is never performed alone"):
         ActionUnitClassifier.fit([regions], [without])
     groups = [group for group in GROUPS if group.name == "mouth"]
-    with pytest.raises(NameMismatchError, match="no group tells it"):
+    with pytest.raises(NameMismatchError, match="no group of regions shows it"):
         ActionUnitClassifier.fit([regions], [labels], groups)
     with pytest.raises(NameMismatchError, match="no region chin"):
         ActionUnitClassifier.fit([regions], [labels], [RegionGroup("chin", ("chin",), ("17",))])

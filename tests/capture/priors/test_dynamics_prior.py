@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +15,10 @@ from torchface import zoo
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, resampled, windows_of
-from torchface.capture.priors.dynamics_training import cross_validated, fitted_kernel, import_gpytorch
+from torchface.capture.priors.dynamics_training import cross_validated, fitted_kernel
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
-from torchface.errors import FileFormatError, MissingExtraError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
 from torchface.synthetic.stages.weight_curves import perform
 
@@ -266,13 +264,3 @@ def test_bad_input(prior: DynamicsPrior, monkeypatch: pytest.MonkeyPatch) -> Non
     for change in ({"window": 0}, {"inducing": 10**9}, {"fps": 0.0}, {"groups": 3}, {"window": 10**6}):
         with pytest.raises(FileFormatError, match="dynamics prior"):
             DynamicsPrior.from_config({**prior.config, **change})
-    there: Any = builtins.__import__
-
-    def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name.startswith("gpytorch"):
-            raise ImportError("no module")
-        return there(name, *rest, **more)
-
-    monkeypatch.setattr("importlib.import_module", without)
-    with pytest.raises(MissingExtraError, match=r"-m pip install 'gpytorch"):
-        import_gpytorch()

@@ -19,7 +19,6 @@ from torchface.capture.action_units.intensity_labels import intensity_levels
 from torchface.capture.action_units.local_warps import local_warps
 from torchface.capture.action_units.region_video import RegionVideo
 from torchface.capture.action_units.regions import GROUPS, RegionGroup
-from torchface.capture.action_units.scikit import scikit
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
 from torchface.progress import Progress, silent
@@ -34,7 +33,7 @@ class TrainingSettings:
 
     Args:
         levels: of intensity, the lowest of them rest.
-        variance: share of the features' variance that the principal components keep.
+        variance: fraction of the features' variance that the principal components explain.
         penalty: of the support vector machines.
         warps: replicas of every frame, each warped at random.
         warp_amplitude: of their control points, pixels.
@@ -50,7 +49,7 @@ class TrainingSettings:
 
     def __post_init__(self) -> None:
         if self.levels < 2 or not 0 < self.variance <= 1 or not self.penalty > 0 or self.warps < 0:
-            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and shares in (0,1]")
+            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and a variance in (0,1]")
 
 
 DEFAULTS = TrainingSettings()
@@ -58,7 +57,7 @@ DEFAULTS = TrainingSettings()
 
 @dataclass(frozen=True, eq=False)
 class GroupClasses:
-    """What a group's frames are labelled with.
+    """The labels of a group's frames.
 
     Args:
         table: intensities of the group's units in each class, (C,A); the first class is rest.
@@ -79,16 +78,15 @@ def fit_classifier(
     """Learns from one or several performers.
 
     Args:
-        videos: each performer's regions; all but the first laid on the first's ``neutral``.
+        videos: each performer's regions; all but the first warped to the first's ``neutral``.
         labels: of each video, with what was performed.
-        groups: which regions tell which units.
-        settings: how.
+        groups: which regions show which units.
+        settings: of the training.
         progress: told each step and how far it is.
 
     Raises:
         ShapeError: videos and labels differ in number or length.
         NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
-        MissingExtraError: scikit-learn is not installed.
     """
     settings, progress = settings or TrainingSettings(), progress or silent
     check_training(videos, labels, groups)
@@ -99,9 +97,9 @@ def fit_classifier(
     for group in groups:
         progress(f"{group.name}: labelling {len(patterns)} frames")
         own = patterns[:, [names.index(name) for name in group.regions]]
-        known = label_group(own, labels, group, settings)
+        labelled = label_group(own, labels, group, settings)
         still = rest[:, [names.index(name) for name in group.regions]]
-        part = _fit_group(group, own, still, known, size, settings, progress)
+        part = _fit_group(group, own, still, labelled, size, settings, progress)
         sizes.append(GroupSize(len(part.components), len(part.intensities)))
         parts.append(part)
     model = ActionUnitClassifier(groups, sizes, size)
@@ -127,10 +125,10 @@ def merged_videos(videos: Sequence[RegionVideo], names: Sequence[str]) -> tuple[
 def label_group(
     patterns: Tensor, labels: Sequence[ActionLabels], group: RegionGroup, settings: TrainingSettings
 ) -> GroupClasses:
-    """The class of every frame: which of the group's units, and how strongly; 0 for rest.
+    """The class of every frame: the set of the group's units and their intensity; 0 for rest.
 
-    Intensities are clustered for each performer and each set of units by itself, so that what a performer does with
-    all strength counts as the highest level.
+    Intensities are clustered for each performer and each set of units by itself, so that a performer's strongest
+    frames are the highest level.
 
     Args:
         patterns: the group's regions over all videos, one after the other, (T,G,h,w).
@@ -140,7 +138,7 @@ def label_group(
     """
     classes = torch.zeros(len(patterns), dtype=torch.int64)
     rows: list[tuple[float, ...]] = [(0.0,) * len(group.units)]
-    known: dict[tuple[tuple[str, ...], int], int] = {}
+    class_of: dict[tuple[tuple[str, ...], int], int] = {}
     start = 0
     for own in labels:
         for together in sorted({stretch.units for stretch in own.performed}):
@@ -150,11 +148,11 @@ def label_group(
             frames, at_rest = _frames(own, together, start)
             found = intensity_levels(patterns[frames], at_rest, settings.levels, settings.seed)
             for level in range(1, settings.levels):
-                if (units, level) not in known:
-                    known[units, level] = len(rows)
+                if (units, level) not in class_of:
+                    class_of[units, level] = len(rows)
                     strength = level / (settings.levels - 1)
                     rows.append(tuple(strength if unit in units else 0.0 for unit in group.units))
-                classes[frames[found == level]] = known[units, level]
+                classes[frames[found == level]] = class_of[units, level]
         start += own.frames
     return GroupClasses(torch.tensor(rows), classes)
 
@@ -175,28 +173,28 @@ def _fit_group(
     group: RegionGroup,
     patterns: Tensor,
     rest: Tensor,
-    known: GroupClasses,
+    labelled: GroupClasses,
     size: int,
     settings: TrainingSettings,
     progress: Progress,
 ) -> GroupClassifier:
     probe = GroupClassifier(group, size, 1, 2)
     generator = torch.Generator().manual_seed(settings.seed)
-    features, classes = [group_features(probe, patterns, rest)], [known.classes]
+    features, classes = [group_features(probe, patterns, rest)], [labelled.classes]
     for _ in range(settings.warps):
         features.append(group_features(probe, patterns, rest, settings.warp_amplitude, generator))
-        classes.append(known.classes)
+        classes.append(labelled.classes)
     samples, truth = torch.cat(features), torch.cat(classes)
     progress(f"{group.name}: principal components of {samples.shape[1]} features")
     mean = samples.double().mean(0)
     components, deviations = principal_components(samples, mean, settings.variance)
-    part = GroupClassifier(group, size, len(components), len(known.table))
+    part = GroupClassifier(group, size, len(components), len(labelled.table))
     part.mean.copy_(mean)
     part.components.copy_(components)
     part.deviations.copy_(deviations)
-    part.intensities.copy_(known.table)
+    part.intensities.copy_(labelled.table)
     reduced = (samples - part.mean) @ part.components.T / part.deviations
-    progress(f"{group.name}: {len(known.table)} classes of {len(components)} components")
+    progress(f"{group.name}: {len(labelled.table)} classes of {len(components)} components")
     part.machine.fit(reduced, truth, settings.penalty)
     return part
 
@@ -219,12 +217,14 @@ def group_features(
 
 
 def principal_components(samples: Tensor, mean: Tensor, variance: float) -> tuple[Tensor, Tensor]:
-    """Components (K,D) that keep a share of the variance of samples (T,D), and the samples' deviation along each."""
-    reduction = scikit("decomposition").PCA(svd_solver="covariance_eigh")
-    # scikit-learn would also choose K, but then refuses a share of 1.
+    """Components (K,D) that explain a fraction of the variance of samples (T,D), and the deviations along them."""
+    from sklearn.decomposition import PCA  # takes a second, and only training needs it
+
+    reduction = PCA(svd_solver="covariance_eigh")
+    # scikit-learn would also choose K, but then refuses a fraction of 1.
     reduction.fit((samples.double() - mean).numpy())
-    share = torch.from_numpy(reduction.explained_variance_ratio_).cumsum(0)
-    kept = min(int((share < variance).sum()) + 1, len(share))
+    explained = torch.from_numpy(reduction.explained_variance_ratio_).cumsum(0)
+    kept = min(int((explained < variance).sum()) + 1, len(explained))
     deviations = torch.from_numpy(reduction.explained_variance_[:kept]).clamp(min=1e-12).sqrt()
     return torch.from_numpy(reduction.components_[:kept].copy()).float(), deviations.float()
 
@@ -232,7 +232,7 @@ def principal_components(samples: Tensor, mean: Tensor, variance: float) -> tupl
 def check_training(
     videos: Sequence[RegionVideo], labels: Sequence[ActionLabels], groups: Sequence[RegionGroup]
 ) -> None:
-    """Refuses what nothing can be learned from."""
+    """Raises where videos and labels do not fit each other or the groups."""
     check_groups(groups)
     if not videos or len(videos) != len(labels):
         raise ShapeError(f"training: found {len(videos)} videos and {len(labels)} labels, expected one each")
@@ -253,4 +253,4 @@ def check_training(
     wanted += [unit for group in groups for unit in group.beside]
     unknown = sorted({unit for own in labels for unit in own.units} - set(wanted))
     if unknown:
-        raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group tells it from its regions")
+        raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group of regions shows it")

@@ -1,18 +1,17 @@
-"""How strongly an action unit is performed in each frame, learned without labels from the pictures' main mode."""
+"""Intensity levels of the frames of an action, by clustering along the first principal component of their images."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.scikit import scikit
 from torchface.errors import ShapeError, ValueRangeError
 
 
 def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int = 0) -> Tensor:
     """The level of each frame of one action, 0 for rest.
 
-    The frames' largest mode of variation gives one number a frame; k-means clusters these into ``levels``, which are
+    The first principal component gives one number a frame; k-means clusters these into ``levels``, which are
     ordered by how far they lie from the frames at rest.
 
     Args:
@@ -37,7 +36,9 @@ def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int
         raise ValueRangeError(
             f"intensity levels: found {len(mode.unique())} different frames, expected at least {levels} to cluster"
         )
-    clusters = scikit("cluster").KMeans(levels, n_init=10, random_state=seed).fit(mode[:, None].numpy())
+    from sklearn.cluster import KMeans  # takes a second, and only training needs it
+
+    clusters = KMeans(levels, n_init=10, random_state=seed).fit(mode[:, None].numpy())
     centres = torch.from_numpy(clusters.cluster_centers_[:, 0]).double()
     order = (centres - mode[at_rest].median()).abs().argsort()
     rank = torch.empty_like(order)

@@ -7,7 +7,6 @@ from itertools import combinations
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.action_units.scikit import scikit
 from torchface.errors import ShapeError, ValueRangeError
 
 
@@ -55,12 +54,11 @@ class OneVsOne(nn.Module):
         Args:
             features: (T,K).
             classes: (T,) int64; every class from 0 to C-1 occurs.
-            penalty: C of the machine, what a sample on the wrong side costs.
+            penalty: C of the machine, the penalty of a margin violation.
 
         Raises:
             ShapeError: the shapes do not fit.
             ValueRangeError: a class never occurs.
-            MissingExtraError: scikit-learn is not installed.
         """
         count = self.for_first.shape[1]
         if features.shape != (len(classes), self.weight.shape[1]):
@@ -69,9 +67,11 @@ class OneVsOne(nn.Module):
             )
         if not torch.equal(classes.unique(), torch.arange(count)):
             raise ValueRangeError(f"classes: found {classes.unique().tolist()}, expected every one of 0 to {count - 1}")
-        machine = scikit("svm").SVC(kernel="linear", C=penalty, cache_size=500)
+        from sklearn.svm import SVC  # takes a second, and only training needs it
+
+        machine = SVC(kernel="linear", C=penalty, cache_size=500)
         machine.fit(features.double().numpy(), classes.numpy())
-        # scikit-learn turns the sign of the only plane between two classes, so that the second is positive.
+        # Between two classes alone scikit-learn's sign is opposite: positive for the second.
         sign = -1.0 if count == 2 else 1.0
         self.weight.copy_(sign * torch.tensor(machine.coef_))
         self.bias.copy_(sign * torch.tensor(machine.intercept_))

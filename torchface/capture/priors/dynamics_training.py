@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,6 @@ from torchface.capture.priors.gaussian_process import (
 from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts, windows_of
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.files.extra_packages import import_extra
 from torchface.progress import Progress, silent
 
 _FOLDS = 4  # of a single take
@@ -31,15 +29,6 @@ _LEARNING_RATE = 0.1
 _RIDGE = 1e-6  # of the coefficients, in squared weights
 _POOLING = 0.02  # weight of the coefficients that all shapes share against each one's own
 _MIN_SCALE = 1e-3  # a standard deviation below which a shape counts as one that never moves
-
-
-def import_gpytorch() -> Any:
-    """The ``gpytorch`` package.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    return import_extra("gpytorch", "gpytorch", "train", "learning dynamics")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +79,12 @@ def fit_dynamics_prior(
     Raises:
         ShapeError: no takes, of another number of shapes, or too short for the window.
         ValueRangeError: no window without a NaN, or a setting out of range.
-        MissingExtraError: gpytorch is not installed.
 
     Source: thesis 4.2.10 and the appendix "Learning the prior".
     """
     names, settings = tuple(names), settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
     progress = progress or silent
-    import_gpytorch()
     _check(takes, names, window, fps, input_noise)
     generator = torch.Generator().manual_seed(settings.seed)
     parts = _parts(takes, window, input_noise, generator)
@@ -180,7 +167,7 @@ def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Ten
 
     Source: Titsias 2009.
     """
-    gpytorch = import_gpytorch()
+    import gpytorch  # takes seconds, and only training needs it
     from linear_operator.utils.warnings import NumericalWarning
 
     columns = [active[order].nonzero()[:, 0] + order * active.shape[1] for order in range(len(active))]

@@ -76,9 +76,14 @@ class GaussianMixture(nn.Module):
                 f"Gaussian mixture: found {components} components, shrinkage {shrinkage}, floor {floor}, expected "
                 "at least one, a number in [0,1], and a positive variance"
             )
+        from sklearn.cluster import KMeans  # takes a second, and only training needs it
+
         x = samples.detach().double()
         pooled = torch.cov(x.T, correction=0).reshape(x.shape[1], -1)
-        responsibilities = torch.nn.functional.one_hot(_nearest(x, _seeds(x, components, seed)), components).double()
+        clusters = min(components, len(x.unique(dim=0)))
+        k_means = KMeans(clusters, n_init=1, max_iter=_SEED_ITERATIONS, random_state=seed)
+        members = k_means.fit_predict(x.cpu().numpy())
+        responsibilities = torch.nn.functional.one_hot(torch.from_numpy(members).long(), components).to(x)
         before = -math.inf
         # Each iteration needs the responsibilities of the one before.
         for _ in range(_MAX_ITERATIONS):
@@ -149,7 +154,8 @@ def _maximised(x: Tensor, responsibilities: Tensor, pooled: Tensor, shrinkage: f
     """The mixture that is likeliest for samples x (T,D) with given responsibilities (T,K), in float64."""
     count = responsibilities.sum(0)
     means = (responsibilities.T @ x) / count[:, None]
-    moments = _moments(responsibilities, x)
+    # A loop over components keeps (T,K,D) out of the memory.
+    moments = torch.stack([(column[:, None] * x).T @ x for column in responsibilities.T])
     own = moments / count[:, None, None] - means[:, :, None] * means[:, None]
     covariance = (1 - shrinkage) * own + shrinkage * pooled
     covariance = 0.5 * (covariance + covariance.transpose(1, 2))
@@ -159,28 +165,3 @@ def _maximised(x: Tensor, responsibilities: Tensor, pooled: Tensor, shrinkage: f
     # The buffers are float32 in a finished module; the iterations need float64.
     mixture.means, mixture.factors, mixture.log_mixing_weights = means, factors, (count / count.sum()).log()
     return mixture
-
-
-def _moments(responsibilities: Tensor, x: Tensor) -> Tensor:
-    """Second moments (K,D,D); a loop over components keeps (T,K,D) out of the memory."""
-    return torch.stack([(column[:, None] * x).T @ x for column in responsibilities.T])
-
-
-def _seeds(x: Tensor, count: int, seed: int) -> Tensor:
-    """Centres (K,D) by k-means from far-apart samples (k-means++)."""
-    generator = torch.Generator().manual_seed(seed)
-    centers = x[torch.randint(len(x), (1,), generator=generator)]
-    for _ in range(count - 1):  # each seed is drawn by its distance to those before
-        squared = torch.cdist(x, centers).square().amin(1)
-        if float(squared.sum()) == 0:
-            break
-        centers = torch.cat([centers, x[torch.multinomial(squared, 1, generator=generator)]])
-    for _ in range(_SEED_ITERATIONS):
-        member = torch.nn.functional.one_hot(_nearest(x, centers), len(centers)).double()
-        total = member.sum(0)
-        centers = torch.where(total[:, None] > 0, member.T @ x / total.clamp(min=1)[:, None], centers)
-    return centers
-
-
-def _nearest(x: Tensor, centers: Tensor) -> Tensor:
-    return torch.cdist(x, centers).argmin(1)
