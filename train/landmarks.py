@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
+from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
@@ -28,7 +29,6 @@ from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, f
 from train.runner import metric_lines, run
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
-_LUMA = torch.tensor([0.299, 0.587, 0.114])
 _LARGEST_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
 _PART = 60  # pictures that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
@@ -156,7 +156,7 @@ def load_faces(path: Path) -> Faces:
     faces = NO_FACES
     for picture, points in found:
         if picture not in known:
-            known = {picture: torch.einsum("chw,c->hw", load_image(picture), _LUMA)}  # faces of a picture come in a row
+            known = {picture: grey_images(load_image(picture)[None])[0, 0]}  # faces of a picture come in a row
         faces = faces + _cropped(known[picture], points.float())
     return faces
 

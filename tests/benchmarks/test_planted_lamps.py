@@ -18,10 +18,10 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from torchface.capture.video.lighting import estimate_light
+from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight, in_camera_frame, vertex_albedo
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort
@@ -16,7 +17,6 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.uv_raster import rasterise_uvs
 from torchface.mesh import Mesh
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster

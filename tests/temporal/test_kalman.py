@@ -15,10 +15,8 @@ from torchface.temporal import (
     KalmanFilter,
     KalmanSettings,
     estimate_settings,
-    filter_rotations,
     kalman_filter,
     kalman_smoother,
-    smooth_rotations,
 )
 
 
@@ -106,28 +104,6 @@ def test_one_frame_at_a_time_is_the_whole_take() -> None:
     assert torch.equal(torch.stack([running.step(frame).clone() for frame in values]), kalman_filter(values, settings))
 
 
-def turning(frames: int = 300) -> Tensor:
-    """A head that turns through more than half a circle, so that a quaternion's sign may flip."""
-    angle = 2.4 * (torch.arange(frames, dtype=torch.float64) / 50).sin() + 3.0
-    axis = torch.nn.functional.normalize(torch.tensor([0.2, 1.0, 0.1], dtype=torch.float64), dim=0)
-    return torch.cat([(angle / 2).cos()[:, None], (angle / 2).sin()[:, None] * axis], dim=1)
-
-
-def test_rotations_stay_valid_whatever_the_sign() -> None:
-    truth = turning()
-    generator = torch.Generator().manual_seed(2)
-    noisy = truth + 0.01 * torch.randn(truth.shape, generator=generator, dtype=truth.dtype)
-    signs = torch.where(torch.rand(len(truth), 1, generator=generator) < 0.5, -1.0, 1.0)
-    values = torch.nn.functional.normalize(noisy, dim=1) * signs
-    values[100:104] = torch.nan
-    settings = KalmanSettings(0.01, 0.0001)
-    for kept in (filter_rotations(values, settings), smooth_rotations(values, settings)):
-        assert torch.allclose(kept.norm(dim=1), torch.ones(len(kept), dtype=kept.dtype))
-        off = 2 * (kept * truth).sum(1).abs().clamp(max=1).acos()
-        seen = 2 * (values * truth).sum(1).abs().clamp(max=1).acos()
-        assert float(off[20:].mean()) < 0.7 * float(seen[20:].nanmean())
-
-
 @given(st.integers(1, 30), st.integers(1, 3), st.integers(0, 10**6))
 def test_any_pattern_of_gaps(frames: int, channels: int, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -153,7 +129,3 @@ def test_bad_input() -> None:
         kalman_filter(torch.full((3, 1), torch.inf), KalmanSettings(1, 1))
     with pytest.raises(ValueRangeError, match="expected at least 8"):
         estimate_settings(torch.zeros(3, 1))
-    with pytest.raises(ShapeError, match="expected \\(T,4\\)"):
-        filter_rotations(torch.zeros(3, 3), KalmanSettings(1, 1))
-    with pytest.raises(ValueRangeError, match="no or infinite length"):
-        smooth_rotations(torch.zeros(3, 4), KalmanSettings(1, 1))

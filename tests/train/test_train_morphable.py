@@ -11,11 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchface import Mesh, load_mesh, save_mesh, zoo
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 from torchface.viz.figures import model_figures as model_pictures

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import onnx
 import torch
+from kornia.filters import get_gaussian_kernel1d
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, normalize, pad
 
 from torchface import __version__
 from torchface.errors import ShapeError
 from torchface.landmarks import UVLandmarkDetector
-from torchface.landmarks.scans.gaussian_blur import gaussian_kernel, unsharp
 from torchface.landmarks.scans.hog import CLIP, FAINT, cell_map
 from torchface.landmarks.scans.uv_detector import FARTHEST
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
+from torchface.rendering.gaussian_blur import kernel_size, unsharp
 
 ROUNDS = 5
 _PARITY = {"pixels": 0.5, "confidence": 0.02}
@@ -228,7 +229,8 @@ def _scores(build: GraphBuilder, bank: LandmarkBank) -> str:
     op, constant = build.op, build.constant
     settings, channels = bank.settings, bank.channels
     hog = settings.hog
-    kernel = gaussian_kernel(settings.unsharp_sigma).expand(channels, 1, 1, -1)
+    kernel = get_gaussian_kernel1d(kernel_size(settings.unsharp_sigma), settings.unsharp_sigma)
+    kernel = kernel.expand(channels, 1, 1, -1)
     reach = kernel.shape[-1] // 2
     wide = op("Pad", "images", constant("around", (0, 0, reach, reach, 0, 0, reach, reach)), mode="edge")
     blurred = op("Conv", wide, constant("across", kernel), group=channels)

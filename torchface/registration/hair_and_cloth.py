@@ -8,12 +8,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.geometry.meshes.operators import components, edges, vertex_normals
 from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
 from torchface.mesh import Mesh
 from torchface.registration.ears import find_ears
 from torchface.registration.scan_colors import ScanColors
-from torchface.rendering.color_space import to_linear
 
 _AT_THE_EARS = (0, 1, 2, 14, 15, 16)
 _FEATURE = 0.17

@@ -11,12 +11,12 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort, undistort
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.point_light import in_camera_frame
 from torchface.rendering.raycast import RayCaster
 
 _EDGE_SAMPLES = 4  # a pixel side, where the surface ends or jumps
 _JUMP = 0.006  # of the distance; neighbours that differ by more lie on different parts of the face
-_BLUR = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
 _NEAR = 1.0  # millimetres before the lens
 
 
@@ -65,13 +65,13 @@ class Footprint:
             normals=self.normals[rows],
         )
 
-    def softened(self, values: Tensor, weights: Tensor | None = None, rounds: int = 1) -> Tensor:
+    def softened(self, values: Tensor, weights: Tensor | None = None, sigma: float = 1.0) -> Tensor:
         """Values (S,C) of the samples, blurred over the picture, (S,C).
 
         Args:
             values: of each sample.
             weights: what each counts beside its share of a pixel, (S,).
-            rounds: of a blur of one pixel's standard deviation; r rounds reach as far as the root of r pixels.
+            sigma: standard deviation of the blur, pixels.
         """
         weight = (self.share if weights is None else self.share * weights).float()[:, None]
         rows, columns = self.pixel // self.width, self.pixel % self.width
@@ -80,11 +80,7 @@ class Footprint:
         place = (rows - top) * width + columns - left
         held = torch.zeros(height * width, values.shape[1] + 1)
         held.index_add_(0, place, torch.cat([weight * values.float(), weight], dim=1))
-        part = held.T.reshape(-1, 1, height, width)
-        for _ in range(rounds):
-            part = torch.nn.functional.conv2d(part, _BLUR.view(1, 1, -1, 1), padding=(len(_BLUR) // 2, 0))
-            part = torch.nn.functional.conv2d(part, _BLUR.view(1, 1, 1, -1), padding=(0, len(_BLUR) // 2))
-        blurred = part.reshape(len(part), -1).T[place]
+        blurred = gaussian_blur(held.T.reshape(1, -1, height, width), sigma)[0].flatten(1).T[place]
         return blurred[:, :-1] / blurred[:, -1:].clamp(min=1e-6)
 
     def blended(self, picture: Tensor, over: Tensor, alpha: Tensor) -> Tensor:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.pixel_coverage import Footprint, footprint
 from torchface.rendering.point_light import PointLight, irradiance, lit_by
 
@@ -22,7 +22,7 @@ _NOT_SKIN = (
 )  # fmt: skip
 _MOST_GAIN = 10.0
 _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
-_BESIDE = 9  # rounds of blur; three pixels
+_BESIDE = 3.0  # pixels, standard deviation of a blur
 _LARGEST = 8192
 
 

@@ -4,7 +4,6 @@ from torchface.temporal.adaptive_kalman import AdaptiveFilter, AdaptiveSettings,
 from torchface.temporal.gap_filling import bridged, nearest_rows
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
-from torchface.temporal.quaternions import RotationFilter, filter_rotations, smooth_rotations
 from torchface.temporal.savitzky_golay import savitzky_golay
 
 __all__ = [
@@ -14,16 +13,13 @@ __all__ = [
     "KalmanSettings",
     "OneEuroFilter",
     "OneEuroSettings",
-    "RotationFilter",
     "adaptive_filter",
     "adaptive_smoother",
     "bridged",
     "estimate_settings",
-    "filter_rotations",
     "kalman_filter",
     "kalman_smoother",
     "nearest_rows",
     "one_euro_filter",
     "savitzky_golay",
-    "smooth_rotations",
 ]

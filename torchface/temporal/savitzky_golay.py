@@ -39,12 +39,7 @@ def savitzky_golay(values: Tensor, window: int, order: int = 2) -> Tensor:
     order = min(order, window - 1)
     if window == 1:
         return values.clone()
-    half = window // 2
-    place = torch.linspace(-1, 1, window, dtype=torch.float64, device=values.device)
-    powers = place[:, None] ** torch.arange(order + 1, device=values.device)
-    # Row s of the hat matrix reads the fitted polynomial off at frame s of the window.
-    hat = (powers @ torch.linalg.pinv(powers)).to(values)
-    curves = values.flatten(1) if values.ndim > 1 else values[:, None]
-    middle = torch.einsum("tcw,w->tc", curves.unfold(0, window, 1), hat[half])
-    smooth = torch.cat([hat[:half] @ curves[:window], middle, hat[half + 1 :] @ curves[-window:]])
-    return smooth.reshape(values.shape)
+    # Loaded here: scipy.signal takes longer to load than most takes to filter.
+    from scipy.signal import savgol_filter
+
+    return torch.from_numpy(savgol_filter(values.detach().cpu().numpy(), window, order, axis=0)).to(values)

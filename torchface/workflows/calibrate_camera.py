@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.camera_files import save_calibration
@@ -311,8 +312,7 @@ def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
     if not videos:
         for path in paths:
             image = load_image(path)
-            grey = image.new_tensor([0.299, 0.587, 0.114]) @ image.flatten(1)
-            yield path.name, (255 * grey).round().to(torch.uint8).reshape(image.shape[1:])
+            yield path.name, (255 * grey_images(image[None])[0, 0]).round().to(torch.uint8)
         return
     video = open_video(videos[0])
     step = max(1, -(-video.count // _MOST_FRAMES))

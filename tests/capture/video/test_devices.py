@@ -37,7 +37,6 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.onnx.video_graph_export import filmed
 from torchface.synthetic import performer
 from torchface.temporal import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
-from torchface.temporal.quaternions import filter_rotations, smooth_rotations
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 # Operations that take tensors of two devices: copies, and those that pick rows by numbers on the CPU.
@@ -220,9 +219,6 @@ def test_filters_along_time(seen: tuple[Tensor, Tensor], device: str) -> None:
         check(filtered, device, landmarks)
     check(lambda x: kalman_filter(x, settings), device, landmarks)
     check(lambda x: kalman_smoother(x, settings), device, landmarks)
-    turns = torch.nn.functional.normalize(torch.linspace(0.5, 1, 40).reshape(10, 4), dim=1)
-    check(lambda x: filter_rotations(x, settings), device, turns)
-    check(lambda x: smooth_rotations(x, settings), device, turns)
     noisy = landmarks[:, 0].nan_to_num(300.0).repeat(2, 1)
     assert estimate_settings(noisy.to(device)) == estimate_settings(noisy)
 

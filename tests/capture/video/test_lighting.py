@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video.lighting import LightFit, estimate_light
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
@@ -21,7 +22,6 @@ from torchface.io.video import open_video
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.texture_projection import photo_texture
 from torchface.rendering.camera_visibility import shown_in
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight, in_camera_frame, irradiance, lit_by, vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig

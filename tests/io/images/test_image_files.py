@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ from mutation import check_reader
 from PIL import Image
 
 from torchface.errors import FileFormatError, ShapeError
-from torchface.io import load_image, save_image
+from torchface.io import load_image, save_image, save_image16
 
 
 @given(height=st.integers(1, 9), width=st.integers(1, 9), seed=st.integers(0, 99))
@@ -34,6 +35,27 @@ def test_the_first_row_is_on_top_and_the_first_channel_red(tmp_path: Path) -> No
     Image.fromarray(array).save(tmp_path / "a.png")
     found = load_image(tmp_path / "a.png")
     assert found.nonzero().tolist() == [[0, 0, 2]]
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_every_png_of_sixteen_bits_keeps_them(channels: int, tmp_path: Path) -> None:
+    steps = np.random.default_rng(0).integers(0, 65536, (5, 7, channels), dtype=np.uint16)
+    path = tmp_path / "a.png"
+    path.write_bytes(cv2.imencode(".png", steps)[1].tobytes())
+    expected = steps[..., :3][..., ::-1] if channels > 1 else steps.repeat(3, 2)
+    found = (65535 * load_image(path).double()).round().permute(1, 2, 0).numpy()
+    assert np.array_equal(found, expected)
+
+
+def test_a_bomb_of_sixteen_bits_is_refused_by_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(cv2.imencode(".png", np.zeros((5000, 5000), np.uint16))[1].tobytes())
+    with pytest.raises(FileFormatError, match="found an image of 5000 x 5000 pixels"):
+        load_image(path)
+    save_image16(torch.rand(3, 40, 40), path)
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(FileFormatError, match="found a broken PNG"):
+        load_image(path)
 
 
 def test_a_small_file_of_many_pixels_is_refused(tmp_path: Path) -> None:

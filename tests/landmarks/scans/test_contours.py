@@ -10,8 +10,8 @@ import torch
 
 from torchface.errors import ValueRangeError
 from torchface.landmarks.scans.contours import TraceSettings, evenly_spaced, trace_contour
-from torchface.landmarks.scans.gaussian_blur import gaussian_blur
 from torchface.landmarks.scans.line_shape import LineShape
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 COLUMNS = torch.arange(60.0, 161.0)
 

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
-from torchface.landmarks.scans.gaussian_blur import gaussian_blur, unsharp
 from torchface.landmarks.scans.hole_filling import fill_holes
+from torchface.rendering.gaussian_blur import gaussian_blur, unsharp
 
 
 def test_known_pixels_stay_and_holes_follow_what_is_around() -> None:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.modeling import MorphableModel
 from torchface.modeling.morphable.color_casts import color_casts, texture_areas, without_cast
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.synthetic import neutral_head
 from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 

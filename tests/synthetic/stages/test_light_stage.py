@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchface.color_space import to_linear
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.video import open_video
 from torchface.mesh import Mesh
-from torchface.rendering.color_space import to_linear
 from torchface.rendering.point_light import PointLight, in_camera_frame
 from torchface.synthetic import performer
 from torchface.synthetic.head.neutral_head import neutral_head

@@ -7,11 +7,13 @@ from typing import Literal
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
 
 from torchface.errors import ShapeError
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 Method = Literal["dis", "farneback"]
+
+_SOFTENING = 1.0  # pixels, standard deviation
 
 
 def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tensor:
@@ -45,13 +47,9 @@ def aligned_grid(grid: Tensor, flow: Tensor) -> Tensor:
     return grid + flow * step[:, None, None]
 
 
-def _grey(patterns: Tensor, sigma: float = 1.0) -> np.ndarray:
-    """Softened 8-bit pictures: what is thresholded has edges that a flow cannot follow."""
-    offsets = torch.arange(-3, 4).float()
-    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    wide = pad(patterns[:, None], (3, 3, 3, 3), mode="replicate")
-    soft = conv2d(conv2d(wide, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[:, 0]
+def _grey(patterns: Tensor) -> np.ndarray:
+    """Softened 8-bit images: what is thresholded has edges that a flow cannot follow."""
+    soft = gaussian_blur(patterns[:, None], _SOFTENING)[:, 0]
     return (255 * soft.clamp(0, 1)).round().byte().numpy()
 
 

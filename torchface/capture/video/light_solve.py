@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video.skin_samples import SeenSkin
-from torchface.rendering.color_space import to_srgb
+from torchface.color_space import to_srgb
 from torchface.rendering.point_light import FARTHEST
 
 _DARKEST = 0.01  # linear; below, noise of the camera and not its coding decides

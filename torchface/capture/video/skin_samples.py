@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
 from torchface.rendering.camera_visibility import shown_in
-from torchface.rendering.color_space import to_linear
 from torchface.rendering.point_light import in_camera_frame, lit_by
 from torchface.rendering.raycast import RayCaster
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.part_colors.surfaces import Surface
-from torchface.io.gltf.primitives import decode_srgb
 from torchface.io.gltf.region_materials import SKIN
 from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh
@@ -57,7 +57,7 @@ class MaterialWriter:
         color = torch.tensor(surface.material.color)
         if surface.material is SKIN and self.mesh.texture is not None:
             color = self.mesh.texture.float().mean((1, 2))
-        return [float(value) for value in np.round(decode_srgb(color.numpy().astype(np.float32)), 4)]
+        return [float(value) for value in np.round(to_linear(color.float()).numpy(), 4)]
 
     def _texture(self, image: Tensor, name: str) -> int:
         if id(image) not in self._textures:

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.part_colors.surfaces import Surface
-from torchface.io.gltf.primitives import decode_srgb
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
 
@@ -133,12 +133,12 @@ class PrimitiveWriter:
             uvs = mesh.uvs.detach().float().numpy()[self.split.uv_of[rows]]
             attributes["TEXCOORD_0"] = buffers.vertices(np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1))
         if mesh.colors is not None:
-            light = decode_srgb(mesh.colors.detach().float().clamp(0, 1).numpy())[vertices]
+            light = to_linear(mesh.colors.detach().float().clamp(0, 1)).numpy()[vertices]
             # Beside a texture COLOR_0 would be multiplied with it; under this name viewers leave it alone.
             attributes["COLOR_0" if surface.worn == "colors" else "_COLOR"] = buffers.vertices(light)
         if surface.paint is not None and surface.paint.colors is not None:
-            painted = surface.paint.colors.numpy()[vertices]
-            light = np.concatenate([decode_srgb(painted[:, :3]), painted[:, 3:]], axis=1)
+            painted = surface.paint.colors[vertices]
+            light = torch.cat([to_linear(painted[:, :3]), painted[:, 3:]], dim=1).numpy()
             attributes["COLOR_0"] = buffers.vertices(light)
         if len(mesh.vertices) <= _LARGEST_EXACT_ID:
             attributes["_VERTEX_ID"] = buffers.vertices(vertices.astype(np.float32))

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from torchface.color_space import to_srgb
 from torchface.io.gltf.accessors import read_floats, read_indices
 from torchface.io.gltf.container import Document, shown
 
@@ -123,7 +125,7 @@ def _read_block(document: Document, primitive: dict[str, Any], place: str, first
     color_name = "_COLOR" if "_COLOR" in attributes or _painted(primitive) else "COLOR_0"
     if color_name in attributes:
         colors = read_floats(document, attributes[color_name], f"{place}.{color_name}", ("VEC3", "VEC4"), count)
-        colors = encode_srgb(colors[:, :3].clip(0, 1))
+        colors = to_srgb(torch.from_numpy(colors[:, :3].clip(0, 1))).numpy()
     if "_VERTEX_ID" in attributes:
         numbers = read_floats(document, attributes["_VERTEX_ID"], f"{place}._VERTEX_ID", ("SCALAR",), count)[:, 0]
         whole = numbers == np.floor(numbers)
@@ -210,14 +212,3 @@ def filled(
         for array, count in zip(arrays, counts, strict=True)
     ]
     return np.concatenate(full)
-
-
-def encode_srgb(linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Light to the code of pictures; glTF's vertex colours are light."""
-    low = linear <= 0.0031308
-    return np.where(low, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055).astype(np.float32)
-
-
-def decode_srgb(coded: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The inverse of ``encode_srgb``."""
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Pictures as tensors: (3,H,W) in [0,1], first row on top."""
+"""Images as tensors: (3,H,W) in [0,1], first row on top."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from PIL.ImageFile import ImageFile
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError
 from torchface.files.whole_files import read_file, write_file
-from torchface.io.images.png16 import encode_png16, from_steps, holds_png16, read_png16
 
 _PIXELS_ALWAYS = 4096 * 4096
 _PIXELS_PER_BYTE = 100
@@ -42,7 +42,7 @@ def save_image16(image: Tensor, path: str | Path) -> None:
 def decode_image(data: bytes, source: str) -> Tensor:
     """The image (3,H,W) in ``data``; ``source`` names it in errors.
 
-    A picture of more than 4096 x 4096 pixels needs a byte for every hundred of them, so that a file of some
+    An image of more than 4096 x 4096 pixels needs a byte for every hundred of them, so that a file of some
     kilobytes cannot unpack to gigabytes.
 
     Raises:
@@ -58,9 +58,8 @@ def decode_image(data: bytes, source: str) -> Tensor:
                         f"{source}: found an image of {image.width} x {image.height} pixels in {len(data)} bytes, "
                         f"expected at most {max(_PIXELS_ALWAYS, _PIXELS_PER_BYTE * len(data))} pixels"
                     )
-                if holds_png16(image):
-                    with Image.open(io.BytesIO(data), formats=_FORMATS) as again:
-                        return from_steps(read_png16(image, again))
+                if _has_16_bits(image):
+                    return _decode_png16(data, source)
                 array = np.array(image.convert("RGB"))
     # Pillow's decoders let most kinds of errors escape on broken bytes; whatever they are, it is no image.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, KeyError, EOFError, ArithmeticError) as error:
@@ -82,3 +81,36 @@ def encode_png(image: Tensor) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(array)).save(buffer, "PNG")
     return buffer.getvalue()
+
+
+def encode_png16(image: Tensor) -> bytes:
+    """(3,H,W) in [0,1] as the bytes of a PNG, 16 bits a channel: in a normal map 8 bits show as steps in highlights.
+
+    Raises:
+        ShapeError: the image is not (3,H,W) with at least one pixel.
+    """
+    import cv2
+
+    if image.ndim != 3 or image.shape[0] != 3 or 0 in image.shape:
+        raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) with at least one pixel")
+    steps = image.detach().cpu().clamp(0, 1).double().mul(65535).round().permute(1, 2, 0).numpy().astype(np.uint16)
+    return cv2.imencode(".png", cv2.cvtColor(steps, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def _has_16_bits(image: Image.Image) -> bool:
+    """Whether an image that Pillow has opened, not loaded, is a PNG of 16 bits a channel, of which Pillow keeps 8."""
+    return isinstance(image, ImageFile) and image.format == "PNG" and str(image.tile[0][3]).endswith("16B")
+
+
+def _decode_png16(data: bytes, source: str) -> Tensor:
+    import cv2
+
+    try:
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        steps = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise FileFormatError(f"{source}: no readable image ({error})") from error
+    if steps is None or steps.dtype != np.uint16:
+        raise FileFormatError(f"{source}: found a broken PNG of 16 bits a channel, expected a whole one")
+    array = cv2.cvtColor(steps, cv2.COLOR_BGR2RGB).astype(np.float32) / 65535
+    return torch.from_numpy(array).permute(2, 0, 1).contiguous()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
+from torchface.color_space import grey_images
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.landmarks.images.appearance_level import AppearanceLevel, sample_pixels
 from torchface.landmarks.images.dense_features import CHANNELS, Features, dense_features
@@ -21,7 +22,6 @@ _MARGIN = 0.3
 _MOST_SAMPLES = 8
 _ASTRAY = 4.0  # times the lowest energy: steps that have come to this lead nowhere
 _STILL = 0.02  # pixels of a level: a face whose landmarks move by less has arrived
-_LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
@@ -331,19 +331,6 @@ class AppearanceModel(nn.Module):
             total = total.index_add(1, corner, parts * share[:, None, None])
             weights = weights.index_add(0, corner, share)
         return (total / weights[:, None, None])[:, :COUNT]
-
-
-def grey_images(images: Tensor) -> Tensor:
-    """Images (B,1,H,W) or (B,3,H,W) as grey ones (B,1,H,W).
-
-    Raises:
-        ShapeError: of another shape.
-    """
-    if images.ndim != 4 or images.shape[1] not in (1, 3):
-        raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,1,H,W) or (B,3,H,W)")
-    if images.shape[1] == 1:
-        return images
-    return (images * images.new_tensor(_LUMA)[:, None, None]).sum(1, keepdim=True)
 
 
 def _cut_out(images: Tensor, pose: PlanarPose, size: tuple[int, int], samples: int) -> Tensor:

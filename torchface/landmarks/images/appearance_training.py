@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchface.color_space import grey_images
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.appearance_level import AppearanceLevel, sample_pixels
-from torchface.landmarks.images.appearance_model import COUNT, AppearanceModel, AppearanceSettings, grey_images
+from torchface.landmarks.images.appearance_model import COUNT, AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.face_warp import FaceGrid, face_grid, face_triangles, with_forehead
 from torchface.landmarks.images.ibug import MIRROR_68
 from torchface.landmarks.images.shape_modes import learn_shape_modes, similarity_modes

@@ -7,9 +7,10 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from torchface.errors import NameMismatchError
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 Features = Literal["grey", "gradient_direction", "oriented_gradients"]
 CHANNELS: dict[str, int] = {"grey": 1, "gradient_direction": 2, "oriented_gradients": 8}
@@ -50,7 +51,8 @@ def dense_features(images: Tensor, kind: Features) -> Tensor:
         return torch.cat([along_x, along_y], dim=1) / strength
     if kind == "oriented_gradients":
         angle = torch.arange(8, dtype=images.dtype, device=images.device)[:, None, None] * (math.pi / 4)
-        gathered = _gathered((angle.cos() * along_x + angle.sin() * along_y).clamp(min=0))
+        directed = (angle.cos() * along_x + angle.sin() * along_y).clamp(min=0)
+        gathered = gaussian_blur(directed, _CELL, truncate=2.5)
         around = avg_pool2d(pad(gathered.square().sum(1, keepdim=True), (3,) * 4, mode="replicate"), 7, 1)
         return gathered / (around + _FAINT**2).sqrt()
     raise NameMismatchError(f"features: found {kind!r}, expected one of {', '.join(get_args(Features))}")
@@ -58,14 +60,3 @@ def dense_features(images: Tensor, kind: Features) -> Tensor:
 
 def _window_mean(images: Tensor) -> Tensor:
     return avg_pool2d(images, _WINDOW, 1, _WINDOW // 2, count_include_pad=False)
-
-
-def _gathered(images: Tensor) -> Tensor:
-    """Each channel under a small Gaussian window."""
-    reach = math.ceil(2.5 * _CELL)
-    offsets = torch.arange(-reach, reach + 1, dtype=images.dtype, device=images.device)
-    kernel = torch.exp(-0.5 * (offsets / _CELL) ** 2)
-    kernel = (kernel / kernel.sum()).expand(images.shape[1], 1, -1)
-    padded = pad(images, (reach,) * 4, mode="replicate")
-    across = conv2d(padded, kernel[:, :, None, :], groups=images.shape[1])
-    return conv2d(across, kernel[:, :, :, None], groups=images.shape[1])

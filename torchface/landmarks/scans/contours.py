@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.scans.gaussian_blur import gaussian_blur
 from torchface.landmarks.scans.line_shape import LineShape, unit_profiles
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 _BRIGHT = 4.0  # standard deviations; were such rows forbidden, a column without others would jump to any dark spot
 

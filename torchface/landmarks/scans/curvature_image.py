@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.landmarks.scans.cylinder import UnwrappedHead
-from torchface.landmarks.scans.gaussian_blur import gaussian_blur
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 
 def relief(head: UnwrappedHead, scale: float = 1.2, contrast: float = 8.0) -> Tensor:

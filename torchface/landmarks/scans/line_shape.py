@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.landmarks.scans.gaussian_blur import gaussian_blur
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 STATIONS = 17
 REACH = 10

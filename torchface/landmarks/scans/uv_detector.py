@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.face_frame import FaceFrame
-from torchface.landmarks.scans.gaussian_blur import unsharp
 from torchface.landmarks.scans.hog import cell_map, similarity, unit_windows, windows
 from torchface.landmarks.scans.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.scans.score_statistics import best_scores, score_statistics
 from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE
 from torchface.mesh import Mesh
 from torchface.optim.mean_shift import mean_shift
+from torchface.rendering.gaussian_blur import unsharp
 
 FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
 _PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that

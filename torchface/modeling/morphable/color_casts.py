@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.mesh import Mesh
-from torchface.rendering.color_space import to_linear, to_srgb
 
 _DARK, _BRIGHT = 0.02, 0.98
 _STEPS = 20

@@ -7,6 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError
 from torchface.synthetic.head.neutral_head import neutral_head
 
@@ -50,8 +51,7 @@ def complexion_colors(complexions: Tensor) -> Tensor:
     base, fields = _skin()
     amounts = torch.expm1(_SKEW * complexions.to(fields)) / _SKEW
     light = base * torch.tensordot(amounts, fields, 1).exp()
-    coded = torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
-    return coded.clamp(0, 1)
+    return to_srgb(light).clamp(0, 1)
 
 
 @lru_cache(maxsize=1)
@@ -66,7 +66,7 @@ def _skin() -> tuple[Tensor, Tensor]:
     corner[mesh.faces.flatten()] = mesh.uv_faces.flatten()
     grid = torch.stack([2 * mesh.uvs[corner, 0] - 1, 1 - 2 * mesh.uvs[corner, 1]], dim=1)[None, None]
     colors = torch.nn.functional.grid_sample(mesh.texture[None], grid, align_corners=False)[0, :, 0].T
-    base = torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    base = to_linear(colors)
     regions = {name: mask.float() for name, mask in mesh.annotations.regions.items()}
     inside = sum(regions[n] for n in ("eyeball_left", "eyeball_right", "mouth_interior", "eye_sockets"))
     skin = 1 - torch.as_tensor(inside).clamp(max=1)

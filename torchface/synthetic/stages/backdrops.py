@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import cast
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchface.rendering.gaussian_blur import gaussian_blur
 
 
 def uniform(low: float, high: float, generator: torch.Generator) -> float:
@@ -38,18 +39,15 @@ def backdrop(height: int, width: int, generator: torch.Generator) -> Tensor:
             ends = (np.array([x, y]) - reach).astype(int), (np.array([x, y]) + reach).astype(int)
             cv2.line(picture, tuple(map(int, ends[0])), tuple(map(int, ends[1])), grey, int(uniform(1, 7, generator)))
     sigma = uniform(0, 4, generator)
-    if sigma > 0.4:
-        picture = cast(np.ndarray, cv2.GaussianBlur(picture, (0, 0), sigma))
-    return torch.from_numpy(picture).clamp(0, 1)
+    blurred = gaussian_blur(torch.from_numpy(picture)[None, None], sigma if sigma > 0.4 else 0)
+    return blurred[0, 0].clamp(0, 1)
 
 
 def photographed(picture: Tensor, height: int, generator: torch.Generator) -> Tensor:
     """What a camera makes of a grey picture (H,W) in [0,1]: uint8 (height, width), blurred, noisy, compressed."""
     high, wide = picture.shape
-    grey = picture.numpy()
     sigma = abs(uniform(-0.6, 1.2, generator)) * high / 200
-    if sigma > 0.2:
-        grey = cv2.GaussianBlur(grey, (0, 0), sigma)
+    grey = gaussian_blur(picture[None, None], sigma if sigma > 0.2 else 0)[0, 0].numpy()
     grey = cv2.resize(grey, (max(1, round(wide * height / high)), height), interpolation=cv2.INTER_AREA)
     grey = grey + uniform(0, 0.035, generator) * torch.randn(grey.shape, generator=generator).numpy()
     stored = np.clip(grey * 255, 0, 255).round().astype(np.uint8)

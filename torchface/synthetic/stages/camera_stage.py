@@ -20,6 +20,7 @@ from torchface.io.action_labels import ActionLabels, Box, save_action_labels
 from torchface.io.take_files import save_take
 from torchface.io.video import VideoFile, write_video
 from torchface.progress import Progress, silent
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import both_sides, mean_vertices
 from torchface.synthetic.head.performer import performer
@@ -243,7 +244,7 @@ def film(
     for t in range(len(weights)):  # a picture at a time: each has a surface of its own
         centre = -rotation[t].T @ translation[t]
         light = scene.picture(weights[t], centre, ways.reshape(-1, 3) @ rotation[t]).view(shape)
-        light = flaws.exposure * shade * _blurred(light, flaws.blur)
+        light = flaws.exposure * shade * gaussian_blur(light[None, None], flaws.blur)[0, 0]
         noise = flaws.noise * torch.randn(shape, generator=generator)
         yield (light + noise * (light.clamp(min=0).sqrt() + 1 / 3)).clamp(0, 1)
 
@@ -251,14 +252,3 @@ def film(
 def _vignette(shape: torch.Size, amount: float) -> Tensor:
     y, x = torch.meshgrid(torch.linspace(-1, 1, shape[0]), torch.linspace(-1, 1, shape[1]), indexing="ij")
     return 1 - amount * (x**2 + y**2) / 2
-
-
-def _blurred(picture: Tensor, sigma: float) -> Tensor:
-    if sigma == 0:
-        return picture
-    offsets = torch.arange(-2, 3).float()
-    kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    padded = torch.nn.functional.pad(picture[None, None], (2, 2, 2, 2), mode="replicate")
-    across = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return torch.nn.functional.conv2d(across, kernel.view(1, 1, -1, 1))[0, 0]

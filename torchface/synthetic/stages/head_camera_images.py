@@ -15,7 +15,7 @@ from torchface.synthetic.stages.helmet_camera import helmet_plates
 
 MARKER_RADIUS = 1.7
 _MARKER_GREY, _PAINT_GREY, _SKIN_GAIN = 1.5, 1.25, 0.72
-_LUMA = torch.tensor([0.45, 0.40, 0.15])  # such cameras see much of the red
+_SENSITIVITY = torch.tensor([0.45, 0.40, 0.15])  # such cameras see much of the red
 _DISTANCE = 230.0  # at which a surface is as bright as its grey says, millimetres
 
 
@@ -39,7 +39,7 @@ class FilmedHead:
         used, self.faces = mesh.faces[front].unique(return_inverse=True)
         self.rest, self.deltas = rig.vertices[used].double(), rig.deltas[:, used].double()
         self.uvs = mesh.uvs[mesh.uv_faces[front]].float()
-        grey = torch.einsum("chw,c->hw", mesh.texture, _LUMA)
+        grey = torch.einsum("chw,c->hw", mesh.texture, _SENSITIVITY)
         paint = torch.nn.functional.interpolate(paint[None, None], grey.shape, mode="bilinear")[0, 0]
         self.textures = torch.stack([_SKIN_GAIN * grey, paint])
         row = torch.full((len(mesh.faces),), -1, dtype=torch.int64)

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
@@ -18,7 +19,6 @@ from torchface.io.video import VideoFile, write_video
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
-from torchface.rendering.color_space import to_linear, to_srgb
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig

@@ -13,6 +13,7 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.rotations import rotation_matrix
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import Lighting, render
+from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
@@ -114,7 +115,8 @@ def film_portrait(
         origins, ways = camera.rays()
         hits = RayCaster(mesh.vertices, mesh.faces).cast(origins.reshape(-1, 3), ways.reshape(-1, 3))
         picture = torch.where((hits.triangle >= 0).view(size), picture, wall)
-        picture = _blurred(picture, settings.blur) + settings.noise * torch.randn(size, generator=generator)
+        picture = gaussian_blur(picture[None, None], settings.blur)[0, 0]
+        picture = picture + settings.noise * torch.randn(size, generator=generator)
         frames.append((255 * picture.clamp(0, 1)).round().to(torch.uint8))
         landmarks.append(camera.project(posed[ids]))
         progress("rendering the video", number + 1, len(weights))
@@ -158,14 +160,3 @@ def _wall(size: tuple[int, int], generator: torch.Generator) -> Tensor:
     spots = torch.rand(1, 1, 9, 7, generator=generator)
     wall = torch.nn.functional.interpolate(spots, size, mode="bicubic", align_corners=False)[0, 0]
     return 0.25 + 0.5 * wall.clamp(0, 1)
-
-
-def _blurred(picture: Tensor, sigma: float) -> Tensor:
-    if sigma == 0:
-        return picture
-    reach = math.ceil(3 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    padded = torch.nn.functional.pad(picture[None, None], (reach,) * 4, mode="replicate")
-    across = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return torch.nn.functional.conv2d(across, kernel.view(1, 1, -1, 1))[0, 0]

@@ -25,7 +25,7 @@ from torchface.synthetic.stages.backdrops import backdrop, photographed, uniform
 from torchface.synthetic.stages.portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait, widened
 from torchface.synthetic.stages.weight_curves import GESTURES
 
-_LUMA = torch.tensor([0.35, 0.5, 0.15])
+_SENSITIVITY = torch.tensor([0.35, 0.5, 0.15])
 # What people in photographs have more or less of than the mean head, standard deviations: width, most of all.
 _LEANING = {"face_width": 1.2, "jaw_width": 1.3, "cheek_fullness": 1.0, "head_width": 0.8, "pupil_distance": -0.4,
             "face_height": 0.4, "chin_height": 0.4, "mouth_width": 0.6, "brow_height": 0.5}  # fmt: skip
@@ -119,11 +119,11 @@ def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Pers
     rig = performer(draw_identities(1, generator, settings.spread)[0] + leaning)
     mesh = rig.neutral
     assert mesh.texture is not None
-    texture = torch.einsum("chw,c->hw", mesh.texture, _LUMA)[None]
+    texture = torch.einsum("chw,c->hw", mesh.texture, _SENSITIVITY)[None]
     drawn = draw_complexions(1, generator, 1.1)[0]
     drawn[0] = uniform(-1.5, 2.6, generator)  # pigment: as many dark faces as light ones
     drawn[3] = uniform(-2.5, 2.0, generator)
-    grey = complexion_colors(torch.stack([drawn, torch.zeros_like(drawn)])) @ _LUMA
+    grey = complexion_colors(torch.stack([drawn, torch.zeros_like(drawn)])) @ _SENSITIVITY
     tint = grey[0] / grey[1].clamp(min=0.02) * _facial_hair(generator)
 
     def chance(share: float) -> bool:

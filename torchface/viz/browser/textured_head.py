@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchface.color_space import to_linear
 from torchface.geometry.meshes.normal_maps import encode_normals
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.primitives import decode_srgb
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY
 from torchface.rendering.compositing import to_pillow
@@ -50,9 +50,9 @@ class Skin:
             self._picture = _encoded(to_pillow(mesh.texture), "JPEG", _LARGEST_SIDE)
         elif mesh.colors is not None:
             # glTF wants vertex colours linear, the mesh holds them as a picture does.
-            self._colors = decode_srgb(mesh.colors.clamp(0, 1).float()[self._vertex_of].numpy())
+            self._colors = to_linear(mesh.colors.clamp(0, 1).float()[self._vertex_of]).numpy()
         else:
-            clay = decode_srgb(torch.tensor(CLAY).numpy()).tolist()
+            clay = to_linear(torch.tensor(CLAY)).tolist()
             self._material["baseColorFactor"] = [*clay, 1.0]
 
     def glb(self, vertices: Tensor, wrinkles: Tensor | None = None) -> bytes:
