@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -132,3 +133,19 @@ def test_a_real_video_is_read_whole(data: Path) -> None:
     frames = torch.cat(list(video.chunks(32)))
     assert frames.shape == (72, 360, 640)
     assert 0.1 < (frames / 255).mean() < 0.9
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("name", "count", "fps"),
+    [("no_face.mp4", 95, 24.0), ("single_face.mp4", 72, 30.0), ("webcam/brother.mkv", 65, 30.0)],
+)
+def test_real_videos_come_as_opencv_decodes_them(name: str, count: int, fps: float, data: Path) -> None:
+    video = open_video(data / "video" / name)
+    assert (video.count, video.fps) == (count, fps)  # three more frames of the first are hidden by its edit list
+    capture = cv2.VideoCapture(str(video.path), cv2.CAP_FFMPEG)
+    for frame in video.color_frames():
+        found, pixels = capture.read()
+        assert found
+        assert np.array_equal(frame.permute(1, 2, 0).numpy(), pixels[..., ::-1])
+    assert not capture.read()[0]

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
+import av
+import cv2
 import numpy as np
 import torch
+from av.container import InputContainer
+from av.video.reformatter import Interpolation, VideoReformatter
+from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.video.decoding import opencv, opened, short
-from torchface.io.video.packets import Packets, read_packets
+from torchface.io.video.container import open_container, reason
+from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
 from torchface.io.video.timing import check_even_rate
 
-_LARGEST_SIDE = 8192
-_LARGEST_FRAME = 4096 * 4096
-LARGEST_FPS = 10_000.0
-_HIDDEN = 16  # frames before the point where an edit list of MP4 says that the video begins
+MAX_FPS = 10_000.0
+_MAX_FRAMES = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,8 @@ class VideoFile:
     Args:
         path: the file.
         fps: frames a second.
-        width, height: pixels.
-        count: how many frames the file says it has; the frames themselves are counted as they are read.
+        width, height: pixels, upright: a phone's rotation is applied.
+        count: frames that are shown; of a file that is cut off, those its header promises.
     """
 
     path: Path
@@ -45,14 +49,20 @@ class VideoFile:
         return self.count / self.fps
 
     def check(self) -> None:
-        """Goes through the file without decoding it, and refuses what no take can be made of.
+        """Goes through the file, decoding key frames alone, and refuses what no take can be made of.
 
         ``chunks`` and ``color_chunks`` do so before their first frame.
 
         Raises:
             FileFormatError: frames change their size on the way, or come at a variable rate.
         """
-        self._checked_packets()
+        packets = read_packets(self.path)
+        check_even_rate(self.path, packets.seconds, self.fps)
+        first: tuple[int, int] | None = None
+        for seconds, width, height in key_frame_sizes(self.path):
+            first = first or (width, height)
+            if (width, height) != first:
+                raise self._resized(int((packets.seconds < seconds).sum()), width, height, *first)
 
     def chunks(self, frames: int = 64) -> Iterator[Tensor]:
         """The frames as uint8 tensors (t,H,W), ``frames`` at a time, the last chunk shorter.
@@ -60,10 +70,8 @@ class VideoFile:
         Raises:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
         """
-        cv2 = opencv()
-        for held in self._held(frames):
-            grey = [frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in held]
-            yield torch.from_numpy(np.stack(grey))
+        for batch in _batches((cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in self._decoded()), frames):
+            yield torch.from_numpy(np.stack(batch))
 
     def color_chunks(self, frames: int = 16) -> Iterator[Tensor]:
         """The frames in colour as uint8 tensors (t,3,H,W), red first, ``frames`` at a time, the last chunk shorter.
@@ -71,9 +79,8 @@ class VideoFile:
         Raises:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
         """
-        for held in self._held(frames):
-            color = [np.repeat(frame[..., None], 3, 2) if frame.ndim == 2 else frame[..., ::-1] for frame in held]
-            yield torch.from_numpy(np.ascontiguousarray(np.stack(color).transpose(0, 3, 1, 2)))
+        for batch in _batches((np.stack(cv2.split(frame)) for frame in self._decoded()), frames):
+            yield torch.from_numpy(np.stack(batch))
 
     def frames(self) -> Iterator[Tensor]:
         """The frames one by one, uint8 (H,W)."""
@@ -98,101 +105,79 @@ class VideoFile:
                 return frame
         raise ValueRangeError(f"{self.path}: asked for frame {number}, found fewer")
 
-    def _held(self, frames: int) -> Iterator[list[np.ndarray]]:
-        if frames < 1:
-            raise ValueRangeError(f"frames: found {frames}, expected at least 1")
-        held: list[np.ndarray] = []
-        for frame in self._decoded():
-            held.append(frame)
-            if len(held) == frames:
-                yield held
-                held = []
-        if held:
-            yield held
-
     def _decoded(self) -> Iterator[np.ndarray]:
-        """Frames as OpenCV gives them, (H,W,3) blue first or (H,W)."""
-        packets = self._checked_packets()
-        cv2, capture = opencv(), opened(self.path)
-        found = 0
-        try:
-            while True:  # a decoder gives one frame at a time
-                try:
-                    good, frame = capture.read()
-                except cv2.error as error:
-                    raise FileFormatError(f"{self.path}: frame {found} cannot be decoded ({short(error)})") from error
-                if not good:
-                    break
+        """Checked frames, red first, (H,W,3)."""
+        self.check()
+        found, errors = 0, list[str]()
+        with open_container(self.path) as (container, stream):
+            for frame in _rgb_frames(container, stream, errors):
                 if frame.shape[:2] != (self.height, self.width):
-                    raise FileFormatError(
-                        f"{self.path}: frame {found} is {frame.shape[1]} x {frame.shape[0]} pixels, "
-                        f"expected {self.width} x {self.height} as the first"
-                    )
+                    raise self._resized(found, frame.shape[1], frame.shape[0], self.width, self.height)
                 found += 1
                 yield frame
-        finally:
-            capture.release()
-        # Headers count by duration and rate: a frame or two may be missing from a whole file.
-        fewest = 0.99 * self.count - 1
-        if packets is not None and len(packets.seconds) >= fewest and _has_edit_list(self.path):
-            fewest = min(fewest, self.count - _HIDDEN)
-        if found < max(fewest, 1):
+        # Recordings that were cut lose a frame or two at their ends.
+        if found < max(0.99 * self.count - 1, 1):
             raise FileFormatError(
-                f"{self.path}: {found} frames could be decoded, expected {self.count} as its header says: "
-                "the file is cut off or damaged"
+                f"{self.path}: {found} frames could be decoded, expected {self.count}: the file is cut off or "
+                f"damaged{''.join(errors[:1])}"
             )
 
-    def _checked_packets(self) -> Packets | None:
-        packets = read_packets(self.path)
-        if packets is None:
-            return None
-        resized = packets.resized()
-        if resized is not None:
-            _, width, height = packets.sizes[0]
-            raise FileFormatError(
-                f"{self.path}: frame {resized[0]} is {resized[1]} x {resized[2]} pixels, expected {width} x {height} "
-                f"as the first. To convert it: ffmpeg -i {self.path.name} -vf scale={width}:{height} "
-                f"{self.path.stem}_even.mp4"
-            )
-        check_even_rate(self.path, packets.seconds, self.fps)
-        return packets
+    def _resized(self, number: int, width: int, height: int, first_width: int, first_height: int) -> FileFormatError:
+        return FileFormatError(
+            f"{self.path}: frame {number} is {width} x {height} pixels, expected {first_width} x {first_height} as the "
+            f"first. To convert it: ffmpeg -i {self.path.name} -vf scale={first_width}:{first_height} "
+            f"{self.path.stem}_even.mp4"
+        )
 
 
 def open_video(path: str | Path) -> VideoFile:
-    """Opens a video and decodes its first frame, so that one that cannot be decoded is refused at once.
+    """Opens a video, counts its frames and decodes the first one, so that a bad file is refused at once.
 
     Args:
-        path: an ``.avi``, ``.mkv``, ``.webm``, ``.mp4`` or ``.mov`` file; told by its content.
+        path: an ``.avi``, ``.mkv``, ``.webm``, ``.mp4`` or ``.mov`` file; recognised by its content.
 
     Raises:
         FileFormatError: the file is missing, no video, of a codec that is not there, or claims absurd sizes.
     """
     path = Path(path)
-    cv2, capture = opencv(), opened(path)
-    try:
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        if not (1 <= width <= _LARGEST_SIDE and 1 <= height <= _LARGEST_SIDE and width * height <= _LARGEST_FRAME):
+    packets = read_packets(path)
+    with open_container(path) as (container, stream):
+        rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate, stream.base_rate) if rate]
+        rates = [rate for rate in rates if math.isfinite(rate) and 0 < rate <= MAX_FPS]
+        if not rates:
+            raise FileFormatError(f"{path}: found no frame rate up to {MAX_FPS:g} a second in its header, expected one")
+        times = packets.seconds[np.isfinite(packets.seconds)]
+        spacing = float(np.diff(times).mean()) if len(times) > 1 and times[-1] > times[0] else 1 / rates[0]
+        fps = min(rates, key=lambda rate: abs(rate * spacing - 1))  # a mean over an edit list's hidden frames is wrong
+        errors: list[str] = []
+        frame = next(_rgb_frames(container, stream, errors), None)
+        if frame is None:
             raise FileFormatError(
-                f"{path}: found frames of {width:.0f} x {height:.0f} pixels, expected at most {_LARGEST_SIDE} a side"
+                f"{path}: no frame can be decoded{''.join(errors[:1])}; expected a video of a codec that FFmpeg knows"
             )
-        if not (math.isfinite(fps) and 0 < fps <= LARGEST_FPS):
-            raise FileFormatError(f"{path}: found {fps} frames a second, expected a positive number")
+        declared = stream.frames or round((container.duration or 0) / av.time_base * fps)
+    whole = len(packets.seconds) + packets.hidden >= 0.99 * declared - 1
+    count = len(packets.seconds) if whole else declared - packets.hidden
+    if not 1 <= count <= _MAX_FRAMES:
+        raise FileFormatError(f"{path}: its header says {count} frames, expected a positive number")
+    return VideoFile(path, fps, frame.shape[1], frame.shape[0], count)
+
+
+def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[np.ndarray]:
+    """Upright frames (H,W,3) of the packets that can be decoded; what is wrong with the others goes to ``errors``."""
+    reformatter = VideoReformatter()
+    for packet in packets_of(container, stream, errors):  # a decoder takes one packet at a time
         try:
-            good, frame = capture.read()
-        except cv2.error as error:
-            raise FileFormatError(f"{path}: cannot be decoded ({short(error)})") from error
-        if not good:
-            raise FileFormatError(f"{path}: no frame can be decoded; expected a video of a codec that FFmpeg knows")
-        if not 1 <= count < 2**31:
-            raise FileFormatError(f"{path}: its header says {count:.0f} frames, expected a positive number")
-    finally:
-        capture.release()
-    return VideoFile(path, fps, frame.shape[1], frame.shape[0], int(count))
+            for frame in stream.decode(packet):
+                rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BICUBIC)
+                yield np.ascontiguousarray(np.rot90(rgb.to_ndarray(), quarter_turns(frame)))
+        except (av.FFmpegError, ValueError) as error:
+            errors.append(f" ({reason(error)})")
 
 
-def _has_edit_list(path: Path) -> bool:
-    """Whether the container is of a kind whose header can hide frames of the file."""
-    with path.open("rb") as file:
-        return file.read(12)[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free")
+def _batches(frames: Iterable[np.ndarray], size: int) -> Iterator[list[np.ndarray]]:
+    if size < 1:
+        raise ValueRangeError(f"frames: found {size}, expected at least 1")
+    iterator = iter(frames)
+    while batch := list(islice(iterator, size)):
+        yield batch

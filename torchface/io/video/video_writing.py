@@ -5,17 +5,27 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 
+import av
 import numpy as np
 import torch
+from av.container import OutputContainer
+from av.video.frame import VideoFrame
+from av.video.reformatter import VideoReformatter
+from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.io.video.decoding import opencv
-from torchface.io.video.video_file import LARGEST_FPS, VideoFile
+from torchface.io.video.container import reason
+from torchface.io.video.video_file import MAX_FPS, VideoFile
 
-_CODECS = {".avi": "FFV1", ".mkv": "FFV1", ".mp4": "mp4v"}
+_SUFFIXES = (".avi", ".mkv", ".mp4")
+_BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
+_LOSSY = ("yuv420p", "yuv444p")
+_MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30
 
 
 def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> VideoFile:
@@ -25,7 +35,7 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
         frames: grey chunks (t,H,W) or single grey frames (H,W), or chunks in colour (t,3,H,W), red first; uint8, or
             floats in [0,1]; all of one size, all grey or all in colour. Three dimensions are always grey: a single
             frame in colour is (1,3,H,W).
-        path: ``.avi`` and ``.mkv`` are lossless (FFV1), ``.mp4`` (MPEG-4) is not.
+        path: ``.avi`` and ``.mkv`` are lossless (FFV1), ``.mp4`` (H.264, or MPEG-4 where FFmpeg lacks x264) is not.
         fps: frames a second.
 
     Raises:
@@ -34,43 +44,24 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
         ValueRangeError: ``fps`` is not a positive number.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in _CODECS:
-        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_CODECS)}")
-    if not (math.isfinite(fps) and 0 < fps <= LARGEST_FPS):
+    if path.suffix.lower() not in _SUFFIXES:
+        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_SUFFIXES)}")
+    if not (math.isfinite(fps) and 0 < fps <= MAX_FPS):
         raise ValueRangeError(f"fps: found {fps}, expected a positive number")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{suffix}")
-    cv2 = opencv()
-    writer, count = None, 0
-    shape: tuple[int, ...] = (0, 0)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix.lower()}")
+    single = _single(frames)
+    first = next(single, None)
+    if first is None:
+        raise ShapeError(f"{path}: found no frame, expected at least one")
     try:
-        for frame in _single(frames):  # the encoder takes one frame at a time
-            height, width = frame.shape[-2:]
-            if writer is None:
-                shape = tuple(frame.shape)
-                code = cv2.VideoWriter.fourcc(*_CODECS[suffix])
-                colored = frame.ndim == 3
-                writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, code, fps, (width, height), isColor=colored)
-                if not writer.isOpened():
-                    raise FileFormatError(f"{path}: cannot be written as {_CODECS[suffix]}, {width} x {height}")
-            if frame.shape != shape:
-                raise ShapeError(f"frames: found {tuple(frame.shape)}, expected {shape} as the first")
-            pixels = to_bytes(frame).numpy()
-            if pixels.ndim == 3:
-                pixels = np.ascontiguousarray(pixels[::-1].transpose(1, 2, 0))
-            writer.write(pixels)
-            count += 1
-        if writer is None:
-            raise ShapeError(f"{path}: found no frame, expected at least one")
-        writer.release()
+        with av.open(str(temporary), "w") as container:
+            count = _encode(container, first, single, fps)
         os.replace(temporary, path)
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be written ({error.strerror})") from error
+    except (OSError, av.FFmpegError) as error:
+        raise FileFormatError(f"{path}: cannot be written ({reason(error)})") from error
     finally:
-        if writer is not None:
-            writer.release()
         temporary.unlink(missing_ok=True)
-    return VideoFile(path, fps, shape[-1], shape[-2], count)
+    return VideoFile(path, fps, first.shape[-1], first.shape[-2], count)
 
 
 def to_bytes(frame: Tensor) -> Tensor:
@@ -78,6 +69,55 @@ def to_bytes(frame: Tensor) -> Tensor:
     if frame.dtype == torch.uint8:
         return frame.contiguous()
     return (frame.clamp(0, 1) * 255).round().to(torch.uint8).contiguous()
+
+
+def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor], fps: float) -> int:
+    """Writes all frames and gives their number."""
+    stream = _add_stream(container, first, fps)
+    layout = "rgb24" if first.ndim == 3 else "gray"
+    lossy = {"dst_colorspace": _BT709, "dst_color_range": _LIMITED} if stream.pix_fmt in _LOSSY else {}
+    reformatter = VideoReformatter()
+    count = 0
+    for frame in chain([first], others):  # the encoder takes one frame at a time
+        if frame.shape != first.shape:
+            raise ShapeError(f"frames: found {tuple(frame.shape)}, expected {tuple(first.shape)} as the first")
+        pixels = to_bytes(frame).numpy()
+        if pixels.ndim == 3:
+            pixels = np.ascontiguousarray(pixels.transpose(1, 2, 0))
+        coded = reformatter.reformat(VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
+        coded.pts, coded.time_base = count, 1 / stream.codec_context.framerate
+        container.mux(stream.encode(coded))
+        count += 1
+    container.mux(stream.encode(None))
+    return count
+
+
+def _add_stream(container: OutputContainer, first: Tensor, fps: float) -> VideoStream:
+    """A stream for frames as the first: FFV1 for a lossless container, else H.264 or MPEG-4 in BT.709."""
+    height, width = first.shape[-2:]
+    lossless = container.format.name != "mp4"
+    codec = "ffv1" if lossless else "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    options = {"preset": "veryfast", "crf": "16"} if codec == "libx264" else {}
+    stream = container.add_stream(codec, rate=_rate(fps, codec), options=options)
+    assert isinstance(stream, VideoStream)
+    stream.width, stream.height = width, height
+    if lossless:
+        stream.pix_fmt = "bgr0" if first.ndim == 3 else "gray"
+        return stream
+    if codec == "mpeg4":
+        stream.bit_rate = min(round(4 * width * height * fps), _MAX_BIT_RATE)
+    even = width % 2 == 0 and height % 2 == 0
+    stream.pix_fmt = "yuv420p" if even or codec == "mpeg4" else "yuv444p"
+    context = stream.codec_context
+    context.colorspace = context.color_primaries = context.color_trc = _BT709
+    context.color_range = _LIMITED
+    return stream
+
+
+def _rate(fps: float, codec: str) -> Fraction:
+    """Frames a second as the codec's header can hold it."""
+    largest = _MAX_MPEG4_TICKS // math.ceil(fps) if codec == "mpeg4" else 100_000
+    return max(Fraction(fps).limit_denominator(largest), Fraction(1, 100_000))
 
 
 def _single(frames: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.io.video.decoding import opencv
 from torchface.landmarks.images.ibug import MIRROR_68
 from torchface.landmarks.images.landmark_trees import LandmarkTrees, similarity_to, start_shapes
 
@@ -122,7 +122,6 @@ def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:
 
 def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.ndarray, Tensor, Tensor]:
     """The picture round a box at the wanted size, pixels of it a pixel (2,), and the corner it was cut at (2,)."""
-    cv2 = opencv()
     middle = (box[:2] + box[2:] / 2).tolist()
     reach = (0.5 + _AROUND) * side
     x, y = math.floor(middle[0] - reach), math.floor(middle[1] - reach)

@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueRangeError
-from torchface.io.video.decoding import opencv
+
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
 
 _WINDOW = 24  # pixels a side of the smallest face that a cascade is shown
 _OVERLAP = 0.25
@@ -141,7 +143,6 @@ class YuNetDetector:
             )
         self.path, self.least_score, self.longest = Path(path), least_score, longest
         _check_network(self.path)
-        cv2 = opencv()
         try:
             self._network = cv2.FaceDetectorYN.create(str(self.path), "", (longest, longest), least_score, 0.3, 1000)
         except cv2.error as error:
@@ -157,7 +158,7 @@ class YuNetDetector:
         try:
             self._network.setInputSize((small.shape[1], small.shape[0]))
             found = self._network.detect(small)[1]
-        except opencv().error as error:
+        except cv2.error as error:
             raise self._broken(error) from error
         rows = torch.zeros(0, 15) if found is None else torch.from_numpy(np.asarray(found, dtype=np.float32))
         if rows.shape[1:] != (15,):
@@ -224,7 +225,6 @@ def grey_pixels(image: Tensor) -> np.ndarray:
     _check_picture(image)
     if image.ndim == 2:
         return image.cpu().numpy()
-    cv2 = opencv()
     return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
 
 
@@ -257,13 +257,11 @@ def _box_of_five(points: Tensor) -> Tensor:
 
 
 def _shrunk(pixels: np.ndarray, scale: float) -> np.ndarray:
-    cv2 = opencv()
     size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def _cascade(name: str) -> Any:
-    cv2 = opencv()
     folder = Path(getattr(getattr(cv2, "data", None), "haarcascades", ""))
     cascade = cv2.CascadeClassifier(str(folder / name))
     if cascade.empty():

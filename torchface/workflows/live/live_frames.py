@@ -7,12 +7,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.io.video import VideoFile, open_video
-from torchface.io.video.decoding import opencv
 
 _USUAL_RATE = 30.0
 _PATIENCE = 5.0
@@ -63,7 +63,7 @@ class Camera:
     """
 
     def __init__(self, number: int) -> None:
-        cv2 = opencv()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
         self._capture = cv2.VideoCapture(number)
         good, frame = self._capture.read() if self._capture.isOpened() else (False, None)
         if not good or frame is None:

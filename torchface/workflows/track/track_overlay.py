@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,7 +18,6 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import write_video
-from torchface.io.video.decoding import opencv
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
@@ -145,7 +145,6 @@ def undistorted(frame: Tensor, calibration: CameraCalibration) -> Tensor:
     """What a camera without distortion would have seen, uint8 (3,H,W)."""
     if not calibration.distortion.any():
         return frame
-    cv2 = opencv()
     picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
     straight = cv2.undistort(picture, calibration.intrinsics.numpy(), calibration.distortion.numpy())
     return torch.from_numpy(straight).permute(2, 0, 1)
@@ -201,7 +200,6 @@ def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> C
 
 def with_dots(frame: Tensor, found: Tensor, solved: Tensor) -> Tensor:
     """Landmarks on a frame, uint8 (3,H,W): found ones (L,2) green, the solved rig's (L,2) red."""
-    cv2 = opencv()
     canvas = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
     radius = max(1.0, 0.004 * max(frame.shape[1:]))
     scale = 2**_SUBPIXEL
