@@ -1,13 +1,17 @@
-"""Head pose beside OpenCV's solvePnPRansac, and what filtering live costs and gains; one thread, processor time."""
+"""Head pose beside OpenCV's RANSACs, and what filtering live costs and gains; one thread, processor time."""
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchface.capture.video.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
@@ -58,49 +62,93 @@ def degrees(one: Tensor, other: Tensor) -> Tensor:
     return rotation_vector(one @ other.transpose(1, 2)).norm(dim=1).rad2deg().nan_to_num(180.0)
 
 
-@pytest.mark.parametrize("count", [68, len(STABLE_LANDMARKS)])
-def test_robust_pnp_beside_opencv(count: int) -> None:
-    cv2 = pytest.importorskip("cv2")
+def turned_far(flatness: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What ``filmed`` gives, with the stable landmarks alone, of a head in any pose up to 86° from the camera."""
+    generator = torch.Generator().manual_seed(0)
+    mesh = neutral_head()
+    points = mesh.vertices[mesh.landmarks].double()[list(STABLE_LANDMARKS)]
+    points = points * torch.tensor([1.0, 1.0, flatness], dtype=torch.float64)
+    angles = (torch.rand(FRAMES, 3, generator=generator).double() - 0.5) * torch.tensor([1.5, 3.0, 1.5]).double()
+    rotation = UPRIGHT @ torch.from_numpy(Rotation.from_euler("xyz", angles.numpy()).as_matrix())
+    translation = (torch.rand(FRAMES, 3, generator=generator).double() - 0.5) * torch.tensor([200.0, 200, 600]).double()
+    translation = translation + torch.tensor([0.0, 0, 750], dtype=torch.float64)
+    pixels, _ = pixel_jacobian(points @ rotation.transpose(1, 2) + translation[:, None], K)
+    return points, rotation, translation, pixels + torch.randn(pixels.shape, generator=generator).double()
+
+
+def opencv(points: Tensor, pixels: Tensor, method: int, draws: int, confidence: float) -> tuple[Tensor, Tensor]:
+    found = []
+    for frame in pixels.numpy():  # OpenCV takes one view at a time
+        good, vector, translation, inliers = cv2.solvePnPRansac(
+            points.numpy(),
+            frame,
+            K.numpy(),
+            None,
+            iterationsCount=draws,
+            reprojectionError=4.0,
+            confidence=confidence,
+            flags=method,
+        )
+        if good and inliers is not None and len(inliers) > 3:
+            agreed = inliers[:, 0]
+            vector, translation = cv2.solvePnPRefineLM(
+                points.numpy()[agreed], frame[agreed], K.numpy(), None, vector, translation
+            )
+        elif not good:
+            vector, translation = np.full((2, 3, 1), np.nan)
+        found.append((rotation_matrix(torch.from_numpy(vector[:, 0])), torch.from_numpy(translation[:, 0])))
+    return torch.stack([pose[0] for pose in found]), torch.stack([pose[1] for pose in found])
+
+
+PEERS = {
+    "solvePnPRansac": (cv2.SOLVEPNP_ITERATIVE, 256, 0.99),
+    "EPNP": (cv2.SOLVEPNP_EPNP, 300, 0.99),
+    "AP3P": (cv2.SOLVEPNP_AP3P, 300, 0.99),
+    "AP3P, most draws": (cv2.SOLVEPNP_AP3P, 4000, 1 - 1e-9),
+    "USAC_ACCURATE": (cv2.USAC_ACCURATE, 1000, 0.9999),
+    "USAC_MAGSAC": (cv2.USAC_MAGSAC, 1000, 0.9999),
+}
+
+
+@pytest.mark.parametrize("scene", ["68 landmarks", "13 landmarks", "13, any pose", "13, any pose, flat face"])
+def test_robust_pnp_beside_opencv(scene: str) -> None:
     cv2.setNumThreads(1)
-    kept = torch.arange(68) if count == 68 else torch.tensor(STABLE_LANDMARKS)
-    points, rotation, translation, pixels = filmed(1.0)
-    points, pixels = points[kept], pixels[:, kept]
+    if "any" in scene:
+        points, rotation, translation, pixels = turned_far(0.15 if "flat" in scene else 1.0)
+    else:
+        points, rotation, translation, pixels = filmed(1.0)
+    if scene == "13 landmarks":
+        points, pixels = points[list(STABLE_LANDMARKS)], pixels[:, list(STABLE_LANDMARKS)]
     generator = torch.Generator().manual_seed(2)
     wrong = torch.rand(pixels.shape[:2], generator=generator) < 0.3
-    off = 300 * (torch.rand(pixels.shape, generator=generator).double() - 0.5)
-    pixels = torch.where(wrong[..., None], pixels + off, pixels)
-    theirs: list[tuple[Tensor, Tensor]] = []
+    residual = 300 * (torch.rand(pixels.shape, generator=generator).double() - 0.5)
+    pixels = torch.where(wrong[..., None], pixels + residual, pixels)
 
-    def opencv() -> None:
-        for frame in pixels.numpy():  # OpenCV takes one view at a time
-            good, turn, move, inliers = cv2.solvePnPRansac(
-                points.numpy(), frame, K.numpy(), None, iterationsCount=256, reprojectionError=4.0
-            )
-            if good and inliers is not None and len(inliers) > 3:
-                agreed = inliers[:, 0]
-                turn, move = cv2.solvePnPRefineLM(points.numpy()[agreed], frame[agreed], K.numpy(), None, turn, move)
-            theirs.append((torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(move[:, 0])))
+    def ours() -> tuple[Tensor, Tensor]:
+        pose = robust_pnp(points, pixels, K).pose
+        return pose.rotation, pose.translation
 
+    methods: dict[str, Callable[[], tuple[Tensor, Tensor]]] = {"torchface robust_pnp": ours}
+    for name, settings in PEERS.items():
+        methods[f"cv2 {name} + LM"] = functools.partial(opencv, points, pixels, *settings)
     robust_pnp(points, pixels[:10], K)
-    ours = robust_pnp(points, pixels, K)
-    spent = min(seconds(lambda: robust_pnp(points, pixels, K)) for _ in range(3)), seconds(opencv)
-    turned, moved = (torch.stack(part) for part in zip(*theirs, strict=True))
-    rows = (
-        ("torchface robust_pnp", spent[0], ours.pose.rotation, ours.pose.translation),
-        ("cv2.solvePnPRansac + LM", spent[1], turned, moved),
-    )
-    print(f"\n{count} landmarks, 1 px of noise, 30 % of them up to 150 px off, {FRAMES} frames")
-    print(f"{'':26} {'ms/frame':>9} {'degrees: median':>16} {'95 %':>7} {'over 10':>8} {'mm: median':>11}")
-    for name, each, found, place in rows:
+    print(f"\n{scene}, 1 px of noise, 30 % of them up to 150 px wrong, {FRAMES} frames")
+    print(f"{'':28} {'ms/frame':>9} {'degrees: median':>16} {'95 %':>7} {'over 10':>8} {'mm: median':>11}")
+    rows = []
+    for name, method in methods.items():
+        begin = time.process_time()
+        found, place = method()
+        spent = time.process_time() - begin
         angle, far = degrees(found, rotation), (place - translation).norm(dim=1).nan_to_num(1e9)
+        rows.append((spent, float(angle.median()), float((angle > 10).double().mean())))
         print(
-            f"{name:26} {1e3 * each / FRAMES:9.3f} {float(angle.median()):16.3f} {float(angle.quantile(0.95)):7.2f} "
-            f"{float((angle > 10).double().mean()):8.1%} {float(far.median()):11.2f}"
+            f"{name:28} {1e3 * spent / FRAMES:9.3f} {rows[-1][1]:16.3f} {float(angle.quantile(0.95)):7.2f} "
+            f"{rows[-1][2]:8.1%} {float(far.median()):11.2f}"
         )
-    angles = [degrees(found, rotation) for _, _, found, _ in rows]
-    assert float(angles[0].median()) <= 1.02 * float(angles[1].median())
-    assert float((angles[0] > 10).double().mean()) <= float((angles[1] > 10).double().mean())
-    assert spent[0] < 3 * spent[1]
+    # As good as AP3P at its best, and unlike OpenCV's draws it takes weights, which temples need.
+    assert rows[0][1] <= 1.02 * min(row[1] for row in rows[1:4])
+    assert rows[0][2] <= min(row[2] for row in rows[1:4])
+    assert rows[0][0] < 3 * rows[1][0]
 
 
 def test_poses_along_time() -> None:

@@ -67,10 +67,10 @@ def test_weights_choose_whom_to_believe() -> None:
     assert float((solve_pnp(points, pixels, K).rotation - rotation).abs().max()) > 1e-3
 
 
-def test_a_start_is_refined() -> None:
+def test_an_initial_guess_is_refined() -> None:
     points, _, translation, pixels = planted(3)
     found = solve_pnp(points, pixels + 1.0, K)
-    again = solve_pnp(points, pixels, K, start=found)
+    again = solve_pnp(points, pixels, K, initial=found)
     torch.testing.assert_close(again.translation, translation, rtol=0, atol=1e-3)
 
 

@@ -144,7 +144,7 @@ def test_frames_without_enough_points_have_no_pose() -> None:
     assert robust_pnp(points, pixels[:0], K).inliers.shape == (0, 68)
 
 
-def test_weights_and_a_start() -> None:
+def test_weights_and_an_initial_guess() -> None:
     points, rotation, translation, pixels = filmed(6)
     weights = torch.ones(68).double()
     weights[:17] = 0
@@ -152,18 +152,20 @@ def test_weights_and_a_start() -> None:
     found = robust_pnp(points, pixels, K, weights=weights)
     assert not found.inliers[:, :17].any()
     assert float(degrees(found.pose.rotation, rotation).max()) < 1e-3
-    # What weighs a quarter may be off twice as far.
+    # What weighs a quarter may have twice the residual.
     clean = filmed(6)[3]
     clean[:, 30, 0] += 6.0
     weights = torch.ones(68).double()
     assert not robust_pnp(points, clean, K).inliers[:, 30].any()
     weights[30] = 0.25
     assert robust_pnp(points, clean, K, weights=weights).inliers[:, 30].all()
-    # With one draw a frame hardly any is found; the start is tried beside it.
+    # With one draw a frame hardly any is found; the initial guess is tried beside it.
     wrong, _ = spoiled(filmed(6, 0.3)[3], 0.6)
-    start = Pose(rotation, translation + 0.5, torch.zeros(6).double())
+    initial = Pose(rotation, translation + 0.5, torch.zeros(6).double())
     assert int(robust_pnp(points, wrong, K, hypotheses=1).inliers.sum(1).min()) < 10
-    assert float(degrees(robust_pnp(points, wrong, K, start=start, hypotheses=1).pose.rotation, rotation).max()) < 1.0
+    assert (
+        float(degrees(robust_pnp(points, wrong, K, initial=initial, hypotheses=1).pose.rotation, rotation).max()) < 1.0
+    )
 
 
 def test_bad_input_is_named() -> None:
@@ -180,7 +182,7 @@ def test_bad_input_is_named() -> None:
         robust_pnp(points, pixels, K, threshold=0.0)
     with pytest.raises(ValueRangeError, match="negative or infinite weight"):
         robust_pnp(points, pixels, K, weights=-torch.ones(68))
-    with pytest.raises(ShapeError, match="start: found rotation"):
-        robust_pnp(points, pixels, K, start=Pose(torch.zeros(1, 3, 3), torch.zeros(1, 3), torch.zeros(1)))
+    with pytest.raises(ShapeError, match="initial: found rotation"):
+        robust_pnp(points, pixels, K, initial=Pose(torch.zeros(1, 3, 3), torch.zeros(1, 3), torch.zeros(1)))
     with pytest.raises(ValueRangeError, match="NaN or infinite points"):
         robust_pnp(points * torch.nan, pixels, K)

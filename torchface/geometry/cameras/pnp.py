@@ -10,10 +10,10 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 
-_FEWEST = 4
+_MIN_POINTS = 4
 _NEAREST = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
-_FLAT = 1e-2  # relative; points that extend less in their third direction are flat for the start
-_START_ROUNDS, _ROUNDS, _DONE = 5, 60, 1e-10
+_FLAT = 1e-2  # relative; points that extend less in their third direction count as flat at first
+_ORTHOGRAPHIC_ITERATIONS, _MAX_ITERATIONS, _DONE = 5, 60, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Pose:
 
 
 def solve_pnp(
-    points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None = None, start: Pose | None = None
+    points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None = None, initial: Pose | None = None
 ) -> Pose:
     r"""The poses in which a camera sees points where they are seen, with least squared error.
 
@@ -46,7 +46,7 @@ def solve_pnp(
         pixels: :math:`q`, (B,N,2); a NaN row counts as not seen.
         intrinsics: K, (B,3,3) or (3,3).
         weights: non-negative, (B,N) or (N,); equal if absent.
-        start: poses to refine instead of looking for them.
+        initial: poses to refine; found from nothing if absent.
 
     Returns:
         ``Pose(rotation (B,3,3), translation (B,3), errors (B,))`` in float64.
@@ -61,13 +61,13 @@ def solve_pnp(
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
     inverse = torch.linalg.inv(K)
     rays = torch.nn.functional.pad(q, (0, 1), value=1.0) @ inverse.transpose(-1, -2)
-    if start is not None:
-        best = _refined(x, q, K, w, start.rotation.double(), start.translation.double())
+    if initial is not None:
+        best = refined_poses(x, q, K, w, initial.rotation.double(), initial.translation.double())
     else:
-        rotation, translation, normal, flat = _orthographic_start(x, rays[..., :2] / rays[..., 2:], w)
-        best = _refined(x, q, K, w, rotation, translation)
+        rotation, translation, normal, flat = _orthographic_pose(x, rays[..., :2] / rays[..., 2:], w)
+        best = refined_poses(x, q, K, w, rotation, translation)
         if flat.any():
-            best = _better(best, _refined(x, q, K, w, *_mirrored(x, w, best, normal)))
+            best = _better(best, refined_poses(x, q, K, w, *_mirrored(x, w, best, normal)))
     if not torch.isfinite(best.errors).all():
         bad = (~torch.isfinite(best.errors)).nonzero()[:, 0].tolist()
         raise AlignmentError(f"solve_pnp: found no pose with all points in front of the camera in views {bad[:5]}")
@@ -77,7 +77,7 @@ def solve_pnp(
 def pose_covariance(
     points: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Tensor, weights: Tensor | None = None
 ) -> Tensor:
-    r"""How far off poses of least squares are, where every pixel is off by a deviation of one.
+    r"""The covariance of poses of least squares, where every pixel has a standard deviation of one.
 
     .. math:: \Sigma = \Big( \sum_i w_i J_i^\top J_i \Big)^{-1}, \qquad
         J = \frac{\partial \pi(K (\exp([\theta]) R x + t + m))}{\partial (\theta, m)}
@@ -89,7 +89,7 @@ def pose_covariance(
         weights: w, (B,N); equal if absent.
 
     Returns:
-        Covariance of the turn in the camera's frame, radians, and of the move, millimetres, (B,6,6) float64.
+        Covariance of the rotation in the camera's frame, radians, and of the translation, millimetres, (B,6,6) float64.
 
     Source: first-order propagation of noise, Hartley and Zisserman 2004, 5.2.
     """
@@ -99,7 +99,7 @@ def pose_covariance(
 
 
 def pixel_jacobian(seen: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (B,N,2) of points (B,N,3) in the camera's frame, and what moves them: (B,N,2,3)."""
+    """Pixels (B,N,2) of points (B,N,3) in the camera's frame, and their derivatives: (B,N,2,3)."""
     image = seen @ intrinsics.transpose(-1, -2)
     depth = image[..., 2:]
     pixels = image[..., :2] / depth
@@ -125,10 +125,10 @@ def _checked(
     if not torch.isfinite(w).all() or (w < 0).any():
         raise ValueRangeError("solve_pnp: found a negative or infinite weight, expected finite ones of at least 0")
     w = w * seen
-    if int((w > 0).sum(1).min()) < _FEWEST:
+    if int((w > 0).sum(1).min()) < _MIN_POINTS:
         raise ValueRangeError(
             f"solve_pnp: found {int((w > 0).sum(1).min())} points seen in view {int((w > 0).sum(1).argmin())}, "
-            f"expected at least {_FEWEST}"
+            f"expected at least {_MIN_POINTS}"
         )
     x = points.detach().double().expand(len(q), -1, -1)
     if not torch.isfinite(x[w > 0]).all():
@@ -137,7 +137,7 @@ def _checked(
     return x, torch.where(seen[..., None], q, 0.0), intrinsics.detach().double().expand(len(q), 3, 3), w
 
 
-def _orthographic_start(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _orthographic_pose(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rotation, translation, the direction (B,3) in which points extend least, and whether they are flat, (B,).
 
     ``rays`` (B,N,2) are pixels of a camera with K = I.
@@ -152,7 +152,7 @@ def _orthographic_start(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Ten
     inverse = vh.transpose(-1, -2) @ (u / kept[:, None, :]).transpose(-1, -2)
     normal = vh[:, 2]
     deeper = torch.zeros_like(x[..., 0])
-    for _ in range(_START_ROUNDS):  # each round corrects for perspective with the depths of the one before
+    for _ in range(_ORTHOGRAPHIC_ITERATIONS):  # each corrects for perspective with the depths of the one before
         goal = rays * (1 + deeper)[..., None]
         middle = (share * goal).sum(1, keepdim=True)
         ij = (inverse @ ((goal - middle) * share.sqrt())).transpose(-1, -2)
@@ -200,13 +200,25 @@ def _better(one: Pose, other: Pose) -> Pose:
     )
 
 
-def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor) -> Pose:
+def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor) -> Pose:
+    """Poses after Levenberg's method from initial ones, for arguments that are checked already, all float64.
+
+    Args:
+        x: points, (B,N,3), millimetres.
+        q: pixels, (B,N,2).
+        K: intrinsics, (B,3,3).
+        w: weights, (B,N).
+        rotation, translation: the initial poses, (B,3,3) and (B,3).
+
+    Returns:
+        ``Pose``; errors are infinite where points stay behind the camera.
+    """
     nearest = _NEAREST * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     damping = torch.full_like(translation[:, 0], 1e-4)
     error = _error(x, q, K, w, rotation, translation, nearest)
     total, going = w.sum(1), torch.arange(len(x), device=x.device)
     found = Pose(rotation.clone(), translation.clone(), error.clone())
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         pixels, jacobian = _jacobian(x @ rotation.transpose(-1, -2), translation, K)
         weighted = (jacobian * w.repeat_interleave(2, dim=1)[..., None]).transpose(-1, -2)
         H = weighted @ jacobian
@@ -234,11 +246,11 @@ def _refined(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, trans
 
 
 def _jacobian(turned: Tensor, translation: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (B,N,2) of points turned into the camera's frame (B,N,3), and what moves them: (B,2N,6)."""
-    pixels, by_place = pixel_jacobian(turned + translation[:, None], K)
-    # A turn by r moves the point s by r x s, so the pixel by (s x a) r where a move by m moves it by a m.
-    by_turn = torch.linalg.cross(turned[:, :, None].expand_as(by_place), by_place)
-    return pixels, torch.cat([by_turn, by_place], dim=-1).flatten(1, 2)
+    """Pixels (B,N,2) of points rotated into the camera's frame (B,N,3), and their derivatives: (B,2N,6)."""
+    pixels, by_translation = pixel_jacobian(turned + translation[:, None], K)
+    # A rotation by r moves the point s by r x s, so the pixel by (s x a) r where a translation by m moves it by a m.
+    by_rotation = torch.linalg.cross(turned[:, :, None].expand_as(by_translation), by_translation)
+    return pixels, torch.cat([by_rotation, by_translation], dim=-1).flatten(1, 2)
 
 
 def _error(

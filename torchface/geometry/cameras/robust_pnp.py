@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.cameras.pnp import Pose, solve_pnp
+from torchface.geometry.cameras.pnp import Pose, refined_poses
 from torchface.geometry.cameras.three_points import three_point_poses
 
-_FEWEST = 4
-_KEPT = 3  # hypotheses of a frame that are refined; the one that fits best from three points need not stay so
-_ROUNDS = 3
-_SURE = 0.75  # share of the points seen that agree with a start that needs no rival
-_NEAREST = 1e-3
-_LARGEST = 2**20  # numbers held at once for a chunk of frames
+_MIN_POINTS = 4
+_CANDIDATES = 3  # hypotheses of a frame that are refined; the best one before it need not be the best after
+_REFINEMENTS = 3
+_MIN_AGREEMENT = 0.75  # share of the points seen that agree with an initial guess that needs no rival
+_MIN_DEPTH = 1e-3
+_MAX_NUMBERS = 2**20  # numbers held at once for a chunk of frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +43,17 @@ def robust_pnp(
     intrinsics: Tensor,
     threshold: float | Tensor = 4.0,
     weights: Tensor | None = None,
-    start: Pose | None = None,
-    hypotheses: int = 64,
+    initial: Pose | None = None,
+    hypotheses: int = 128,
     seed: int = 0,
 ) -> RobustPose:
     r"""The poses in which a camera sees most points where they are seen, whatever the others do.
 
     .. math:: \min_{R,t} \sum_i \min\big( w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \tau^2 \big)
 
-    Random threes of points give hypotheses (RANSAC, scored by the sum above); the best few are refined on their
+    Random triples of points give hypotheses (RANSAC, scored by the sum above); the best few are refined on their
     inliers by Levenberg's method, and the inliers chosen anew until they stay the same. All frames and hypotheses at
-    once; every frame draws the same threes, so that its answer does not depend on the others.
+    once; every frame draws the same triples, so that its answer does not depend on the others.
 
     Args:
         points: x, (N,3), millimetres.
@@ -61,10 +61,10 @@ def robust_pnp(
         intrinsics: K, (3,3).
         threshold: :math:`\tau`, pixels, one for all or (B,); three deviations of good landmarks or so.
         weights: w, non-negative, (B,N) or (N,); 1 if absent. Where points are not equally exact, inverse variances in
-            units of the others': a point of weight 1/4 may be off twice as far. One of weight 0 is never an inlier.
-        start: poses to be tried first, such as those of the frames before; NaN where there is none. Where three
-            quarters of the points seen agree with it, nothing else is tried.
-        hypotheses: threes drawn a frame; 64 find a good one nearly always while half of the points are wrong.
+            units of the others': a point of weight 1/4 may have twice the residual. One of weight 0 is never an inlier.
+        initial: initial guesses, such as the poses of the frames before; NaN where there is none. Where three
+            quarters of the points seen agree with it, nothing is drawn.
+        hypotheses: triples drawn a frame; 128 find a good one nearly always while half of the points are wrong.
         seed: of the draws.
 
     Returns:
@@ -79,17 +79,17 @@ def robust_pnp(
     """
     x, q, K, w = _checked(points, pixels, intrinsics, weights)
     limit = _limits(threshold, q, hypotheses)
-    given = _given(start, q)
-    size = max(1, _LARGEST // (hypotheses * 4 * len(x)))
-    before = _squared(x, q, K, given[:, None, :, :3], given[:, None, :, 3])[:, 0]
+    guess = _guesses(initial, q)
+    size = max(1, _MAX_NUMBERS // (hypotheses * 4 * len(x)))
+    before = _squared(x, q, K, guess[:, None, :, :3], guess[:, None, :, 3])[:, 0]
     close = (before * w < limit[:, None].square()) & (w > 0)
-    sure = close.sum(1) >= _SURE * (w > 0).sum(1)
-    found = RobustPose(Pose(*(given.new_full(shape, torch.nan) for shape in _shapes(len(q)))), close)
+    sure = close.sum(1) >= _MIN_AGREEMENT * (w > 0).sum(1)
+    found = RobustPose(Pose(*(guess.new_full(shape, torch.nan) for shape in _shapes(len(q)))), close)
     for draws, frames in ((0, sure.nonzero()[:, 0]), (hypotheses, (~sure).nonzero()[:, 0])):
         # Drawn on the CPU, so that every device draws the same.
         order = torch.rand(draws, len(x), generator=torch.Generator().manual_seed(seed), device="cpu").to(x.device)
         for part in frames.split(size) if len(frames) else ():
-            pose, inliers = _consensus(x, q[part], K, w[part], given[part], order, limit[part])
+            pose, inliers = _consensus(x, q[part], K, w[part], guess[part], order, limit[part])
             found.pose.rotation[part], found.pose.translation[part] = pose.rotation, pose.translation
             found.pose.errors[part], found.inliers[part] = pose.errors, inliers
     return found
@@ -100,41 +100,43 @@ def _shapes(frames: int) -> tuple[tuple[int, ...], ...]:
 
 
 def _consensus(
-    x: Tensor, q: Tensor, K: Tensor, w: Tensor, given: Tensor, order: Tensor, limit: Tensor
+    x: Tensor, q: Tensor, K: Tensor, w: Tensor, guess: Tensor, order: Tensor, limit: Tensor
 ) -> tuple[Pose, Tensor]:
-    """Poses and inliers of a chunk of frames; ``given`` holds [R|t] to try beside."""
-    enough = ((w > 0).sum(1) >= _FEWEST).nonzero()[:, 0]
+    """Poses and inliers of a chunk of frames; ``guess`` holds [R|t] to try beside."""
+    enough = ((w > 0).sum(1) >= _MIN_POINTS).nonzero()[:, 0]
     rotation, translation, errors = (q.new_full(shape, torch.nan) for shape in _shapes(len(q)))
     inliers = torch.zeros_like(w, dtype=torch.bool)
     if not len(enough):
         return Pose(rotation, translation, errors), inliers
     q, w, limit = q[enough], w[enough], limit[enough]
-    turned, moved = _hypotheses(x, q, K, w, order)
-    turned = torch.cat([turned, given[enough, None, :, :3]], dim=1)
-    moved = torch.cat([moved, given[enough, None, :, 3]], dim=1)
+    rotations, translations = _hypotheses(x, q, K, w, order)
+    rotations = torch.cat([rotations, guess[enough, None, :, :3]], dim=1)
+    translations = torch.cat([translations, guess[enough, None, :, 3]], dim=1)
     row = torch.arange(len(q), device=q.device)[:, None]
-    if turned.shape[1] > _KEPT:
+    if rotations.shape[1] > _CANDIDATES:
         # Single precision is enough to tell which are worth more work.
-        rough = _scores(x.float(), q.float(), K.float(), w.float(), turned.float(), moved.float(), limit.float())
-        kept = rough.topk(_KEPT, dim=1, largest=False).indices
-        turned, moved = turned[row, kept], moved[row, kept]
-    turned, moved = _refined(x, q, K, w, turned, moved, limit)
-    best = _scores(x, q, K, w, turned, moved, limit).argmin(1)
-    turned, moved = turned[row[:, 0], best], moved[row[:, 0], best]
-    squared = _squared(x, q, K, turned[:, None], moved[:, None])[:, 0]
+        rough = _scores(
+            x.float(), q.float(), K.float(), w.float(), rotations.float(), translations.float(), limit.float()
+        )
+        kept = rough.topk(_CANDIDATES, dim=1, largest=False).indices
+        rotations, translations = rotations[row, kept], translations[row, kept]
+    rotations, translations = _refined(x, q, K, w, rotations, translations, limit)
+    best = _scores(x, q, K, w, rotations, translations, limit).argmin(1)
+    rotations, translations = rotations[row[:, 0], best], translations[row[:, 0], best]
+    squared = _squared(x, q, K, rotations[:, None], translations[:, None])[:, 0]
     agreed = (squared * w < limit[:, None].square()) & (w > 0)
-    found = agreed.sum(1) >= _FEWEST
-    share = torch.where(agreed, w, 0.0)
-    error = (torch.where(agreed, squared * w, 0.0).sum(1) / share.sum(1)).sqrt()
-    rotation[enough] = torch.where(found[:, None, None], turned, torch.nan)
-    translation[enough] = torch.where(found[:, None], moved, torch.nan)
+    found = agreed.sum(1) >= _MIN_POINTS
+    weight = torch.where(agreed, w, 0.0)
+    error = (torch.where(agreed, squared * w, 0.0).sum(1) / weight.sum(1)).sqrt()
+    rotation[enough] = torch.where(found[:, None, None], rotations, torch.nan)
+    translation[enough] = torch.where(found[:, None], translations, torch.nan)
     errors[enough] = torch.where(found, error, torch.nan)
     inliers[enough] = agreed & found[:, None]
     return Pose(rotation, translation, errors), inliers
 
 
 def _hypotheses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations (B,4S,3,3) and translations (B,4S,3) from S threes of points."""
+    """Rotations (B,4S,3,3) and translations (B,4S,3) from S triples of points."""
     if not len(order):
         return q.new_zeros(len(q), 0, 3, 3), q.new_zeros(len(q), 0, 3)
     keys = torch.where((w > 0)[:, None], order, 2.0)
@@ -152,15 +154,16 @@ def _refined(
     shape = rotation.shape[:2]
     rotation, translation = rotation.clone(), translation.clone()
     before = torch.zeros(*shape, len(x), dtype=torch.bool, device=x.device)
-    for _ in range(_ROUNDS):
+    for _ in range(_REFINEMENTS):
         squared = _squared(x, q, K, rotation, translation)
         agreed = (squared * w[:, None] < limit[:, None, None].square()) & (w > 0)[:, None]
-        going = ((agreed.sum(-1) >= _FEWEST) & (agreed != before).any(-1)).nonzero(as_tuple=True)
+        going = ((agreed.sum(-1) >= _MIN_POINTS) & (agreed != before).any(-1)).nonzero(as_tuple=True)
         if not len(going[0]):
             break
         frame = going[0]
-        begin = Pose(rotation[going], translation[going], q.new_zeros(len(frame)))
-        pose = solve_pnp(x, q[frame], K, torch.where(agreed[going], w[frame], 0.0), begin)
+        used = torch.where(agreed[going], w[frame], 0.0)
+        points = torch.where((used > 0)[..., None], x, 0.0)
+        pose = refined_poses(points, q[frame], K.expand(len(frame), 3, 3), used, rotation[going], translation[going])
         rotation[going], translation[going] = pose.rotation, pose.translation
         before = agreed
     return rotation, translation
@@ -177,24 +180,24 @@ def _scores(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, transl
 def _squared(x: Tensor, q: Tensor, K: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
     """Squared errors (B,H,N), pixels; infinite behind the camera and where the pose is NaN."""
     # K [R|t] first: three products a point and hypothesis, not six.
-    moved = (K @ translation[..., None])[..., 0]
-    image = x @ (K @ rotation).transpose(-1, -2) + moved[..., None, :]
+    offset = (K @ translation[..., None])[..., 0]
+    image = x @ (K @ rotation).transpose(-1, -2) + offset[..., None, :]
     depth = image[..., 2]
-    near = _NEAREST * (x - x.mean(0)).norm(dim=-1).amax()
+    near = _MIN_DEPTH * (x - x.mean(0)).norm(dim=-1).amax()
     u, v = image[..., 0] / depth - q[:, None, :, 0], image[..., 1] / depth - q[:, None, :, 1]
     return torch.where(depth > near, u * u + v * v, torch.inf).nan_to_num(torch.inf)
 
 
-def _given(start: Pose | None, q: Tensor) -> Tensor:
+def _guesses(initial: Pose | None, q: Tensor) -> Tensor:
     frames = len(q)
-    if start is None:
+    if initial is None:
         return q.new_full((frames, 3, 4), torch.nan)
-    if start.rotation.shape != (frames, 3, 3) or start.translation.shape != (frames, 3):
+    if initial.rotation.shape != (frames, 3, 3) or initial.translation.shape != (frames, 3):
         raise ShapeError(
-            f"start: found rotation {tuple(start.rotation.shape)} and translation {tuple(start.translation.shape)}, "
-            f"expected ({frames},3,3) and ({frames},3)"
+            f"initial: found rotation {tuple(initial.rotation.shape)} and translation "
+            f"{tuple(initial.translation.shape)}, expected ({frames},3,3) and ({frames},3)"
         )
-    return torch.cat([start.rotation.detach().double(), start.translation.detach().double()[..., None]], dim=-1)
+    return torch.cat([initial.rotation.detach().double(), initial.translation.detach().double()[..., None]], dim=-1)
 
 
 def _limits(threshold: float | Tensor, q: Tensor, hypotheses: int) -> Tensor:
@@ -216,8 +219,8 @@ def _checked(
             f"robust_pnp: found points {tuple(points.shape)} and pixels {tuple(pixels.shape)}, "
             "expected (N,3) and (B,N,2)"
         )
-    if len(points) < _FEWEST:
-        raise ShapeError(f"robust_pnp: found {len(points)} points, expected at least {_FEWEST}")
+    if len(points) < _MIN_POINTS:
+        raise ShapeError(f"robust_pnp: found {len(points)} points, expected at least {_MIN_POINTS}")
     if intrinsics.shape != (3, 3):
         raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
     q = pixels.detach().double()

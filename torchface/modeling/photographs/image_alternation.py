@@ -35,8 +35,8 @@ def alternate(problem: Problem, state: State, rounds: int = 40) -> State:
         if problem.settings.sliding:
             state = replace(state, rows=chosen_points(problem.points, state.coefficients, state.views))
         views = state.views
-        start = Pose(views.rotation, views.translation, torch.zeros(len(views.rotation)))
-        pose = solve_pnp(at[state.rows], problem.found, views.intrinsics, weights, start)
+        initial = Pose(views.rotation, views.translation, torch.zeros(len(views.rotation)))
+        pose = solve_pnp(at[state.rows], problem.found, views.intrinsics, weights, initial)
         views = Views(views.intrinsics, pose.rotation, pose.translation)
         for free in (groups, ~groups):
             picked = problem.points.picked(state.rows)
