@@ -1,20 +1,24 @@
-"""The triangle mesh with seams, quads and annotations that everything else speaks of."""
+"""The triangle mesh with seams, quads and annotations that the whole toolkit works on."""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """What is known of a mesh's vertices beyond where they are; travels in glTF extras.
+    """Landmarks, regions and symmetry of a mesh's vertices; travels in glTF extras.
 
     Args:
         landmarks: vertex ids of the 68 iBUG landmarks (or another set), (L,) int64.
@@ -111,10 +115,34 @@ class Mesh:
         return replace(self, **moved)
 
     def with_vertices(self, vertices: Tensor) -> Mesh:
-        """The same topology, skin and annotations at other positions (V,3)."""
+        """The same topology, texture, colours and annotations at other positions (V,3)."""
         if vertices.shape != self.vertices.shape:
             raise ShapeError(f"vertices: found {tuple(vertices.shape)}, expected {tuple(self.vertices.shape)}")
         return replace(self, vertices=vertices)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The mesh for ``trimesh``, in the same millimetres and axes, vertices unmerged and in order.
+
+        ``trimesh`` has one texture coordinate a vertex: where texture coordinates have seams, vertices are split, and
+        ``vertex_attributes["vertex_id"]`` says which vertex each was, so that :meth:`from_trimesh` joins them again.
+        Lost are polygons (faces are their triangles) and annotations. Colours and texture have 8 bits a channel;
+        beside texture coordinates colours are in ``vertex_attributes["color"]``, since ``trimesh`` shows one or the
+        other.
+        """
+        return to_trimesh(self.vertices, self.faces, self.uvs, self.uv_faces, self.colors, self.texture)
+
+    @staticmethod
+    def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
+        """The mesh of a ``trimesh.Trimesh`` in millimetres, y up, with its texture coordinates, image and colours.
+
+        Vertices keep their order; those that :meth:`to_trimesh` split at seams are joined again, unless they have
+        been moved apart. Colours of faces become the mean of a vertex's faces; opacity is lost.
+
+        Raises:
+            ShapeError: not a ``Trimesh``; of a ``trimesh.Scene`` take ``scene.to_geometry()``.
+            ValueRangeError: a position is NaN or infinite.
+        """
+        return Mesh(**from_trimesh(mesh))
 
     @property
     def landmarks(self) -> Tensor:

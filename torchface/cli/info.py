@@ -17,7 +17,7 @@ def info(
     """Say what a file holds: a rig, mesh, take, attachment or solver.
 
     Args:
-        path: A .glb, .obj, .ply, .stl, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's folder.
+        path: A .glb, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's folder.
         attachment: Report which shapes of the rig these markers tell apart.
         part: Look at this region of the rig only, such as face.
     """

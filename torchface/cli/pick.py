@@ -30,7 +30,7 @@ def pick(
     open it. Needs the extra: pip install '.[viewer]' in a checkout.
 
     Args:
-        mesh: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        mesh: A mesh or rig: .glb, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         scan: A mesh to find the same places on: click on the head, then on the scan.
         out: The folder to save into.
         mode: What to pick first; the page can change it.

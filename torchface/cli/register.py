@@ -37,8 +37,9 @@ def register(
     was; a scan whose files have changed is registered anew.
 
     Args:
-        template: A mesh or rig: .glb, .obj, .ply, .stl, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        scans: Files (.obj, .ply, .stl, .glb, .gltf), or folders of them.
+        template: A mesh or rig: .glb, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel
+            folder.
+        scans: Files (.obj, .ply, .stl, .off, .glb, .gltf), or folders of them.
         out: The folder to write into.
         landmarks: Folder of landmark files named as the scans are: .ljson, .pts or .json in the order of the
             template's annotated landmarks, or correspondences saved by `torchface pick`.

@@ -35,7 +35,7 @@ def rig(
     The neutral scan gives the actor's face in the template's topology, deformation transfer its shapes. Scans of
     expressions make the shapes the actor's own; high-resolution scans give normal maps for wrinkles.
 
-    EXAMPLES holds scans (.obj, .ply, .stl, .glb, .gltf). Each file's name says roughly what it shows, as in
+    EXAMPLES holds scans (.obj, .ply, .stl, .off, .glb, .gltf). Each file's name says roughly what it shows, as in
     jawOpen.obj or jawOpen=0.6+mouthSmileLeft=0.5.obj; or a file weights.csv in the folder does, with the header
     scan,<shape>,... and a row for each file. Landmark files of the same names (.ljson, .pts, .json) may lie beside the
     scans. DETAIL holds one scan a shape at full strength, named for it, and neutral.obj (or another format).

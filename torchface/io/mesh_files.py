@@ -1,4 +1,4 @@
-"""Meshes by path: OBJ, PLY, STL, glTF."""
+"""Meshes by path: OBJ, PLY, STL, OFF, glTF."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from pathlib import Path
 from torchface.errors import FileFormatError
 from torchface.io.gltf import read_gltf_mesh, save_gltf_mesh
 from torchface.io.meshes.obj import read_obj, write_obj
+from torchface.io.meshes.off import read_off, write_off
 from torchface.io.meshes.ply import read_ply, write_ply
 from torchface.io.meshes.stl import read_stl, write_stl
 from torchface.mesh import Mesh
 
-_READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl}
-_WRITERS = {".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".glb": save_gltf_mesh}
+_READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}
+_WRITERS = {".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".off": write_off, ".glb": save_gltf_mesh}
 _GLTF = (".glb", ".gltf")
 
 
@@ -20,9 +21,9 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """A mesh in millimetres.
 
     Args:
-        path: ``.obj`` (polygons, seams, vertex colours, the material's picture), ``.ply`` (polygons, vertex colours),
-            ``.stl`` (triangles, equal corners welded), ``.glb`` or ``.gltf`` (the whole scene, morph targets at rest).
-            Vertices keep the file's order.
+        path: ``.obj`` (polygons, seams, vertex colours, the material's image), ``.ply`` (polygons, vertex colours),
+            ``.stl`` (triangles, equal corners merged), ``.off`` (triangles), ``.glb`` or ``.gltf`` (the whole
+            scene, morph targets at rest). Vertices keep the file's order.
         unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, millimetres for the others.
 
     Raises:
@@ -40,10 +41,10 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Writes a mesh: ``.obj``, ``.ply`` and ``.stl`` in millimetres, ``.glb`` in metres.
+    """Writes a mesh: ``.obj``, ``.ply``, ``.stl`` and ``.off`` in millimetres, ``.glb`` in metres.
 
     OBJ keeps polygons, seams and colours and puts the texture beside itself; ``.glb`` keeps all and the annotations;
-    PLY keeps polygons and colours, STL triangles. The file appears only when it is complete.
+    PLY keeps polygons and colours, STL and OFF triangles. The file appears only when it is complete.
 
     Raises:
         FileFormatError: another suffix, or the folder cannot be written to.

@@ -53,7 +53,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return rows
     if attachment is not None:
         raise FileFormatError(f"{path}: found no rig, expected one to say what the markers of {attachment} tell apart")
-    if suffix in {".obj", ".ply", ".stl"}:
+    if suffix in {".obj", ".ply", ".stl", ".off"}:
         return _mesh_rows(load_mesh(path))
     if suffix in {".c3d", ".trc", ".csv"}:
         return _take_rows(load_take(path))
@@ -62,7 +62,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     if suffix == ".onnx":
         return _graph_rows(path)
     raise FileFormatError(
-        f"{path}: found the ending {suffix!r}, expected .glb .obj .ply .stl .c3d .trc .csv .json .onnx"
+        f"{path}: found the ending {suffix!r}, expected .glb .obj .ply .stl .off .c3d .trc .csv .json .onnx"
     )
 
 

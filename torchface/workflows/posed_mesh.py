@@ -15,7 +15,7 @@ from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.shape_names import mapping
 
-_MESH_ONLY = {".obj", ".ply", ".stl"}
+_MESH_ONLY = {".obj", ".ply", ".stl", ".off"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from torchface.io import load_detail_maps, load_mesh
 from torchface.mesh import Annotations, Mesh
 from torchface.viz.browser.colored_pieces import split_parts, triangle_texture
 from torchface.viz.browser.html_lists import pick_list, shape_list
-from torchface.viz.browser.textured_head import Skin
+from torchface.viz.browser.textured_head import TexturedHead
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -55,13 +55,13 @@ def test_regions_give_colours_and_clear_shells_are_left_out(two_balls: Mesh) -> 
     assert len(split_parts(shell)) == 1
 
 
-def test_the_skin_is_a_glb_that_another_reader_opens(two_balls: Mesh, tmp_path) -> None:
+def test_the_textured_head_is_a_glb_that_another_reader_opens(two_balls: Mesh, tmp_path) -> None:
     mesh = painted(two_balls)
     moved = mesh.vertices + torch.tensor([0.0, 5.0, 0.0])
-    path = tmp_path / "skin.glb"
-    path.write_bytes(Skin(mesh).glb(moved))
+    path = tmp_path / "head.glb"
+    path.write_bytes(TexturedHead(mesh).glb(moved))
     found = trimesh.load(path, force="mesh", process=False)
-    corners = torch.tensor(found.vertices[found.faces], dtype=torch.float32)
+    corners = torch.tensor(1000 * found.vertices[found.faces], dtype=torch.float32)
     torch.testing.assert_close(corners, moved[mesh.faces])
     pixels = found.visual.material.baseColorTexture
     assert pixels.size == (64, 64)
@@ -69,25 +69,25 @@ def test_the_skin_is_a_glb_that_another_reader_opens(two_balls: Mesh, tmp_path) 
     torch.testing.assert_close(uvs, mesh.uvs[mesh.uv_faces])
 
 
-def test_vertex_colours_come_back_from_the_skin(two_balls: Mesh, tmp_path) -> None:
+def test_vertex_colours_come_back_from_the_textured_head(two_balls: Mesh, tmp_path) -> None:
     colors = torch.rand(len(two_balls.vertices), 3, generator=torch.Generator().manual_seed(0))
-    path = tmp_path / "skin.glb"
-    path.write_bytes(Skin(replace(two_balls, colors=colors)).glb(two_balls.vertices))
-    found = load_mesh(path, unit="mm")
+    path = tmp_path / "head.glb"
+    path.write_bytes(TexturedHead(replace(two_balls, colors=colors)).glb(two_balls.vertices))
+    found = load_mesh(path)
     corners = two_balls.faces[:, :1]
     torch.testing.assert_close(found.colors[found.faces[:, :1]], colors[corners], atol=1e-5, rtol=0)
 
 
-def test_wrinkles_are_the_skins_normal_texture(two_balls: Mesh, tmp_path) -> None:
+def test_wrinkles_are_the_normal_texture(two_balls: Mesh, tmp_path) -> None:
     mesh = painted(two_balls)
     direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.4, 1.0]), dim=0)
-    path = tmp_path / "skin.glb"
-    path.write_bytes(Skin(mesh).glb(mesh.vertices, direction[:, None, None].expand(3, 32, 32)))
+    path = tmp_path / "head.glb"
+    path.write_bytes(TexturedHead(mesh).glb(mesh.vertices, direction[:, None, None].expand(3, 32, 32)))
     found = load_detail_maps(path)
     assert found.names == ()
     assert found.neutral.shape == (3, 32, 32)
     assert (found.neutral - direction[:, None, None]).abs().max() < 0.01  # eight bits
-    path.write_bytes(Skin(mesh).glb(mesh.vertices))
+    path.write_bytes(TexturedHead(mesh).glb(mesh.vertices))
     assert load_detail_maps(path) is None
 
 

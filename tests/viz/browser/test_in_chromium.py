@@ -146,14 +146,14 @@ def test_play_moves_the_mesh_along_the_take(chromium: Any, viewer: RigViewer) ->
     until(lambda: thumb(chromium, "Frame").get_attribute("aria-valuenow") == str(viewer.editor.frame))
 
 
-def test_the_skin_comes_off_in_motion_and_back_on_at_rest(chromium: Any, ball_rig: BlendshapeRig) -> None:
+def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_rig: BlendshapeRig) -> None:
     mesh = ball_rig.neutral
     colors = (mesh.vertices - mesh.vertices.amin(0)) / (mesh.vertices.amax(0) - mesh.vertices.amin(0))
     rig = BlendshapeRig(replace(mesh, colors=colors), ball_rig.deltas, ball_rig.names)
     opened = RigViewer(rig, port=0)
     try:
         chromium.get(opened.url)
-        visible = "return (n => n ? n.visible : null)(window.__viserMutable?.nodeRefFromName['/head/skin'])"
+        visible = "return (n => n ? n.visible : null)(window.__viserMutable?.nodeRefFromName['/head/textured'])"
         until(lambda: chromium.execute_script(visible) is True)
 
         def dragged_bare() -> bool:
@@ -163,8 +163,8 @@ def test_the_skin_comes_off_in_motion_and_back_on_at_rest(chromium: Any, ball_ri
         until(dragged_bare)
         expected = opened.rig(opened.editor.pose[None])[0]
         until(lambda: chromium.execute_script(visible) is True)
-        until(lambda: (shown(chromium, "/head/skin")[1] - expected).abs().max() < 1e-3)
-        opened.head.wear_skin(False)
+        until(lambda: (1000 * shown(chromium, "/head/textured")[1] - expected).abs().max() < 1e-3)
+        opened.head.enable_texture(False)
         until(lambda: chromium.execute_script(visible) is False)
     finally:
         chromium.get("about:blank")

@@ -44,7 +44,7 @@ def shoot(chromium: Any, rig: BlendshapeRig, path: Path) -> None:
         end = time.monotonic() + 60
         while not chromium.execute_script(drawn) and time.monotonic() < end:
             time.sleep(0.2)
-        time.sleep(6)  # the skin goes on at rest, and a software renderer takes its time
+        time.sleep(6)  # the texture is shown at rest, and a software renderer takes its time
         chromium.execute_script(_CLOSE)
         time.sleep(2)
         picture = Image.open(io.BytesIO(chromium.get_screenshot_as_png())).convert("RGB")

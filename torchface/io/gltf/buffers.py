@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_LINEAR, _LINEAR_MIPMAPS = 9729, 9987
 _COMPONENT = {"<u2": 5123, "<u4": 5125, "<f4": 5126}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
@@ -34,6 +35,15 @@ class BufferWriter:
         self._pieces.append(padded)
         self._size += len(padded)
         return len(self.views) - 1
+
+    def texture(self, root: dict[str, Any], image: bytes, kind: str = "image/png", name: str | None = None) -> int:
+        """The index of a texture of an encoded image, which is added to a document under construction."""
+        images, textures = root.setdefault("images", []), root.setdefault("textures", [])
+        root.setdefault("samplers", [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS}])
+        named = {} if name is None else {"name": name}
+        images.append({"bufferView": self.view(image), "mimeType": kind, **named})
+        textures.append({"source": len(images) - 1, "sampler": 0})
+        return len(textures) - 1
 
     def vertices(self, rows: NDArray[np.float32]) -> int:
         """An accessor of one row (D,) a vertex, with its bounds."""

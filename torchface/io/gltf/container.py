@@ -13,7 +13,8 @@ from typing import Any
 from urllib.parse import unquote
 
 from torchface.errors import FileFormatError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.whole_files import read_file
+from torchface.io.gltf.buffers import BufferWriter
 
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _LARGEST_JSON = 2**26
@@ -212,19 +213,32 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
     return text, memoryview(b"") if binary is None else binary
 
 
-def write_document(path: str | Path, root: dict[str, Any], binary: bytes) -> None:
-    """Writes a ``.glb``; the one buffer's length is filled in.
+def glb_bytes(root: dict[str, Any], buffers: BufferWriter, source: str | Path = "glTF") -> bytes:
+    """A ``.glb`` of one scene whose root is the first node.
+
+    Args:
+        root: nodes, meshes, materials and what else the document has.
+        buffers: of its accessors.
+        source: names it in errors.
 
     Raises:
-        FileFormatError: it would pass the format's 4 GB, or the folder cannot be written to.
+        FileFormatError: it would pass the format's 4 GB.
     """
-    root = {**root, "buffers": [{"byteLength": len(binary)}]} if binary else root
+    binary = buffers.data
+    root = {
+        "asset": {"version": "2.0", "generator": "torchface"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        **root,
+        "accessors": buffers.accessors,
+        "bufferViews": buffers.views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
     text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
-    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
-    if binary:
-        chunks += struct.pack("<II", len(binary), _BINARY_CHUNK) + binary
-    if 12 + len(chunks) >= 2**32:
-        raise FileFormatError(f"{path}: would take {len(chunks)} bytes, expected less than 4 GB for a .glb")
-    write_file(path, _MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+    size = 12 + 8 + len(text) + 8 + len(binary)
+    if size >= 2**32:
+        raise FileFormatError(f"{source}: would take {size} bytes, expected less than 4 GB for a .glb")
+    head = _MAGIC + struct.pack("<II", 2, size) + struct.pack("<II", len(text), _JSON_CHUNK)
+    return b"".join([head, text, struct.pack("<II", len(binary), _BINARY_CHUNK), binary])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
 from torchface.io.gltf.primitives import Part, read_part
@@ -135,13 +136,9 @@ def _texture_coordinates(
     """Each pair of vertex and coordinate once: what was split at the border of two primitives is no seam."""
     used = np.unique(triangles)
     keys = np.column_stack([vertex_of[used], (uvs[used] + np.float32(0)).view(np.int32)])
-    _, row_of, pair_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(row_of)
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
     row = np.zeros(len(uvs), np.int64)
-    row[used] = rank[pair_of.reshape(-1)]
-    return torch.from_numpy(uvs[used][row_of[order]]), torch.from_numpy(row[triangles])
+    row[used], first = merge_equal_rows(keys)
+    return torch.from_numpy(uvs[used][first]), torch.from_numpy(row[triangles])
 
 
 def _moved(

@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
+from torchface.files.whole_files import write_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.container import write_document
+from torchface.io.gltf.container import glb_bytes
 from torchface.io.gltf.material_writing import MaterialWriter
 from torchface.io.gltf.mesh_extras import write_extras, write_order
 from torchface.io.gltf.part_colors.eyes import eye_centre
 from torchface.io.gltf.part_colors.surfaces import surfaces
-from torchface.io.gltf.primitive_writing import PrimitiveWriter, metres, split_at_seams
+from torchface.io.gltf.primitive_writing import PrimitiveWriter, metres
 from torchface.io.gltf.wrinkle_maps import corner_tangents, write_detail
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
@@ -124,7 +126,9 @@ def _write(
         raise TopologyError(f"{path}: the mesh has no triangle; glTF needs one")
     mesh, buffers = mesh.to("cpu"), BufferWriter()
     tangents = None if detail is None or detail.neutral is None else corner_tangents(mesh)
-    split = split_at_seams(mesh, None if tangents is None else tangents[..., 3] < 0)
+    mirrored = None if tangents is None else tangents[..., 3] < 0
+    uv_faces = None if mesh.uv_faces is None else mesh.uv_faces.numpy()
+    split = split_at_seams(len(mesh.vertices), mesh.faces.numpy(), uv_faces, mirrored)
     writer, materials = PrimitiveWriter(mesh, split, buffers, tangents), MaterialWriter(mesh, buffers)
     parts = surfaces(mesh, mesh.texture is not None or detail is not None)
     if all(surface.part is not None for surface in parts):  # nothing but eyeballs: none is another's child
@@ -152,9 +156,6 @@ def _write(
     if len(nodes) > 1:
         nodes[0]["children"] = list(range(1, len(nodes)))
     root: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "torchface"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
         "nodes": nodes,
         "meshes": meshes,
         **materials.fields,
@@ -163,8 +164,7 @@ def _write(
         write_detail(detail, mesh, names, root, buffers)
     if keys is not None:
         root["animations"] = [_animation(*keys, len(nodes), buffers)]
-    root |= {"accessors": buffers.accessors, "bufferViews": buffers.views}
-    write_document(path, root, buffers.data)
+    write_file(path, glb_bytes(root, buffers, path))
 
 
 def _animation(times: Tensor, weights: Tensor, nodes: int, buffers: BufferWriter) -> dict[str, Any]:

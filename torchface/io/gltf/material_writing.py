@@ -15,8 +15,6 @@ from torchface.io.gltf.region_materials import SKIN
 from torchface.io.images.image_files import encode_png
 from torchface.mesh import Mesh
 
-_LINEAR, _MIPMAPS = 9729, 9987
-
 
 class MaterialWriter:
     """Collects the materials of one mesh; ``fields`` is what the document gets of them.
@@ -35,13 +33,13 @@ class MaterialWriter:
         """The index of the material of a primitive."""
         look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": surface.material.roughness}
         material: dict[str, Any] = {"name": surface.material.name, "doubleSided": True}
-        if surface.worn == "texture":
+        if surface.color_source == "texture":
             assert self.mesh.texture is not None
             look["baseColorTexture"] = {"index": self._texture(self.mesh.texture, "skin")}
         elif surface.paint is not None and surface.paint.image is not None:
             name = f"{surface.part}_{surface.material.name}" if surface.part else surface.material.name
             look["baseColorTexture"] = {"index": self._texture(surface.paint.image, name)}
-        elif surface.worn == "material" and surface.paint is None:
+        elif surface.color_source == "material" and surface.paint is None:
             look["baseColorFactor"] = [*self._plain(surface), surface.material.opacity]
         if surface.material.alpha != "OPAQUE":
             material["alphaMode"] = surface.material.alpha
@@ -61,10 +59,5 @@ class MaterialWriter:
 
     def _texture(self, image: Tensor, name: str) -> int:
         if id(image) not in self._textures:
-            view = self.buffers.view(encode_png(image))
-            images, textures = self.fields.setdefault("images", []), self.fields.setdefault("textures", [])
-            self.fields.setdefault("samplers", [{"magFilter": _LINEAR, "minFilter": _MIPMAPS}])
-            images.append({"bufferView": view, "mimeType": "image/png", "name": name})
-            textures.append({"source": len(images) - 1, "sampler": 0})
-            self._textures[id(image)] = len(textures) - 1
+            self._textures[id(image)] = self.buffers.texture(self.fields, encode_png(image), name=name)
         return self._textures[id(image)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from torchface.color_space import to_linear
 from torchface.geometry.meshes.operators import vertex_normals
+from torchface.geometry.meshes.uv_seams import Split
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.part_colors.surfaces import Surface
 from torchface.io.length_units import millimetres_per
@@ -22,41 +22,6 @@ STILL = 1e-4
 STEADY = 1 / 256
 """A normal that a shape turns less than this, in radians, is written as unturned: no light of 8 bits shows it."""
 _LARGEST_EXACT_ID = 2**24
-
-
-@dataclass(frozen=True)
-class Split:
-    """One row for each pair of vertex and texture coordinate that occurs, in the order of the coordinates.
-
-    Args:
-        vertex_of: the vertex of each, (C,); those that no face has come last.
-        uv_of: its row of ``uvs``, (C,); none without texture coordinates.
-        triangles: the mesh's, into these rows, (F,3).
-    """
-
-    vertex_of: NDArray[np.int64]
-    uv_of: NDArray[np.int64] | None
-    triangles: NDArray[np.int64]
-
-
-def split_at_seams(mesh: Mesh, mirrored: NDArray[np.bool_] | None = None) -> Split:
-    """Vertices as glTF wants them, with one texture coordinate each.
-
-    Args:
-        mesh: the mesh.
-        mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
-    """
-    count = len(mesh.vertices)
-    faces = mesh.faces.numpy()
-    if mesh.uvs is None or mesh.uv_faces is None:
-        return Split(np.arange(count), None, faces)
-    keys = mesh.uv_faces.numpy() * count + faces
-    sided = keys * 2 if mirrored is None else keys * 2 + mirrored
-    pairs, triangles = np.unique(sided, return_inverse=True)
-    vertex_of, uv_of = pairs // 2 % count, pairs // 2 // count
-    loose = np.setdiff1d(np.arange(count), vertex_of)
-    vertex_of, uv_of = np.append(vertex_of, loose), np.append(uv_of, np.zeros_like(loose))
-    return Split(vertex_of, uv_of, triangles.reshape(-1, 3))
 
 
 class PrimitiveWriter:
@@ -135,7 +100,7 @@ class PrimitiveWriter:
         if mesh.colors is not None:
             light = to_linear(mesh.colors.detach().float().clamp(0, 1)).numpy()[vertices]
             # Beside a texture COLOR_0 would be multiplied with it; under this name viewers leave it alone.
-            attributes["COLOR_0" if surface.worn == "colors" else "_COLOR"] = buffers.vertices(light)
+            attributes["COLOR_0" if surface.color_source == "colors" else "_COLOR"] = buffers.vertices(light)
         if surface.paint is not None and surface.paint.colors is not None:
             painted = surface.paint.colors[vertices]
             light = torch.cat([to_linear(painted[:, :3]), painted[:, 3:]], dim=1).numpy()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.primitives import Part
 
 
@@ -47,10 +48,5 @@ def _by_id(part: Part, ids: NDArray[np.int64]) -> Weld | None:
 def _by_position(part: Part) -> Weld:
     """Vertices numbered by first appearance; lips that touch at rest stay apart because they move differently."""
     rows = np.concatenate([part.positions[None], part.deltas]).transpose(1, 0, 2).reshape(len(part.positions), -1)
-    rows = np.ascontiguousarray(rows + np.float32(0))  # so that -0 equals 0 byte by byte
-    keys = rows.view([("", np.void, rows.shape[1] * 4)]).reshape(-1)
-    _, row_of, vertex_of = np.unique(keys, return_index=True, return_inverse=True)
-    order = np.argsort(row_of)
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    return Weld(rank[vertex_of.reshape(-1)], row_of[order], False)
+    vertex_of, row_of = merge_equal_rows(rows)
+    return Weld(vertex_of, row_of, False)

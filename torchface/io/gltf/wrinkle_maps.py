@@ -47,11 +47,14 @@ def write_detail(
     if missing:
         raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
     if detail.neutral is not None:
-        texture = _add_texture(detail.neutral, "neutral_normals", root, buffers)
-        root["materials"][0]["normalTexture"] = {"index": texture}
+        image = encode_png(encode_normals(detail.neutral))
+        root["materials"][0]["normalTexture"] = {"index": buffers.texture(root, image, name="neutral_normals")}
     listed = [
-        {"shape": name, "texture": _add_texture(one, f"{name}_normals", root, buffers)}
-        for name, one in zip(detail.names, detail.maps, strict=True)
+        {
+            "shape": name,
+            "texture": buffers.texture(root, encode_png(encode_normals(normals)), name=f"{name}_normals"),
+        }
+        for name, normals in zip(detail.names, detail.maps, strict=True)
     ]
     root["meshes"][0]["extras"]["torchface"][_LIST] = listed
 
@@ -69,15 +72,6 @@ def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
     space = tangent_space(points, faces, mesh.uvs.detach().cpu().double(), mesh.uv_faces.cpu(), normals)
     rows = torch.cat([space.tangents, space.signs[:, None]], dim=1)[space.tangent_faces]
     return rows.float().numpy()
-
-
-def _add_texture(normals: Tensor, name: str, root: dict[str, Any], buffers: BufferWriter) -> int:
-    view = buffers.view(encode_png(encode_normals(normals)))
-    images, textures = root.setdefault("images", []), root.setdefault("textures", [])
-    root.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987}])
-    images.append({"bufferView": view, "mimeType": "image/png", "name": name})
-    textures.append({"source": len(images) - 1, "sampler": 0})
-    return len(textures) - 1
 
 
 def load_detail_maps(path: str | Path) -> DetailMaps | None:

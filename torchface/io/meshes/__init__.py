@@ -1,1 +1,1 @@
-"""Mesh files: OBJ, PLY, STL, and many meshes of one topology."""
+"""Mesh files: OBJ, PLY, STL, OFF, and many meshes of one topology."""

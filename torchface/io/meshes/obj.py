@@ -83,8 +83,8 @@ def face_bytes(data: bytes) -> bytes | None:
     return None if start < 0 else data[start:]
 
 
-def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
-    """Writes polygons (or triangles), seams and vertex colours; a texture goes beside it as PNG with a material.
+def write_obj(mesh: Mesh, path: str | Path) -> None:
+    """Writes polygons (or triangles), seams and vertex colours, in millimetres; a texture beside it, with a material.
 
     Raises:
         FileFormatError: the folder cannot be written to.
@@ -94,33 +94,32 @@ def write_obj(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
         write_file(path.with_suffix(".png"), encode_png(mesh.texture))
         write_file(path.with_suffix(".mtl"), f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n".encode())
     colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
-    rows = _vertex_lines(mesh.vertices, unit, colors)
+    rows = _vertex_lines(mesh.vertices, colors)
     write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))
 
 
-def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path, unit: str = "mm") -> None:
+def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path) -> None:
     """Writes shapes of a mesh beside its own file, with the same faces and material.
 
     Args:
         mesh: the neutral, as ``write_obj`` wrote it.
         shapes: the name and the vertices (V,3) of each; its file is called so.
         neutral: the mesh's own file.
-        unit: of the files.
 
     Raises:
         FileFormatError: the folder cannot be written to.
     """
     surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
-    for name, vertices in shapes:  # a file a turn
-        write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices, unit) + surface)
+    for name, vertices in shapes:  # a file each
+        write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices) + surface)
 
 
 def _material_line(mesh: Mesh, path: Path) -> bytes:
     return b"" if mesh.texture is None else f"mtllib {path.stem}.mtl\n".encode()
 
 
-def _vertex_lines(vertices: Tensor, unit: str, colors: NDArray[np.float64] | None = None) -> bytes:
-    positions = (vertices.detach().cpu().double() / millimetres_per(unit)).numpy()
+def _vertex_lines(vertices: Tensor, colors: NDArray[np.float64] | None = None) -> bytes:
+    positions = vertices.detach().cpu().double().numpy()
     columns = positions if colors is None else np.hstack([positions, colors])
     row = "v " + " ".join(["%.9g"] * columns.shape[1])
     return "".join([row % tuple(values) + "\n" for values in columns.tolist()]).encode()

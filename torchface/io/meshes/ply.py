@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.ply_tables import Element, Lists, read_tables
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, fan_triangulation
 
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _UV_NAMES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
@@ -43,31 +42,25 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
     if lists.sizes.min() < 3:
         raise FileFormatError(f"{path}: found a face of {int(lists.sizes.min())} corners, expected at least 3")
     corners = lists.values
-    if not (corners.min() >= 0 and corners.max() < len(vertices)):
+    if not (corners.min() >= 0 and corners.max() < len(vertices) and (corners.astype(np.int64) == corners).all()):
         raise TopologyError(
-            f"{path}: found faces with vertex {corners.min():.0f} to {corners.max():.0f}, "
-            f"expected 0 to {len(vertices) - 1}"
+            f"{path}: found faces with vertex {corners.min():g} to {corners.max():g}, "
+            f"expected 0 to {len(vertices) - 1}, whole numbers"
         )
     polygons = pad_polygons(str(path), lists.sizes, corners.astype(np.int64))
-    mesh = Mesh.from_polygons(vertices, polygons, colors=_colors(path, columns, elements))
-    uvs = _uvs(path, columns)
-    return Mesh(
-        mesh.vertices,
-        mesh.faces,
-        None if uvs is None else torch.from_numpy(uvs),
-        None if uvs is None else mesh.faces,
-        mesh.colors,
-        polygons=None if polygons.shape[1] == 3 else polygons,
-    )
+    triangles = fan_triangulation(polygons)
+    uvs, colors = _uvs(path, columns), _colors(path, columns, elements)
+    authored = None if polygons.shape[1] == 3 else polygons
+    return Mesh(vertices, triangles, uvs, None if uvs is None else triangles, colors, polygons=authored)
 
 
-def write_ply(mesh: Mesh, path: str | Path, unit: str = "mm") -> None:
-    """Writes polygons (or triangles) and vertex colours, binary.
+def write_ply(mesh: Mesh, path: str | Path) -> None:
+    """Writes polygons (or triangles) and vertex colours, binary, in millimetres.
 
     Raises:
         FileFormatError: the folder cannot be written to.
     """
-    positions = (mesh.vertices.detach().cpu().double() / millimetres_per(unit)).numpy()
+    positions = mesh.vertices.detach().cpu().numpy()
     fields: list[tuple[str, str]] = [(axis, "<f4") for axis in "xyz"]
     if mesh.colors is not None:
         fields += [(name, "u1") for name in ("red", "green", "blue")]
@@ -105,12 +98,12 @@ def _colors(path: Path, columns: dict[str, Any], elements: list[Element]) -> tor
     return torch.from_numpy(coded.clip(0, 1).astype(np.float32))
 
 
-def _uvs(path: Path, columns: dict[str, Any]) -> NDArray[np.float32] | None:
+def _uvs(path: Path, columns: dict[str, Any]) -> torch.Tensor | None:
     for u, v in _UV_NAMES:
         if isinstance(columns.get(u), np.ndarray) and isinstance(columns.get(v), np.ndarray):
             with np.errstate(over="ignore"):
                 uvs = np.stack([columns[u], columns[v]], axis=1).astype(np.float32)
             if not np.isfinite(uvs).all():
                 raise FileFormatError(f"{path}: found NaN or infinity among the texture coordinates, expected numbers")
-            return uvs
+            return torch.from_numpy(uvs)
     return None

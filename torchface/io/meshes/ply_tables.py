@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,21 +39,23 @@ class Lists:
     """Rows of different lengths: ``sizes`` (P,) and all ``values`` in a line (C,)."""
 
     sizes: NDArray[np.int64]
-    values: NDArray[np.float64]
+    values: NDArray[Any]
 
 
 def read_tables(path: Path, data: bytes) -> tuple[dict[str, dict[str, Any]], list[Element]]:
-    """Every element's columns by name, arrays (P,) or ``Lists``, and the elements as the header tells them.
-
-    Of an element with lists the other columns are left out.
+    """Every element's columns by name, arrays (P,) or ``Lists``, and the elements as the header names them.
 
     Raises:
         FileFormatError: no PLY, another format, truncated, or text among the numbers.
     """
     elements, order, start = _header(path, data)
-    return (
-        _ascii(path, elements, data[start:]) if order == "" else _binary(path, elements, order, data, start)
-    ), elements
+    # A unit of the body is a byte where it is binary, a number where it is text.
+    body = _words(path, data[start:]) if order == "" else np.frombuffer(data, np.uint8, offset=start)
+    tables: dict[str, dict[str, Any]] = {}
+    at = 0
+    for element in elements:
+        tables[element.name], at = _columns(path, element, order, body, at) if element.count else ({}, at)
+    return tables, elements
 
 
 def _header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
@@ -87,139 +88,86 @@ def _header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
     return elements, order, newline + 1
 
 
+def _words(path: Path, body: bytes) -> NDArray[np.float64]:
+    try:
+        return np.array(list(map(float, body.split())), dtype=np.float64)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: found text among the numbers ({error})") from error
+
+
+def _columns(path: Path, element: Element, order: str, body: NDArray[Any], at: int) -> tuple[dict[str, Any], int]:
+    """The columns of an element that begins at unit ``at``, and where the next one begins."""
+    spans = _spans(path, element, order, body, at, 1)
+    row = int(spans[0, -1].sum()) - at
+    if row * element.count <= len(body) - at:
+        columns = _equal_rows(element, order, body[at : at + row * element.count].reshape(-1, row), spans[0] - [at, 0])
+        if columns is not None:
+            return columns, at + row * element.count
+    elif all(count is None for _, _, count in element.properties):
+        raise _truncated(path, element, len(body) - at, str(row * element.count))
+    spans = _spans(path, element, order, body, at, element.count)
+    columns = {}
+    for (name, kind, count), (starts, units) in zip(element.properties, spans.transpose(1, 2, 0), strict=True):
+        place = np.repeat(starts - (np.cumsum(units) - units), units) + np.arange(int(units.sum()))
+        values = _decode(body[place], order, kind)
+        columns[name] = values if count is None else Lists(units // _width(order, kind), values)
+    return columns, int(spans[-1, -1].sum())
+
+
+def _equal_rows(element: Element, order: str, rows: NDArray[Any], spans: NDArray[np.int64]) -> dict[str, Any] | None:
+    """The columns of rows (P,R) whose lists all have the lengths of the first row's; none where they do not."""
+    columns: dict[str, Any] = {}
+    for (name, kind, count), (start, units) in zip(element.properties, spans.tolist(), strict=True):
+        values = _decode(rows[:, start : start + units], order, kind).reshape(-1)
+        if count is None:
+            columns[name] = values
+            continue
+        size = units // _width(order, kind)
+        if (_decode(rows[:, start - _width(order, count) : start], order, count) != size).any():
+            return None
+        columns[name] = Lists(np.full(len(rows), size), values)
+    return columns
+
+
+def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int, rows: int) -> NDArray[np.int64]:
+    """First unit and number of units of every property in the first rows, (rows, properties, 2)."""
+    if element.count > len(body) - at:
+        raise _truncated(path, element, len(body) - at, f"at least {element.count}")
+    plan = [(_width(order, kind), count, _width(order, count or kind)) for _, kind, count in element.properties]
+    if any(count is not None and order and np.dtype(count).kind == "f" for _, count, _ in plan):
+        raise _truncated(path, element, len(body) - at, "an integer that tells a list's length")
+    found: list[tuple[int, int]] = []
+    for _ in range(rows):  # where a row begins is known only after the one before
+        for width, count, before in plan:
+            length = 1
+            if count is not None:
+                length = _length(body[at : at + before], order, count)
+                at += before
+            found.append((at, length * width))
+            at += length * width
+            if length < 0 or at > len(body):
+                raise _truncated(path, element, max(len(body) - found[-1][0], 0), f"a list of {length}")
+    return np.array(found, np.int64).reshape(rows, -1, 2)
+
+
+def _length(units: NDArray[Any], order: str, kind: str) -> int:
+    """The length of a list; -1 for none that can be."""
+    if order:
+        return int.from_bytes(units.tobytes(), "big" if order == ">" else "little", signed=kind[0] == "i")
+    value = float(units[0]) if len(units) else -1.0
+    return int(value) if value.is_integer() else -1
+
+
+def _width(order: str, kind: str) -> int:
+    return np.dtype(kind).itemsize if order else 1
+
+
+def _decode(units: NDArray[Any], order: str, kind: str) -> NDArray[Any]:
+    return np.ascontiguousarray(units).view(order + kind) if order else units
+
+
 def _truncated(path: Path, element: Element, found: int, wanted: str) -> FileFormatError:
     return FileFormatError(
         f"{path}: found {found} bytes or words (truncated) for {element.count} rows of {element.name!r}, "
         f"expected {wanted}"
     )
-
-
-def _binary(path: Path, elements: list[Element], order: str, data: bytes, at: int) -> dict[str, dict[str, Any]]:
-    tables: dict[str, dict[str, Any]] = {}
-    for element in elements:
-        if any(count is not None for _, _, count in element.properties):
-            tables[element.name], at = _binary_lists(path, element, order, data, at)
-            continue
-        dtype = np.dtype([(name, order + kind) for name, kind, _ in element.properties])
-        size = dtype.itemsize * element.count
-        if size > len(data) - at:
-            raise _truncated(path, element, len(data) - at, str(size))
-        rows = np.frombuffer(data, dtype, element.count, at)
-        tables[element.name] = {name: rows[name].astype(np.float64) for name in dtype.names or ()}
-        at += size
-    return tables
-
-
-def _binary_lists(path: Path, element: Element, order: str, data: bytes, at: int) -> tuple[dict[str, Any], int]:
-    """Rows with lists: at once where all have the first row's lengths, else row by row."""
-    if element.count == 0:
-        return {}, at
-    fields: list[tuple[str, str, int]] = []
-    offset = at
-    for name, kind, count in element.properties:
-        length = 1
-        if count is not None:
-            length = _number(path, element, data, offset, order + count)
-            fields.append((f"count {name}", order + count, 1))
-            offset += np.dtype(count).itemsize
-        if not 0 <= length * np.dtype(kind).itemsize <= len(data) - offset:
-            raise _truncated(path, element, len(data) - offset, f"a list of {length}")
-        fields.append((name, order + kind, length))
-        offset += length * np.dtype(kind).itemsize
-    dtype = np.dtype([(name, kind, (length,)) for name, kind, length in fields])
-    if dtype.itemsize * element.count <= len(data) - at:
-        rows = np.frombuffer(data, dtype, element.count, at)
-        lengths = {name: length for name, _, length in fields}
-        if all((rows[name] == lengths[name[6:]]).all() for name in lengths if name.startswith("count ")):
-            lists = {
-                name: Lists(np.full(element.count, lengths[name]), rows[name].reshape(-1).astype(np.float64))
-                for name, _, count in element.properties
-                if count is not None
-            }
-            return lists, at + dtype.itemsize * element.count
-    return _binary_rows(path, element, order, data, at)
-
-
-def _binary_rows(path: Path, element: Element, order: str, data: bytes, at: int) -> tuple[dict[str, Any], int]:
-    """Where each row begins is known only after the one before: hence the loop."""
-    if element.count > len(data) - at:
-        raise _truncated(path, element, len(data) - at, f"at least {element.count}")
-    sizes: dict[str, list[int]] = {name: [] for name, _, _ in element.properties}
-    pieces: dict[str, list[bytes]] = {name: [] for name, _, _ in element.properties}
-    plan = [
-        (name, np.dtype(kind).itemsize, None if count is None else struct.Struct((order or "<") + _CODES[count]))
-        for name, kind, count in element.properties
-    ]
-    for _ in range(element.count):
-        for name, width, counter in plan:
-            length = 1
-            if counter is not None:
-                if at + counter.size > len(data):
-                    raise _truncated(path, element, len(data), "more")
-                length = int(counter.unpack_from(data, at)[0]) if counter.size else 0
-                at += counter.size
-            end = at + length * width
-            if length < 0 or end > len(data):
-                raise _truncated(path, element, len(data) - at, f"a list of {length}")
-            sizes[name].append(length)
-            pieces[name].append(data[at:end])
-            at = end
-    lists = {
-        name: Lists(np.array(sizes[name]), np.frombuffer(b"".join(pieces[name]), order + kind).astype(np.float64))
-        for name, kind, count in element.properties
-        if count is not None
-    }
-    return lists, at
-
-
-_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "x", "f8": "x"}
-"""For ``struct``; a count that is no integer is refused before."""
-
-
-def _number(path: Path, element: Element, data: bytes, at: int, kind: str) -> int:
-    dtype = np.dtype(kind)
-    if dtype.kind == "f" or at + dtype.itemsize > len(data):
-        raise _truncated(path, element, max(len(data) - at, 0), "an integer that tells a list's length")
-    return int(np.frombuffer(data, dtype, 1, at)[0])
-
-
-def _ascii(path: Path, elements: list[Element], body: bytes) -> dict[str, dict[str, Any]]:
-    try:
-        words = np.array(list(map(float, body.split())), dtype=np.float64)
-    except ValueError as error:
-        raise FileFormatError(f"{path}: found text among the numbers ({error})") from error
-    tables: dict[str, dict[str, Any]] = {}
-    at = 0
-    for element in elements:
-        width = len(element.properties)
-        if element.count * width > len(words) - at:
-            raise _truncated(path, element, len(words) - at, f"at least {element.count * width}")
-        if all(count is None for _, _, count in element.properties):
-            rows = words[at : at + element.count * width].reshape(element.count, width)
-            tables[element.name] = {name: rows[:, i] for i, (name, _, _) in enumerate(element.properties)}
-            at += element.count * width
-        else:
-            tables[element.name], at = _ascii_rows(path, element, words, at)
-    return tables
-
-
-def _ascii_rows(path: Path, element: Element, words: NDArray[np.float64], at: int) -> tuple[dict[str, Any], int]:
-    """Where each row begins is known only after the one before: hence the loop."""
-    sizes: dict[str, list[int]] = {name: [] for name, _, count in element.properties if count is not None}
-    pieces: dict[str, list[NDArray[np.float64]]] = {name: [] for name in sizes}
-    for _ in range(element.count):
-        for name, _, count in element.properties:
-            if count is None:
-                at += 1
-                continue
-            length = float(words[at]) if at < len(words) else -1.0
-            if not (length >= 0 and length.is_integer() and at + 1 + length <= len(words)):
-                raise _truncated(path, element, max(len(words) - at, 0), f"a list of {length:g}")
-            end = at + 1 + int(length)
-            sizes[name].append(int(length))
-            pieces[name].append(words[at + 1 : end])
-            at = end
-    return {
-        name: Lists(np.array(sizes[name], np.int64), np.concatenate(pieces[name]) if pieces[name] else words[:0])
-        for name in sizes
-    }, at

@@ -31,7 +31,7 @@ try:
 except ImportError:  # Windows has none; two runs into one folder then go unnoticed
     fcntl = None  # type: ignore[assignment]
 
-SCAN_ENDINGS = (".obj", ".ply", ".stl", ".glb", ".gltf")
+SCAN_ENDINGS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 SUMMARY = "summary.csv"
 
 

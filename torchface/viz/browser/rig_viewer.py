@@ -74,7 +74,7 @@ class RigViewer:
         self._panel_due = False
         self.server = start_server(label, port)
         self._detail, self._wrinkled = detail, detail is not None
-        self.head = HeadOnPage(self.server, self._posed(), "head", wrinkles=self._wrinkles if detail else None)
+        self.head = HeadOnPage(self.server, self._posed(), "head", normal_map=self._normal_map if detail else None)
         frame_camera(self.server, rig.neutral)
         if self.take is not None:
             self._add_timeline()
@@ -128,14 +128,14 @@ class RigViewer:
     def _vertices(self) -> Tensor:
         return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
 
-    def _wrinkles(self) -> Tensor | None:
+    def _normal_map(self) -> Tensor | None:
         if self._detail is None or not self._wrinkled:
             return None
         return self._detail.blend(self.rig.names, self.editor.pose)
 
     def _show_wrinkles(self, shown: bool) -> None:
         self._wrinkled = bool(shown)
-        self.head.refresh_skin()
+        self.head.refresh_texture()
 
     def _show(self) -> int:
         sent = self.head.show(self._vertices())
@@ -145,7 +145,7 @@ class RigViewer:
         return sent
 
     def _run(self) -> None:
-        """Plays, keeps the panel up to date at a rate that a browser likes, and puts the skin on at rest."""
+        """Plays, keeps the panel up to date at a rate that a browser likes, and shows the texture at rest."""
         while not self._stopped.wait(_TICK):
             with self._lock:
                 now = time.monotonic()
@@ -192,9 +192,9 @@ class RigViewer:
             if self.take is not None:
                 spread = gui.add_slider("Spread", 0, 60, 1, _SPREAD, hint="Frames beside that an edit takes along")
                 self._shared(spread, lambda value: setattr(self.editor, "spread", int(value)))
-            if self.head.has_skin:
-                skin = gui.add_checkbox("Texture at rest", True, hint="In motion the head shows in plain colours")
-                self._shared(skin, self.head.wear_skin)
+            if self.head.has_texture:
+                texture = gui.add_checkbox("Texture at rest", True, hint="In motion the head shows in plain colours")
+                self._shared(texture, self.head.enable_texture)
             if self._detail is not None:
                 self._shared(gui.add_checkbox("Wrinkles", True), self._show_wrinkles)
             actions: dict[str, Callable[[], None]] = {"Reset": self.editor.reset}

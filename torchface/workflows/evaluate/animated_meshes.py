@@ -17,7 +17,7 @@ from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
 
-MESH_ENDINGS = (".obj", ".ply", ".stl")
+MESH_ENDINGS = (".obj", ".ply", ".stl", ".off")
 _GLTF = (".glb", ".gltf")
 _FORMS = "weights as .csv, an animated .glb, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 

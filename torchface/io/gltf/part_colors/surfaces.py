@@ -18,7 +18,7 @@ from torchface.mesh import Mesh
 _RASTER = 512
 _OWNED = 0.5
 
-Worn = Literal["texture", "colors", "material"]
+ColorSource = Literal["texture", "colors", "material"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +28,14 @@ class Surface:
     Args:
         triangles: rows of the mesh's faces, ascending, (K,).
         material: what they are made of.
-        worn: where their colour is: in the mesh's texture, in its vertex colours, or in the material.
+        color_source: where their colour is: in the mesh's texture, in its vertex colours, or in the material.
         part: the region of an eyeball that turns about a node of its own.
         paint: of an eyeball or lashes whose colour is in the material.
     """
 
     triangles: Tensor
     material: PartMaterial
-    worn: Worn
+    color_source: ColorSource
     part: str | None = None
     paint: Paint | None = None
 
@@ -53,14 +53,14 @@ def surfaces(mesh: Mesh, pictured: bool) -> list[Surface]:
     groups = _groups(mesh)
     if len(groups) == 1 and groups[0][0] is SKIN:
         everything = torch.arange(len(mesh.faces))
-        return [Surface(everything, SKIN, _worn(mesh, mesh.texture is not None and mesh.uvs is not None))]
+        return [Surface(everything, SKIN, _color_source(mesh, mesh.texture is not None and mesh.uvs is not None))]
     own = _own_texels(mesh, groups) if pictured else torch.zeros(len(mesh.faces), dtype=torch.bool)
     found: list[Surface] = []
     for material, part, triangles in groups:
         if material is SKIN:
             pieces = [(triangles[own[triangles]], True), (triangles[~own[triangles]], False)]
             found += [
-                Surface(rows, SKIN, _worn(mesh, owns and mesh.texture is not None))
+                Surface(rows, SKIN, _color_source(mesh, owns and mesh.texture is not None))
                 for rows, owns in pieces
                 if len(rows)
             ]
@@ -86,7 +86,7 @@ def parts_without_texels(mesh: Mesh) -> Tensor:
     return bare
 
 
-def _worn(mesh: Mesh, textured: bool) -> Worn:
+def _color_source(mesh: Mesh, textured: bool) -> ColorSource:
     if textured:
         return "texture"
     return "material" if mesh.colors is None else "colors"

@@ -1,0 +1,64 @@
+"""Vertices split where texture coordinates differ, as glTF, trimesh and GPUs want them, and merged again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Split:
+    """One row for each pair of vertex and texture coordinate that occurs, in the order of the coordinates.
+
+    Args:
+        vertex_of: the vertex of each, (C,); those that no face has come last.
+        uv_of: its row of the texture coordinates, (C,); none without them.
+        triangles: the mesh's, into these rows, (F,3).
+    """
+
+    vertex_of: NDArray[np.int64]
+    uv_of: NDArray[np.int64] | None
+    triangles: NDArray[np.int64]
+
+
+def split_at_seams(
+    vertex_count: int,
+    faces: NDArray[np.int64],
+    uv_faces: NDArray[np.int64] | None,
+    mirrored: NDArray[np.bool_] | None = None,
+) -> Split:
+    """Vertices with one texture coordinate each.
+
+    Args:
+        vertex_count: V.
+        faces: triangles, (F,3).
+        uv_faces: rows of the texture coordinates at their corners, (F,3).
+        mirrored: at which corners (F,3) the texture is; a pair that is on both sides gets two rows.
+    """
+    if uv_faces is None:
+        return Split(np.arange(vertex_count), None, faces)
+    keys = uv_faces * vertex_count + faces
+    sided = keys * 2 if mirrored is None else keys * 2 + mirrored
+    pairs, triangles = np.unique(sided, return_inverse=True)
+    vertex_of, uv_of = pairs // 2 % vertex_count, pairs // 2 // vertex_count
+    loose = np.setdiff1d(np.arange(vertex_count), vertex_of)
+    vertex_of, uv_of = np.append(vertex_of, loose), np.append(uv_of, np.zeros_like(loose))
+    return Split(vertex_of, uv_of, triangles.reshape(-1, 3))
+
+
+def merge_equal_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (C,K) that are equal as one, numbered by first appearance; -0 equals 0.
+
+    Returns:
+        For each row the number of its value, (C,), and for each value its first row, (V,).
+    """
+    rows = np.ascontiguousarray(rows + rows.dtype.type(0))  # so that -0 equals 0 byte by byte
+    keys = rows.view([("", np.void, rows.shape[1] * rows.itemsize)]).reshape(-1)
+    _, first, value_of = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return rank[value_of.reshape(-1)], first[order]
