@@ -1,4 +1,4 @@
-"""From pictures of a checkerboard to a camera's calibration on disk."""
+"""From images of a checkerboard to a camera's calibration on disk."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_picture, sheet
 
 _VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
-_FEWEST_VIEWS, _MOST_FRAMES = 5, 60
-_DETECTED_AT = 1920  # pixels of the longer side; larger pictures are searched smaller and refined at full size
-_ALIKE = 0.01  # of the width: views whose corners move less tell nothing new
-_LEAST_TILT = 10.0  # degrees between the boards of some two views
-_FAR_OFF = 3.0  # times the median error of the views
-_LARGEST_DOUBT = 0.02  # of the focal length, one standard deviation
+_MIN_VIEWS, _MAX_FRAMES = 5, 60
+_DETECTED_AT = 1920  # pixels of the longer side; larger images are searched reduced and refined at full size
+_MIN_MOVEMENT = 0.01  # of the width: views whose corners move less say nothing new
+_MIN_TILT = 10.0  # degrees between the boards of some two views
+_MAX_ERROR_RATIO = 3.0  # to the median error of the views
+_MAX_FOCAL_DEVIATION = 0.02  # of the focal length, one standard deviation
 _SHOWN, _CELL = 6, 420
 
 
@@ -63,7 +63,7 @@ class Board:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture in which the whole board was found.
+    """An image in which the whole board was found.
 
     Args:
         name: of the file, or the number of the video's frame.
@@ -82,52 +82,52 @@ class CalibrationReport:
 
     Args:
         calibration: the camera.
-        used: names of the pictures used.
+        used: names of the images used.
         errors: reprojection of each, root mean square, (M,), pixels.
         left_out: names of the others, and why.
-        doubt: deviation of the focal length, as a share of it.
+        focal_deviation: standard deviation of the focal length, relative to it.
         tilt: the largest angle between the boards of two views, degrees.
-        picture: the overlay written.
+        overlay_path: the overlay written.
     """
 
     calibration: CameraCalibration
     used: tuple[str, ...]
     errors: Tensor
     left_out: tuple[tuple[str, str], ...]
-    doubt: float
+    focal_deviation: float
     tilt: float
-    picture: Path | None = None
+    overlay_path: Path | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""
         camera = self.calibration
-        K, bend = camera.intrinsics.tolist(), camera.distortion.tolist()
+        K, distortion = camera.intrinsics.tolist(), camera.distortion.tolist()
         lines = [
             f"{len(self.used)} of {len(self.used) + len(self.left_out)} views used, {camera.width} x {camera.height} "
             f"pixels, boards tilted by up to {self.tilt:.0f} degrees to each other",
             f"reprojection error {camera.error:.3f} pixels root mean square (views: {float(self.errors.min()):.3f} to "
             f"{float(self.errors.max()):.3f})",
-            f"focal length {K[0][0]:.1f}, {K[1][1]:.1f} pixels (+- {self.doubt:.2%}), centre {K[0][2]:.1f}, "
+            f"focal length {K[0][0]:.1f}, {K[1][1]:.1f} pixels (+- {self.focal_deviation:.2%}), centre {K[0][2]:.1f}, "
             f"{K[1][2]:.1f}; {camera.field_of_view:.1f} degrees across",
             "distortion "
-            + ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), bend, strict=True)),
+            + ", ".join(f"{n} {v:.4f}" for n, v in zip(("k1", "k2", "p1", "p2", "k3"), distortion, strict=True)),
         ]
         return lines + [f"  left out {name}: {reason}" for name, reason in self.left_out]
 
 
 def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress | None = None) -> CalibrationReport:
-    """Calibrates a camera from pictures, or a video, of a checkerboard held at various angles, and writes it.
+    """Calibrates a camera from images, or a video, of a checkerboard held at various angles, and writes it.
 
     Args:
         paths: image files of one size, or one video.
         board: the checkerboard.
-        out: the ``.toml`` to write; beside it a picture of the corners found, and of views without distortion.
+        out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
         progress: told each step and how far it is.
 
     Raises:
         FileFormatError: ``out`` is no ``.toml``, or a file is broken.
-        ShapeError: the pictures differ in size.
-        AlignmentError: the board is found in fewer than five views, or they do not tell the focal length.
+        ShapeError: the images differ in size.
+        AlignmentError: the board is found in fewer than five views, or leave the focal length open.
 
     Source: Zhang 2000; thesis 4.2.4.
     """
@@ -137,56 +137,56 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     if not out.parent.is_dir():
         raise FileFormatError(f"{out}: found no folder {out.parent}, expected an existing one")
     if not paths:
-        raise FileFormatError("calibrate: found no picture, expected some of a checkerboard, or a video")
-    views, left_out = find_boards(_pictures(paths), board, progress)
+        raise FileFormatError("calibrate: found no image, expected some of a checkerboard, or a video")
+    views, left_out = find_boards(_images(paths), board, progress)
     progress(f"calibrating from {len(views)} views")
     report = calibrate_views(views, board, left_out)
     progress("writing the calibration and the overlay")
-    picture = out.with_suffix(".png")
+    overlay_path = out.with_suffix(".png")
     save_calibration(report.calibration, out)
-    save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), picture)
-    return CalibrationReport(**{**vars(report), "picture": picture})
+    save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path)
+    return CalibrationReport(**{**vars(report), "overlay_path": overlay_path})
 
 
 def find_boards(
-    pictures: Iterator[tuple[str, Tensor]], board: Board, progress: Progress
+    images: Iterator[tuple[str, Tensor]], board: Board, progress: Progress
 ) -> tuple[list[View], list[tuple[str, str]]]:
-    """The views with the whole board, and the names of the other pictures with the reason why not.
+    """The views with the whole board, and the names of the other images with the reason why not.
 
     Args:
-        pictures: names and images, uint8 (H,W), of one size.
+        images: names and images, uint8 (H,W), of one size.
         board: the checkerboard.
-        progress: told how many pictures are done.
+        progress: told how many images are done.
 
     Raises:
-        ShapeError: the pictures differ in size.
+        ShapeError: the images differ in size.
     """
     views: list[View] = []
     left_out: list[tuple[str, str]] = []
     first: tuple[str, torch.Size] | None = None
-    for name, image in pictures:  # OpenCV searches one picture at a time
+    for name, image in images:  # OpenCV searches one image at a time
         progress("looking for the board", len(views) + len(left_out))
         first = first or (name, image.shape)
         if image.shape != first[1]:
             raise ShapeError(
                 f"calibrate: found {name} with {image.shape[1]} x {image.shape[0]} pixels and {first[0]} with "
-                f"{first[1][1]} x {first[1][0]}, expected pictures of one camera at one size"
+                f"{first[1][1]} x {first[1][0]}, expected images of one camera at one size"
             )
         corners = find_corners(image, board)
         if corners is None:
             left_out.append((name, f"no board of {board.columns} x {board.rows} inner corners"))
             continue
-        near = _ALIKE * image.shape[1]
-        twin = next((view for view in views if float((view.corners - corners).norm(dim=1).mean()) < near), None)
-        if twin is None:
+        near = _MIN_MOVEMENT * image.shape[1]
+        earlier = next((view for view in views if float((view.corners - corners).norm(dim=1).mean()) < near), None)
+        if earlier is None:
             views.append(View(name, image, corners))
         else:
-            left_out.append((name, f"the board stands as in {twin.name}"))
+            left_out.append((name, f"the board stands as in {earlier.name}"))
     return views, left_out
 
 
 def find_corners(image: Tensor, board: Board) -> Tensor | None:
-    """The inner corners (N,2) float32 of the board in a picture uint8 (H,W), row by row; None if not all are seen."""
+    """The inner corners (N,2) float32 of the board in an image uint8 (H,W), row by row; None if not all are seen."""
     grey = image.numpy()
     scale = min(1.0, _DETECTED_AT / max(grey.shape))
     small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -207,13 +207,13 @@ def find_corners(image: Tensor, board: Board) -> Tensor | None:
 def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tuple[str, str]] = ()) -> CalibrationReport:
     """The camera that explains where the boards' corners are seen.
 
-    Views whose corners are far more off than those of the others are left out; k3 is estimated only where the views
-    tell it from none.
+    Views whose residuals are far larger than those of the others are left out; k3 is estimated only where it differs
+    significantly from 0.
 
     Args:
         views: with the board, of one size.
         board: the checkerboard.
-        left_out: pictures without it, and why; those left out here are added.
+        left_out: images without it, and why; those left out here are added.
 
     Raises:
         AlignmentError: fewer than five views, views that are all parallel, or ones that leave the focal length open.
@@ -221,41 +221,41 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
     left = list(left_out)
     _check_count(views, left)
     fit = _fit(views, board)
-    far = [i for i, error in enumerate(fit.errors) if error > max(0.5, _FAR_OFF * float(np.median(fit.errors)))]
-    if far:
-        left += [(views[i].name, f"its corners are {fit.errors[i]:.1f} pixels off") for i in far]
-        views = [view for i, view in enumerate(views) if i not in far]
+    outliers = [i for i, error in enumerate(fit.errors) if error > max(0.5, _MAX_ERROR_RATIO * float(np.median(fit.errors)))]
+    if outliers:
+        left += [(views[i].name, f"its corners are {fit.errors[i]:.1f} pixels from where the camera predicts them") for i in outliers]
+        views = [view for i, view in enumerate(views) if i not in outliers]
         _check_count(views, left)
         fit = _fit(views, board)
-    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in fit.turns])
+    normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in fit.rotations])
     tilt = math.degrees(math.acos(float(np.clip((normals @ normals.T).min(), -1, 1))))
-    if tilt < _LEAST_TILT:
+    if tilt < _MIN_TILT:
         raise AlignmentError(
             f"calibrate: found {len(views)} views in which the board is tilted by at most {tilt:.1f} degrees from one "
-            f"to another, expected {_LEAST_TILT:.0f} at least: hold it at various angles to the camera"
+            f"to another, expected {_MIN_TILT:.0f} at least: hold it at various angles to the camera"
         )
-    doubt = float(fit.deviations[:2].max() / fit.K[0, 0])
-    if not doubt < _LARGEST_DOUBT:
+    focal_deviation = float(fit.deviations[:2].max() / fit.K[0, 0])
+    if not focal_deviation < _MAX_FOCAL_DEVIATION:
         raise AlignmentError(
-            f"calibrate: found views that leave the focal length open by {doubt:.1%}, expected at most "
-            f"{_LARGEST_DOUBT:.0%}: add views with the board tilted more, and nearer to the image's corners"
+            f"calibrate: found views that leave the focal length open by {focal_deviation:.1%}, expected at most "
+            f"{_MAX_FOCAL_DEVIATION:.0%}: add views with the board tilted more, and nearer to the image's corners"
         )
     height, width = views[0].image.shape
-    camera = CameraCalibration(torch.from_numpy(fit.K), torch.from_numpy(fit.bend), int(width), int(height), fit.error)
+    camera = CameraCalibration(torch.from_numpy(fit.K), torch.from_numpy(fit.distortion), int(width), int(height), fit.error)
     names = tuple(view.name for view in views)
-    return CalibrationReport(camera, names, torch.from_numpy(fit.errors), tuple(left), doubt, tilt)
+    return CalibrationReport(camera, names, torch.from_numpy(fit.errors), tuple(left), focal_deviation, tilt)
 
 
 def overlay(views: Sequence[View], calibration: CameraCalibration, board: Board) -> Tensor:
-    """Views with the corners found, and the same without distortion, as one picture (3,H,W).
+    """Views with the corners found, and the same without distortion, as one image (3,H,W).
 
     The board's lines are drawn between corners: through the undistorted views they are straight.
     """
-    K, bend = calibration.intrinsics.numpy(), calibration.distortion.numpy()
+    K, distortion = calibration.intrinsics.numpy(), calibration.distortion.numpy()
     seen, straight = [], []
-    for view in views[:: max(1, len(views) // _SHOWN)][:_SHOWN]:  # a picture a view
-        flat = cv2.undistort(view.image.numpy(), K, bend)
-        moved = cv2.undistortPoints(view.corners.numpy().reshape(-1, 1, 2), K, bend, P=K).reshape(-1, 2)
+    for view in views[:: max(1, len(views) // _SHOWN)][:_SHOWN]:  # few views are drawn
+        flat = cv2.undistort(view.image.numpy(), K, distortion)
+        moved = cv2.undistortPoints(view.corners.numpy().reshape(-1, 1, 2), K, distortion, P=K).reshape(-1, 2)
         seen.append(caption(_drawn(view.image.numpy(), view.corners.numpy(), board), view.name))
         straight.append(caption(_drawn(flat, moved, board), "undistorted"))
     return sheet([*seen, *straight], columns=len(seen))
@@ -264,8 +264,8 @@ def overlay(views: Sequence[View], calibration: CameraCalibration, board: Board)
 @dataclass(frozen=True, eq=False)
 class _Fit:
     K: np.ndarray
-    bend: np.ndarray
-    turns: Sequence[np.ndarray]
+    distortion: np.ndarray
+    rotations: Sequence[np.ndarray]
     errors: np.ndarray
     deviations: np.ndarray
     error: float
@@ -279,7 +279,7 @@ def _fit(views: Sequence[View], board: Board) -> _Fit:
     best = None
     for flags in (cv2.CALIB_FIX_K3, 0):
         try:
-            error, K, bend, turns, _, deviations, _, errors = cv2.calibrateCameraExtended(
+            error, K, distortion, rotations, _, deviations, _, errors = cv2.calibrateCameraExtended(
                 points, corners, (int(width), int(height)), np.eye(3), np.zeros(5), flags=flags, criteria=stop
             )
         except cv2.error as wrong:
@@ -287,25 +287,25 @@ def _fit(views: Sequence[View], board: Board) -> _Fit:
                 f"calibrate: no camera explains the {len(views)} views ({' '.join(str(wrong).split())[:120]}); "
                 "expected boards at various angles"
             ) from wrong
-        bend, deviations = bend.ravel()[:5].astype(np.float64), deviations.ravel()
+        distortion, deviations = distortion.ravel()[:5].astype(np.float64), deviations.ravel()
         # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2, k3.
-        if best is None or abs(bend[4]) > 3 * deviations[8]:
-            best = _Fit(K, bend, turns, errors.ravel(), deviations, float(error))
+        if best is None or abs(distortion[4]) > 3 * deviations[8]:
+            best = _Fit(K, distortion, rotations, errors.ravel(), deviations, float(error))
     assert best is not None
     return best
 
 
 def _check_count(views: Sequence[View], left_out: Sequence[tuple[str, str]]) -> None:
-    if len(views) >= _FEWEST_VIEWS:
+    if len(views) >= _MIN_VIEWS:
         return
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out[:8])
     raise AlignmentError(
-        f"calibrate: found the board in {len(views)} views, expected {_FEWEST_VIEWS} at least that differ"
+        f"calibrate: found the board in {len(views)} views, expected {_MIN_VIEWS} at least that differ"
         + (f" ({why})" if why else "")
     )
 
 
-def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
+def _images(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
     videos = [path for path in paths if path.suffix.lower() in _VIDEOS]
     if videos and len(paths) > 1:
         raise FileFormatError(f"{videos[0]}: found a video beside {len(paths) - 1} files, expected it alone, or images")
@@ -315,14 +315,14 @@ def _pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
             yield path.name, (255 * grey_images(image[None])[0, 0]).round().to(torch.uint8)
         return
     video = open_video(videos[0])
-    step = max(1, -(-video.count // _MOST_FRAMES))
+    step = max(1, -(-video.count // _MAX_FRAMES))
     for number, frame in enumerate(video.frames()):
         if number % step == 0:
             yield f"frame {number}", frame
 
 
 def _drawn(image: np.ndarray, corners: np.ndarray, board: Board) -> Tensor:
-    """A grey picture, reduced, with the rows of corners drawn over it."""
+    """A grey image, reduced, with the rows of corners drawn over it."""
     scale = _CELL / image.shape[1]
     small = cv2.resize(image, (_CELL, max(1, round(image.shape[0] * scale))), interpolation=cv2.INTER_AREA)
     canvas = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.io.markers.marker_checks import check_names
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
 from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering
 from torchface.io.tables.numbered_csv import rate_of
+from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.take import Take, Track
 
 _FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"
@@ -86,28 +86,14 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
     Source: OpenFace wiki, "Output Format".
     """
     path = Path(path)
-    if take.landmarks is None or take.landmarks.values.shape[:2].numel() == 0:
-        raise ValueRangeError(f"{path}: found a take without landmarks, expected some to write")
-    names, values = take.landmarks.names, take.landmarks.values.detach().cpu().to(torch.float32).numpy().copy()
-    check_names(names, path, "landmark name")
-    if values.shape[2] != 2 or np.isinf(values).any():
-        raise ShapeError(
-            f"{path}: found landmarks {values.shape}, some perhaps infinite; expected finite (T,L,2) or NaN"
-        )
+    names, values = values_to_write(take.landmarks, "landmarks", 2, path)
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     unseen = np.isnan(values).any(2)
-    values[unseen] = np.nan
-    columns = {
-        name: column for name, column in take.extras.get("columns", {}).items() if isinstance(column, torch.Tensor)
-    }
-    wrong = [name for name, column in columns.items() if column.shape != (len(take),)]
-    if wrong:
-        raise ShapeError(
-            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
-        )
+    columns = {name: column for name, column in kept_columns(take, path).items() if isinstance(column, torch.Tensor)}
     header = [_FRAME, _TIME, _CONFIDENCE, _SUCCESS, *(f"{axis}_{name}" for axis in "xy" for name in names), *columns]
     if len(set(header)) < len(header):
         raise NameMismatchError(f"{path}: found a kept column named like another one, expected every name once")
+    assert take.landmarks is not None
     confidence = take.landmarks.confidence
     level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().double().mean(1).float()
     numbers = frame_numbers(take, first=1)

@@ -29,9 +29,10 @@ from torchface.io.markers.c3d_sections import (
     pack_sections,
     read_sections,
 )
-from torchface.io.markers.marker_checks import marker_take, markers_to_write, millimetres, unique_labels
+from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
 from torchface.io.tables.csv_table import quoted
 from torchface.io.tables.frame_rates import check_rate, frame_numbers, simplest_rate
+from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
 _MOST = 65535
@@ -189,7 +190,7 @@ def save_c3d(take: Take, path: str | Path) -> None:
     Source: The C3D File Format User Guide, Motion Lab Systems.
     """
     path = Path(path)
-    labels, positions = markers_to_write(take, path)
+    labels, positions = values_to_write(take.markers, "marker positions", 3, path)
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     frames, points = positions.shape[:2]
     numbers = frame_numbers(take, first=1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import quoted
 from torchface.take import Take, Track
 
@@ -84,41 +84,3 @@ def marker_take(path: Path, fps: float, labels: Sequence[str], values: np.ndarra
         )
     values[unseen] = np.nan
     return Take(fps, markers=Track(tuple(labels), torch.from_numpy(values)), extras={"source": str(path), **extras})
-
-
-def markers_to_write(take: Take, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """Labels and positions (T,M,3) float32, a marker with a NaN coordinate NaN in all.
-
-    Raises:
-        ValueRangeError: the take has no markers or no frames, or a position is infinite.
-        NameMismatchError: a label is empty or begins or ends in a blank, which files do not keep.
-    """
-    if take.markers is None or take.markers.values.shape[:2].numel() == 0:
-        raise ValueRangeError(f"{path}: found a take without marker positions, expected some to write")
-    if take.markers.values.shape[2] != 3:
-        raise ShapeError(f"{path}: found markers {tuple(take.markers.values.shape)}, expected (T,M,3)")
-    check_names(take.markers.names, path, "marker label")
-    values = take.markers.values.detach().cpu().to(torch.float32).numpy().copy()
-    if np.isinf(values).any():
-        raise ValueRangeError(f"{path}: found an infinite marker position, expected numbers, or NaN where not seen")
-    values[np.isnan(values).any(2)] = np.nan
-    return take.markers.names, values
-
-
-def check_names(names: Sequence[str], path: Path, kind: str) -> None:
-    """Raises ``NameMismatchError`` for names that would not come back from a file as they are."""
-    breaks = set("\0\t\n\r")
-    bad = [name for name in names if not name or name != name.strip() or breaks & set(name) or not _is_unicode(name)]
-    if bad:
-        raise NameMismatchError(
-            f"{path}: found the {kind} {quoted(bad)}; expected text that is not empty, "
-            "neither begins nor ends in a blank, and holds no tab, line break or NUL"
-        )
-
-
-def _is_unicode(name: str) -> bool:
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True

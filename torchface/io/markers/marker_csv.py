@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchface.errors import FileFormatError
-from torchface.io.markers.marker_checks import marker_take, markers_to_write, millimetres
+from torchface.io.markers.marker_checks import marker_take, millimetres
 from torchface.io.tables.csv_table import TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered, read_numbered, write_numbered
+from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
 _AXES = ("_x", "_y", "_z")
@@ -64,7 +65,7 @@ def save_markers_csv(take: Take, path: str | Path) -> None:
         NameMismatchError: a label is empty, or begins or ends in a blank.
     """
     path = Path(path)
-    labels, positions = markers_to_write(take, path)
+    labels, positions = values_to_write(take.markers, "marker positions", 3, path)
     write_numbered(
         take, path, [label + axis for label in labels for axis in _AXES], positions.reshape(len(positions), -1)
     )

@@ -8,9 +8,10 @@ import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
-from torchface.io.markers.marker_checks import marker_take, markers_to_write, millimetres, unique_labels
+from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
 from torchface.io.tables.csv_table import LARGEST_TABLE, number_texts, parse_number, quoted
 from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering
+from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
 _FIELDS = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame")
@@ -114,7 +115,7 @@ def save_trc(take: Take, path: str | Path) -> None:
     Source: OpenSim documentation, "Marker (.trc) Files".
     """
     path = Path(path)
-    labels, positions = markers_to_write(take, path)
+    labels, positions = values_to_write(take.markers, "marker positions", 3, path)
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     frames, markers = positions.shape[:2]
     numbers = frame_numbers(take, first=1)

@@ -14,7 +14,8 @@ from torchface.io.tables.csv_table import TableReader, parse_number, quoted, wri
 from torchface.io.tables.frame_rates import check_rate, frame_numbers
 from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.tables.timecode import read_timecodes, write_timecodes
-from torchface.io.weights.weight_csv import ROTATIONS, weights_to_write
+from torchface.io.tables.track_checks import kept_columns, values_to_write
+from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 
@@ -137,24 +138,22 @@ def save_live_link(take: Take, path: str | Path) -> None:
     Source: Epic Games, "Recording Face Animation on iOS Device", CSV of Live Link Face.
     """
     path = Path(path)
-    names, values = _as_arkit(*weights_to_write(take, path), path)
+    names, values = values_to_write(take.weights, "weights", 1, path)
+    names, values = _as_arkit(names, values[..., 0], path)
     check_rate(take.fps, f"{path}: the take", ValueRangeError)
     timecodes = take.timecode or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
     try:
         read_timecodes(timecodes, path)
     except FileFormatError as error:
         raise ValueRangeError(str(error)) from error
-    columns = take.extras.get("columns")
-    if columns is None:
+    columns = kept_columns(take, path)
+    if "columns" not in take.extras:
         columns = {name: torch.zeros(len(take), dtype=torch.float64) for name in ROTATIONS}
     counts = take.extras.get("blendshape_count")
     if counts is None:
         counts = [len(names) + sum(isinstance(column, torch.Tensor) for column in columns.values())] * len(take)
-    wrong = [name for name, column in {**columns, "BlendshapeCount": counts}.items() if len(column) != len(take)]
-    if wrong:
-        raise ShapeError(
-            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
-        )
+    if len(counts) != len(take):
+        raise ShapeError(f"{path}: found {len(counts)} kept blendshape counts, expected {len(take)} frames")
     cells = _ten_decimals(values.reshape(-1))
     width = len(names)
     others = [

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.io.markers.marker_checks import check_names
+from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.markers.marker_csv import is_marker_header
-from torchface.io.tables.csv_table import TableReader, number_texts, quoted
+from torchface.io.tables.csv_table import TableReader, number_texts
 from torchface.io.tables.numbered_csv import COLUMNS, read_numbered, write_numbered
+from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.take import Take, Track
 
 ROTATIONS = tuple(part + axis for part in ("Head", "LeftEye", "RightEye") for axis in ("Yaw", "Pitch", "Roll"))
@@ -72,32 +72,14 @@ def save_weights_csv(take: Take, path: str | Path) -> None:
         NameMismatchError: a name is empty, begins or ends in a blank, or would be taken for another column.
     """
     path = Path(path)
-    names, values = weights_to_write(take, path)
+    names, values = values_to_write(take.weights, "weights", 1, path)
     header = (*COLUMNS, *names)
     if is_marker_header(header) or set(names) & {*COLUMNS, _TIMECODE, *ROTATIONS}:
         raise NameMismatchError(f"{path}: found shapes named like other columns of the file, expected other names")
-    kept = {name: column for name, column in take.extras.get("columns", {}).items() if name in ROTATIONS}
-    wrong = [name for name, column in kept.items() if len(column) != len(take)]
-    if wrong:
-        raise ShapeError(
-            f"{path}: found the kept columns {quoted(wrong)} of other lengths, expected {len(take)} frames"
-        )
     rotations = {
-        name: number_texts(column.detach().cpu().to(torch.float64).numpy())
-        for name, column in kept.items()
-        if isinstance(column, torch.Tensor)
+        name: number_texts(column.detach().cpu().double().numpy())
+        for name, column in kept_columns(take, path).items()
+        if name in ROTATIONS and isinstance(column, torch.Tensor)
     }
-    write_numbered(take, path, names, values, {} if take.timecode is None else {_TIMECODE: take.timecode}, rotations)
-
-
-def weights_to_write(take: Take, path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and weights (T,N) float32, checked."""
-    if take.weights is None or take.weights.values.shape[:2].numel() == 0:
-        raise ValueRangeError(f"{path}: found a take without weights, expected some to write")
-    if take.weights.values.shape[2] != 1:
-        raise ShapeError(f"{path}: found weights {tuple(take.weights.values.shape)}, expected (T,N,1)")
-    check_names(take.weights.names, path, "shape name")
-    values = take.weights.values.detach().cpu().to(torch.float32).numpy()[..., 0]
-    if np.isinf(values).any():
-        raise ValueRangeError(f"{path}: found an infinite weight, expected numbers")
-    return take.weights.names, values
+    timecode = {} if take.timecode is None else {_TIMECODE: take.timecode}
+    write_numbered(take, path, names, values[..., 0], timecode, rotations)
