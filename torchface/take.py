@@ -1,4 +1,4 @@
-"""A performance: what was seen or solved in each frame, by name."""
+"""A performance: markers, landmarks and weights of each frame, by name."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Take:
         landmarks: values (T,L,2), pixels.
         weights: values (T,N,1), blendshape weights.
         timecode: one text a frame, as the file had it.
-        extras: what the file held besides (columns by name, device, subject), kept for writing it back.
+        extras: what else the file holds (columns by name, device, subject), kept for writing it back.
 
     Raises:
         ShapeError: the tracks differ in length.
@@ -121,7 +121,7 @@ class Take:
         return f"Take({', '.join(parts)})"
 
     def frames(self, rows: slice) -> Take:
-        """Consecutive frames, with what the file held for each of them and the numbers that they had."""
+        """Consecutive frames, with their extras and frame numbers."""
         first, last, step = rows.indices(len(self))
         if step != 1:
             raise ValueRangeError(f"take: found a step of {step} frames, expected consecutive ones")
@@ -156,7 +156,7 @@ def empty_frames(take: Take) -> Tensor:
 
 
 def require_seen(take: Take) -> None:
-    """Checks that every frame shows at least one marker, for what cannot do without.
+    """Checks that every frame shows at least one marker, for methods that need one.
 
     Raises:
         ValueRangeError: a frame shows none; the message names the file that the take was read from.

@@ -1,4 +1,4 @@
-"""A planted camera comes back from pictures of a checkerboard, and useless pictures are refused by name."""
+"""A planted camera comes back from pictures of a checkerboard, and useless images are refused by name."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_useless_pictures_are_refused(pictures: list[Tensor]) -> None:
     bent = view("bent.png", TURNS[1], (10, 30), off=5.0)
     report = calibrate_views([*views, bent], BOARD)
     assert [name for name, _ in report.left_out] == ["bent.png"]
-    assert "pixels off" in report.left_out[0][1]
+    assert "pixels from where" in report.left_out[0][1]
     with pytest.raises(ShapeError, match="found b with 600 x 480 pixels and a with 640 x 480"):
         find_boards(iter([("a", pictures[0]), ("b", pictures[1][:, :600])]), BOARD, lambda line: None)
 
@@ -170,5 +170,5 @@ def test_bad_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert not (tmp_path / "camera.toml").exists()
     with pytest.raises(ValueRangeError, match="3 to 100 inner corners"):
         Board(2, 6)
-    with pytest.raises(FileFormatError, match="found no picture"):
+    with pytest.raises(FileFormatError, match="found no image"):
         calibrate([], BOARD, tmp_path / "camera.toml")

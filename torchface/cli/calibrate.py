@@ -1,4 +1,4 @@
-"""``torchface calibrate``: a camera's focal length and lens distortion from pictures of a checkerboard."""
+"""``torchface calibrate``: a camera's focal length and lens distortion from images of a checkerboard."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def calibrate(
     square: float = 25.0,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate a camera from pictures of a checkerboard, or a video of one, and write it as .toml.
+    """Calibrate a camera from images of a checkerboard, or a video of one, and write it as .toml.
 
     Hold the board at ten or more places: tilted this way and that, near, far, and in the corners of the image. Beside
-    OUT lies a picture of the corners found and of the same views without distortion, in which the board is straight.
+    OUT lies an image of the corners found and of the same views without distortion, in which the board is straight.
 
     Args:
         images: Image files of one size, five at least that differ, or one video.
@@ -41,5 +41,5 @@ def calibrate(
         report = run(images, Board(int(match[1]), int(match[2]), square), out, progress)
     for line in report.lines():
         console.print(line, highlight=False, markup=False)
-    for path in (report.picture, out):
+    for path in (report.overlay_path, out):
         print(path)

@@ -19,7 +19,7 @@ _SUFFIXES = "'.c3d', '.trc' or '.csv'"
 
 
 def load_take(path: str | Path, unit: str | None = None) -> Take:
-    """Reads a performance; a ``.csv`` is told by its header.
+    """Reads a performance; the kind of a ``.csv`` follows from its header.
 
     ==================================== =====================================================
     ``.c3d``                             markers, :func:`torchface.io.markers.c3d.load_c3d`
@@ -91,10 +91,10 @@ def save_take(take: Take, path: str | Path) -> None:
         raise FileFormatError(f"{path}: found the suffix {path.suffix!r}, expected {_SUFFIXES}")
     if take.weights is not None:
         return save_live_link(take, path) if are_live_link_shapes(take.weights.names) else save_weights_csv(take, path)
-    held = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]
-    if len(held) != 1:
+    present = [name for name in ("markers", "landmarks") if getattr(take, name) is not None]
+    if len(present) != 1:
         raise ValueRangeError(
-            f"{path}: found a take of {' and '.join(held) or 'no track'}, expected one of them for a .csv; "
+            f"{path}: found a take of {' and '.join(present) or 'no track'}, expected one of them for a .csv; "
             "save_markers_csv and save_landmarks_csv each write theirs"
         )
     return save_markers_csv(take, path) if take.markers is not None else save_landmarks_csv(take, path)

@@ -22,7 +22,7 @@ from torchface.rendering.compositing import save_picture, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.figures.site_views import error_rounds, site_views
-from torchface.workflows.marker_input import AS_THEY_ARE, MarkerOptions, read_range_of_motion
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, read_range_of_motion
 
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
@@ -146,7 +146,7 @@ def attach(
     picture: Path | None = None,
     part: str | None = None,
     progress: Progress | None = None,
-    options: MarkerOptions = AS_THEY_ARE,
+    options: MarkerOptions = DEFAULT_OPTIONS,
     insist: bool = False,
 ) -> AttachReport:
     """Reads, finds the sites, writes them; see ``torchface attach --help`` for the arguments.

@@ -127,7 +127,7 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     Raises:
         FileFormatError: ``out`` is no ``.toml``, or a file is broken.
         ShapeError: the images differ in size.
-        AlignmentError: the board is found in fewer than five views, or leave the focal length open.
+        AlignmentError: the board is found in fewer than five views, or they leave the focal length open.
 
     Source: Zhang 2000; thesis 4.2.4.
     """
@@ -221,9 +221,14 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
     left = list(left_out)
     _check_count(views, left)
     fit = _fit(views, board)
-    outliers = [i for i, error in enumerate(fit.errors) if error > max(0.5, _MAX_ERROR_RATIO * float(np.median(fit.errors)))]
+    outliers = [
+        i for i, error in enumerate(fit.errors) if error > max(0.5, _MAX_ERROR_RATIO * float(np.median(fit.errors)))
+    ]
     if outliers:
-        left += [(views[i].name, f"its corners are {fit.errors[i]:.1f} pixels from where the camera predicts them") for i in outliers]
+        left += [
+            (views[i].name, f"its corners are {fit.errors[i]:.1f} pixels from where the camera predicts them")
+            for i in outliers
+        ]
         views = [view for i, view in enumerate(views) if i not in outliers]
         _check_count(views, left)
         fit = _fit(views, board)
@@ -241,7 +246,9 @@ def calibrate_views(views: Sequence[View], board: Board, left_out: Sequence[tupl
             f"{_MAX_FOCAL_DEVIATION:.0%}: add views with the board tilted more, and nearer to the image's corners"
         )
     height, width = views[0].image.shape
-    camera = CameraCalibration(torch.from_numpy(fit.K), torch.from_numpy(fit.distortion), int(width), int(height), fit.error)
+    camera = CameraCalibration(
+        torch.from_numpy(fit.K), torch.from_numpy(fit.distortion), int(width), int(height), fit.error
+    )
     names = tuple(view.name for view in views)
     return CalibrationReport(camera, names, torch.from_numpy(fit.errors), tuple(left), focal_deviation, tilt)
 

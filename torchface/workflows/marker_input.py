@@ -1,4 +1,4 @@
-"""A marker take from disk as a command wants it: in millimetres, with the attachment's labels, cut to some frames."""
+"""A marker take from disk: in millimetres, by an attachment's labels, cut to some frames."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class MarkerOptions:
     frames: str | None = None
 
 
-AS_THEY_ARE = MarkerOptions()
+DEFAULT_OPTIONS = MarkerOptions()
 """In the file's own unit, by its own labels, all frames."""
 
 
-def read_markers(path: Path, known: Sequence[str] | None, options: MarkerOptions) -> tuple[Take, list[str]]:
-    """The take with the markers of an attachment alone, by its labels, all frames; and what to tell the user.
+def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOptions) -> tuple[Take, list[str]]:
+    """The take with the markers of an attachment alone, by its labels, all frames; and remarks for the user.
 
     Args:
         path: ``.c3d``, ``.trc`` or ``.csv``.
-        known: the attachment's labels; all labelled markers of the file where there is none.
+        labels: the attachment's; all labelled markers of the file where there is none.
         options: unit and label map.
 
     Raises:
@@ -58,7 +58,7 @@ def read_markers(path: Path, known: Sequence[str] | None, options: MarkerOptions
     renamed = None if options.labels is None else load_label_map(options.labels)
     try:
         found = take.markers.names
-        match = own_labels(found, renamed) if known is None else match_labels(found, known, renamed)
+        match = own_labels(found, renamed) if labels is None else match_labels(found, labels, renamed)
     except NameMismatchError as error:
         raise NameMismatchError(f"{path}: {error}") from error
     chosen = take.markers.select(match.channels)
@@ -66,35 +66,36 @@ def read_markers(path: Path, known: Sequence[str] | None, options: MarkerOptions
 
 
 def read_range_of_motion(
-    path: Path, start: Attachment | None, options: MarkerOptions
+    path: Path, initial: Attachment | None, options: MarkerOptions
 ) -> tuple[Take, Attachment | None, list[str]]:
-    """The frames of a range of motion with the markers that are seen in them, the sites of these, and what to tell.
+    """The frames of a range of motion with the markers that are seen in them, the sites of these, and remarks.
 
     Args:
         path: ``.c3d``, ``.trc`` or ``.csv``.
-        start: sites to begin with, if there are any.
+        initial: sites to begin with, if there are any.
         options: unit, label map, frames.
 
     Raises:
         TorchfaceError: as ``read_markers`` and ``frame_span``.
     """
-    take, notes = read_markers(path, None if start is None else start.labels, options)
+    take, notes = read_markers(path, None if initial is None else initial.labels, options)
     take = take.frames(frame_span(options.frames, len(take)))
     assert take.markers is not None
     seen = (~torch.isnan(take.markers.values).any(-1)).any(0).tolist()
     labels = [name for name, shown in zip(take.markers.names, seen, strict=True) if shown]
-    unseen = [name for name in (take.markers.names if start is None else start.labels or ()) if name not in labels]
+    unseen = [name for name in (take.markers.names if initial is None else initial.labels or ()) if name not in labels]
     if unseen:
         more = f" and {len(unseen) - _SHOWN} more" if len(unseen) > _SHOWN else ""
         notes.append(f"no site for {', '.join(unseen[:_SHOWN])}{more}: seen in no frame")
-    return replace(take, markers=take.markers.select(labels)), None if start is None else start.select(labels), notes
+    sites = None if initial is None else initial.select(labels)
+    return replace(take, markers=take.markers.select(labels)), sites, notes
 
 
 def frame_span(frames: str | None, count: int) -> slice:
     """The rows that ``A:B`` means of a take of ``count`` frames.
 
     Raises:
-        ValueRangeError: it is no such text, or leaves no frame.
+        ValueRangeError: it is another text, or leaves no frame.
     """
     if frames is None:
         return slice(0, count)

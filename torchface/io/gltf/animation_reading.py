@@ -11,7 +11,7 @@ import torch
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.container import Document, read_document, shown
 from torchface.io.gltf.primitives import read_target_names
-from torchface.io.tables.frame_rates import FASTEST, SLOWEST, simplest_rate
+from torchface.io.tables.frame_rates import MAX_FPS, MIN_FPS, simplest_rate
 from torchface.io.tables.numbered_csv import DEFAULT_RATE
 from torchface.take import Take, Track
 
@@ -89,6 +89,6 @@ def _rate(document: Document, times: np.ndarray) -> float:
         raise document.error("animations[0]", f"keys {worst} s apart, the mean being {step:.6f}", "even frames")
     slack = 2 * float(np.spacing(np.float32(times[-1])))
     rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
-    if not SLOWEST <= rate <= FASTEST:
-        raise document.error("animations[0]", f"{rate:.4g} frames a second", f"{SLOWEST} to {FASTEST:.0f}")
+    if not MIN_FPS <= rate <= MAX_FPS:
+        raise document.error("animations[0]", f"{rate:.4g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
     return rate

@@ -12,11 +12,11 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 
-_LARGEST_FILE = 64 * 2**20
-_MOST_PARTS = 1000
-_MOST_FACES = 100_000
-_MOST_ROWS = 10_000_000
-_LARGEST_NUMBER = 1e6
+_MAX_BYTES = 64 * 2**20
+_MAX_PARTS = 1000
+_MAX_FACES = 100_000
+_MAX_ROWS = 10_000_000
+_MAX_COORDINATE = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def load_dlib_faces(path: str | Path) -> list[LabelledFace]:
     parser.EntityDeclHandler = reader.entity
     parser.ExternalEntityRefHandler = reader.entity
     try:
-        parser.Parse(read_file(path, _LARGEST_FILE), True)
+        parser.Parse(read_file(path, _MAX_BYTES), True)
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise FileFormatError(f"{path}: not readable XML ({error})") from error
     if not reader.is_dataset:
@@ -98,8 +98,8 @@ class _Reader:
             if self._box is None:
                 raise FileFormatError(f"{self.path}: found a <part> outside a <box>, expected each inside one")
             name = self._text(attributes, "name", tag)
-            if not (name.isascii() and name.isdigit() and len(name) < 10 and int(name) < _MOST_PARTS):
-                raise FileFormatError(f"{self.path}: found a part named {name!r:.40}, expected 0 to {_MOST_PARTS - 1}")
+            if not (name.isascii() and name.isdigit() and len(name) < 10 and int(name) < _MAX_PARTS):
+                raise FileFormatError(f"{self.path}: found a part named {name!r:.40}, expected 0 to {_MAX_PARTS - 1}")
             if int(name) in self._parts:
                 raise FileFormatError(f"{self.path}: found part {name} twice in a face of {self._image}, expected once")
             self._parts[int(name)] = self._number(attributes, "x", tag), self._number(attributes, "y", tag)
@@ -110,9 +110,9 @@ class _Reader:
         elif tag == "box" and self._box is not None:
             count = max(self._parts, default=-1) + 1
             self._rows += count
-            if len(self.faces) >= _MOST_FACES or self._rows > _MOST_ROWS:
+            if len(self.faces) >= _MAX_FACES or self._rows > _MAX_ROWS:
                 raise FileFormatError(
-                    f"{self.path}: found more than {_MOST_FACES} faces or {_MOST_ROWS} landmarks, expected fewer"
+                    f"{self.path}: found more than {_MAX_FACES} faces or {_MAX_ROWS} landmarks, expected fewer"
                 )
             points = torch.full((count, 2), torch.nan, dtype=torch.float64)
             if self._parts:
@@ -133,6 +133,6 @@ class _Reader:
             number = float(text)
         except ValueError:
             number = float("nan")
-        if not abs(number) <= _LARGEST_NUMBER:
+        if not abs(number) <= _MAX_COORDINATE:
             raise FileFormatError(f"{self.path}: found {name}={text!r:.40} in a <{tag}>, expected a number of pixels")
         return number

@@ -10,7 +10,7 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering
+from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras
 from torchface.io.tables.numbered_csv import rate_of
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.take import Take, Track
@@ -53,7 +53,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
     reader.require([_FRAME, _TIME, *columns])
     table = reader.read()
     fps = rate_of(table.column(_FRAME), table.column(_TIME), path)
-    extras = numbering(table.column(_FRAME), first=1, where=str(path))
+    extras = numbering_extras(table.column(_FRAME), first=1, where=str(path))
     positions = table.columns(columns).reshape(-1, len(names), 2).astype(np.float32)
     unseen = np.isnan(positions).any(2)
     if _SUCCESS in table.names:

@@ -35,8 +35,8 @@ from torchface.io.tables.frame_rates import check_rate, frame_numbers, simplest_
 from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
-_MOST = 65535
-_LONGEST_PARAMETER = 32000  # bytes: many readers take the offset to the next one for a signed 16-bit number
+_MAX_COUNT = 65535
+_MAX_PARAMETER_BYTES = 32000  # bytes: many readers take the offset to the next one for a signed 16-bit number
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 
 
@@ -87,8 +87,8 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     return marker_take(path, fps, _labels(sections, int(points)), positions, extras)
 
 
-def _number(sections: Sections, name: str, otherwise: float) -> float:
-    return (sections.numbers(name) or [otherwise])[0]
+def _number(sections: Sections, name: str, default: float) -> float:
+    return (sections.numbers(name) or [default])[0]
 
 
 def _first_frame(sections: Sections) -> int:
@@ -99,13 +99,13 @@ def _first_frame(sections: Sections) -> int:
 
 
 def _frame_counts(sections: Sections) -> list[float]:
-    """What the file's fields say, the most trusted first; the header's own 16 bits end at frame 65,535."""
+    """What the file's fields say, the most reliable first; the header's own 16 bits end at frame 65,535."""
     header = sections.header
     last = sections.numbers("TRIAL:ACTUAL_END_FIELD")
     counts = []
     if len(last) >= 2:
         counts.append(last[0] + 65536 * last[1] - _first_frame(sections) + 1)
-    if header.last_frame < _MOST:
+    if header.last_frame < _MAX_COUNT:
         counts.append(header.last_frame - header.first_frame + 1)
     counts += sections.numbers("POINT:LONG_FRAMES")[:1] + sections.numbers("POINT:FRAMES")[:1]
     counts.append(header.last_frame - header.first_frame + 1)
@@ -197,9 +197,9 @@ def save_c3d(take: Take, path: str | Path) -> None:
     first, last = numbers[0], numbers[0] + frames - 1
     if numbers[-1] != last or first < 1:  # C3D numbers its frames without gaps
         first, last = 1, frames
-    if points > _MOST or last > 2**32 - 1:
+    if points > _MAX_COUNT or last > 2**32 - 1:
         raise ValueRangeError(
-            f"{path}: found {points} points up to frame {last}, expected at most {_MOST} and 2^32 - 1"
+            f"{path}: found {points} points up to frame {last}, expected at most {_MAX_COUNT} and 2^32 - 1"
         )
     header = Header(points, 0, first, last, -1.0, 0, fps)
     head = pack_sections(header, _groups(labels, header, frames, path), path)
@@ -216,13 +216,13 @@ def _groups(labels: Sequence[str], header: Header, frames: int, path: Path) -> d
         "USED": Parameter(2, (), struct.pack("<H", header.points)),
         "SCALE": Parameter(4, (), struct.pack("<f", header.scale)),
         "RATE": Parameter(4, (), struct.pack("<f", header.rate)),
-        "FRAMES": Parameter(2, (), struct.pack("<H", min(frames, _MOST))),
+        "FRAMES": Parameter(2, (), struct.pack("<H", min(frames, _MAX_COUNT))),
         "UNITS": Parameter(-1, (2,), b"mm"),
         "X_SCREEN": Parameter(-1, (2,), b"+X"),
         "Y_SCREEN": Parameter(-1, (2,), b"+Y"),
         **_label_parameters(labels, path),
     }
-    if frames > _MOST:
+    if frames > _MAX_COUNT:
         point["LONG_FRAMES"] = Parameter(4, (), struct.pack("<f", frames))
     trial = {
         "ACTUAL_START_FIELD": Parameter(2, (2,), struct.pack("<I", header.first_frame)),
@@ -245,10 +245,10 @@ def _label_parameters(labels: Sequence[str], path: Path) -> dict[str, Parameter]
     if long:
         raise NameMismatchError(f"{path}: found the label {quoted(long)}, expected at most 255 bytes each")
     width = max(map(len, texts))
-    most = min(255, _LONGEST_PARAMETER // width)
+    per_parameter = min(255, _MAX_PARAMETER_BYTES // width)
     parameters = {}
-    for i in range(0, len(texts), most):
-        some, number = texts[i : i + most], "" if i == 0 else str(i // most + 1)
+    for i in range(0, len(texts), per_parameter):
+        some, number = texts[i : i + per_parameter], "" if i == 0 else str(i // per_parameter + 1)
         joined = b"".join(text.ljust(width) for text in some)
         parameters[f"LABELS{number}"] = Parameter(-1, (width, len(some)), joined)
         parameters[f"DESCRIPTIONS{number}"] = Parameter(-1, (1, len(some)), b" " * len(some))

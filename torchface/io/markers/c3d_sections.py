@@ -1,4 +1,4 @@
-"""The header and the parameter section of C3D files, the part of the format that says what the data are.
+"""The header and the parameter section of C3D files, which describe the data.
 
 Source: The C3D File Format User Guide, Motion Lab Systems.
 """
@@ -16,7 +16,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 BLOCK = 512
 INTEL, DEC, MIPS = 84, 85, 86
 _MAGIC = 0x50
-_MOST_BLOCKS = 255
+_MAX_BLOCKS = 255
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Sections:
-    """What a file says about itself; parameters go by ``GROUP:NAME`` in capitals."""
+    """A file's description of itself; parameters go by ``GROUP:NAME`` in capitals."""
 
     processor: int
     header: Header
@@ -109,7 +109,7 @@ def read_sections(data: bytes, path: Path) -> Sections:
     (data_block,) = struct.unpack_from(order + "H", data, 16)
     scale, rate = (float(floats(data[at : at + 4], processor)[0]) for at in (12, 20))
     header = Header(points, analog, first_frame, last_frame, scale, data_block, rate)
-    stop = min(len(data), start + BLOCK * (blocks or _MOST_BLOCKS))
+    stop = min(len(data), start + BLOCK * (blocks or _MAX_BLOCKS))
     return Sections(processor, header, _read_parameters(data[start + 4 : stop], order, path))
 
 
@@ -171,9 +171,9 @@ def pack_sections(header: Header, groups: dict[str, dict[str, Parameter]], path:
         )
 
     blocks = -(-(4 + len(section(0)) + 2) // BLOCK)  # at least two zeros mark the end
-    if blocks > _MOST_BLOCKS:
+    if blocks > _MAX_BLOCKS:
         raise ValueRangeError(
-            f"{path}: found labels that fill {blocks} blocks of 512 bytes, expected at most {_MOST_BLOCKS}"
+            f"{path}: found labels that fill {blocks} blocks of 512 bytes, expected at most {_MAX_BLOCKS}"
         )
     first = struct.pack(
         "<BB5HfHHf",

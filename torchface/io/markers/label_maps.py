@@ -1,4 +1,4 @@
-"""Tables that say what a take's marker labels are called in an attachment."""
+"""Tables of a take's marker labels and what an attachment calls them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchface.files.whole_files import read_file
 from torchface.io.tables.csv_table import quoted
 
 HEADER = ("take", "attachment")
-_LARGEST = 2**22
+_MAX_BYTES = 2**22
 
 
 def load_label_map(path: str | Path) -> dict[str, str]:
@@ -29,7 +29,7 @@ def load_label_map(path: str | Path) -> dict[str, str]:
     """
     path = Path(path)
     try:
-        rows = list(csv.reader(io.StringIO(read_file(path, _LARGEST).decode("utf-8-sig"), newline="")))
+        rows = list(csv.reader(io.StringIO(read_file(path, _MAX_BYTES).decode("utf-8-sig"), newline="")))
     except (UnicodeDecodeError, csv.Error) as error:
         raise FileFormatError(f"{path}: no table of labels ({error}), expected rows of take,attachment") from error
     renamed: dict[str, str] = {}

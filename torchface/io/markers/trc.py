@@ -9,8 +9,8 @@ import numpy as np
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
-from torchface.io.tables.csv_table import LARGEST_TABLE, number_texts, parse_number, quoted
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering
+from torchface.io.tables.csv_table import MAX_TABLE_BYTES, number_texts, parse_number, quoted
+from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
 
@@ -40,7 +40,7 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     """
     path = Path(path)
     try:
-        lines = read_file(path, LARGEST_TABLE).decode("utf-8-sig").split("\n")
+        lines = read_file(path, MAX_TABLE_BYTES).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path}: found bytes that are no UTF-8 ({error.reason}), expected a TRC file") from error
     rows = [(number + 1, line.rstrip("\r").split("\t")) for number, line in enumerate(lines) if line.strip()]
@@ -68,7 +68,7 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
             f"{path}: found {len(body)} rows and NumFrames {fields['NumFrames'][:40]}, expected the same, not 0"
         )
     table = np.array([_row(cells, 2 + 3 * len(labels), number, path) for number, cells in body])
-    extras = numbering(table[:, 0], first=1, where=str(path))
+    extras = numbering_extras(table[:, 0], first=1, where=str(path))
     return marker_take(path, fps, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.whole_files import read_file, write_file
 
-LARGEST_TABLE = 2**29
+MAX_TABLE_BYTES = 2**29
 """Bytes of text; two hours of 60 fps Live Link Face stay below."""
 
-_LARGEST_NUMBER = float(np.finfo(np.float32).max)
+_MAX_NUMBER = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Table:
 
 
 class TableReader:
-    """A file whose header is read, and whose rows wait until it is known what they are.
+    """A file whose header is read, and whose rows are read once their columns are known.
 
     Args:
         path: the file, UTF-8, its first row the header.
@@ -50,7 +50,7 @@ class TableReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         try:
-            text = read_file(path, LARGEST_TABLE).decode("utf-8-sig")
+            text = read_file(path, MAX_TABLE_BYTES).decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise FileFormatError(
                 f"{path}: found bytes that are no UTF-8 ({error.reason}), expected a table"
@@ -81,7 +81,7 @@ class TableReader:
 
         Args:
             texts: columns that are kept as they stand; every other holds numbers.
-            is_blank: tells a row that may be short of cells: the missing ones count as empty.
+            is_blank: whether a row may be short of cells; the missing ones count as empty.
 
         Raises:
             FileFormatError: a row has too few or too many cells, or a number is none, or is infinite.
@@ -118,7 +118,7 @@ class TableReader:
         if joined.isascii() and "_" not in joined:  # Python would take 1_000 and other scripts' digits for numbers
             try:
                 values = list(map(float, wanted))
-                if all(-_LARGEST_NUMBER <= value <= _LARGEST_NUMBER or value != value for value in values):
+                if all(-_MAX_NUMBER <= value <= _MAX_NUMBER or value != value for value in values):
                     return values
             except ValueError:
                 pass
@@ -142,15 +142,15 @@ def parse_number(cell: str) -> float | None:
         value = float(cell) if cell.isascii() and "_" not in cell else None
     except ValueError:
         return None
-    if value is None or abs(value) > _LARGEST_NUMBER:
+    if value is None or abs(value) > _MAX_NUMBER:
         return None
     return value
 
 
-def quoted(names: Sequence[str], most: int = 5) -> str:
+def quoted(names: Sequence[str], limit: int = 5) -> str:
     """The first few, short enough for a message."""
-    shown = ", ".join(repr(name if len(name) <= 40 else name[:37] + "...") for name in names[:most])
-    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
+    shown = ", ".join(repr(name if len(name) <= 40 else name[:37] + "...") for name in names[:limit])
+    return shown + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:

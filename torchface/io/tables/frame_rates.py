@@ -1,4 +1,4 @@
-"""Frame rates and frame numbers as files tell them."""
+"""Frame rates and frame numbers in files."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import torch
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.take import Take
 
-SLOWEST, FASTEST = 0.01, 10_000.0
-USUAL = (
+MIN_FPS, MAX_FPS = 0.01, 10_000.0
+COMMON_RATES = (
     *(24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0),
     *(60000 / 1001, 60.0, 72.0, 90.0, 100.0),
     *(120000 / 1001, 120.0),
 )
 """Rates that cameras run at."""
 
-_LARGEST_NUMBER = 2**32 - 1
+_MAX_FRAME_NUMBER = 2**32 - 1
 
 
 def check_rate(fps: float, where: str, error: type[TorchfaceError] = FileFormatError) -> float:
     """The rate itself, where it can be one of a camera's; ``where`` begins the message."""
-    if not SLOWEST <= fps <= FASTEST:
-        raise error(f"{where}: found {fps} frames a second, expected {SLOWEST} to {FASTEST:.0f}")
+    if not MIN_FPS <= fps <= MAX_FPS:
+        raise error(f"{where}: found {fps} frames a second, expected {MIN_FPS} to {MAX_FPS:.0f}")
     return float(fps)
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
-    """A usual rate, or else the fraction of the smallest denominator up to 1001, that says the same as ``rate``.
+    """A common rate, or else the fraction of the smallest denominator up to 1001, that equals ``rate`` as written.
 
     A file that holds 59.94006 in few digits meant 60000/1001. Where nothing ``agrees``, the rate stays.
 
@@ -39,12 +39,12 @@ def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
         >>> simplest_rate(59.94005966, lambda rate: abs(rate - 59.94005966) < 1e-6) == 60000 / 1001
         True
     """
-    usual = sorted(USUAL, key=lambda other: abs(other - rate))[:2]
+    usual = sorted(COMMON_RATES, key=lambda other: abs(other - rate))[:2]
     fractions = [float(Fraction(rate).limit_denominator(largest)) for largest in (1, 10, 1001)]
     return next((candidate for candidate in (*usual, *fractions) if candidate > 0 and agrees(candidate)), rate)
 
 
-def jumps(steps: np.ndarray) -> tuple[tuple[int, int], ...]:
+def frame_gaps(steps: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Where frames were dropped, as (row, how many are missing before it); ``steps`` (T-1,) are frames from row to row.
 
     A negative count says that the numbering, or the clock, falls back there.
@@ -53,13 +53,13 @@ def jumps(steps: np.ndarray) -> tuple[tuple[int, int], ...]:
     return tuple((int(row) + 1, int(missing[row])) for row in np.flatnonzero(missing))
 
 
-def numbering(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
+def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
     """What ``Take.extras`` keeps of a file's frame numbers (T,): nothing where they simply count up from ``first``.
 
     Raises:
         FileFormatError: a number is no whole one, is negative, or does not rise.
     """
-    if not np.all((numbers >= 0) & (numbers <= _LARGEST_NUMBER) & (numbers == np.floor(numbers))):
+    if not np.all((numbers >= 0) & (numbers <= _MAX_FRAME_NUMBER) & (numbers == np.floor(numbers))):
         raise FileFormatError(
             f"{where}: found frame numbers that are negative or no whole numbers, expected 0, 1, 2, ..."
         )
@@ -72,7 +72,7 @@ def numbering(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
     if len(numbers) == 0 or (numbers[0] == first and np.all(steps == 1)):
         return {}
     extras: dict[str, Any] = {"frame_numbers": torch.from_numpy(numbers.astype(np.int64))}
-    gaps = jumps(steps)
+    gaps = frame_gaps(steps)
     if gaps:
         extras["gaps"] = gaps
     return extras

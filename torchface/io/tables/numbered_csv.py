@@ -10,12 +10,12 @@ import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import Table, TableReader, number_texts, write_table
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering, simplest_rate
+from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras, simplest_rate
 from torchface.take import Take
 
 COLUMNS = ("frame", "time")
 DEFAULT_RATE = 60.0
-"""Frames a second of a file of one frame at time 0, which tells none."""
+"""Frames a second of a file of one frame at time 0, from which none follows."""
 
 _FULL, _MILLISECONDS = 1e-9, 1e-3
 
@@ -38,7 +38,7 @@ def read_numbered(reader: TableReader, texts: Sequence[str] = ()) -> tuple[Table
         raise FileFormatError(f"{reader.path}: found a header of other columns, expected it to begin with frame,time")
     table = reader.read(texts)
     frames, times = table.numbers[:, 0], table.numbers[:, 1]
-    return table, rate_of(frames, times, reader.path), numbering(frames, first=0, where=str(reader.path))
+    return table, rate_of(frames, times, reader.path), numbering_extras(frames, first=0, where=str(reader.path))
 
 
 def rate_of(frames: np.ndarray, times: np.ndarray, path: Path) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import USUAL, check_rate, jumps
+from torchface.io.tables.frame_rates import COMMON_RATES, check_rate, frame_gaps
 
 _PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
 _DAY = 24 * 3600
@@ -75,9 +75,9 @@ def read_timecodes(texts: Sequence[str], path: Path, first_row: int = 2) -> Timi
     typical = float(np.median(steps[steps > 0]))
     step = float(steps[np.abs(steps - typical) < typical / 2].mean())
     measured = rate_of_base / step
-    usual = min(USUAL, key=lambda rate: abs(rate - measured))
+    usual = min(COMMON_RATES, key=lambda rate: abs(rate - measured))
     fps = usual if abs(measured / usual - 1) <= _TOLERANCE else measured
-    return Timing(check_rate(fps, f"{path}: timecodes"), measured, jumps(steps / step))
+    return Timing(check_rate(fps, f"{path}: timecodes"), measured, frame_gaps(steps / step))
 
 
 def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
@@ -86,7 +86,7 @@ def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
     falls = (rise == 1) & (within < 0) & ~(drop & (seconds[1:] % 60 == 0))  # where numbers are dropped FF falls less
     wraps = (frames[:-1] - frames[1:])[falls]
     if len(steps) and len(wraps):
-        # Where frames were dropped FF falls by less: only the largest falls tell the base.
+        # Where frames were dropped FF falls by less: only the largest falls equal the base.
         typical = float(np.median(steps))
         base = round(float(np.median(wraps[wraps > wraps.max() - typical])) + typical)
         if base > frames.max():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from torchface.errors import FileFormatError
-from torchface.io.tables.frame_rates import USUAL
+from torchface.io.tables.frame_rates import COMMON_RATES
 
 _WINDOW = 15
 _MAX_RATE_CHANGE = 0.1
@@ -54,7 +54,7 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
         what = f"its header says {fps:g} frames a second"
     else:
         return
-    rate = min(USUAL, key=lambda other: abs(other - 1 / usual))
+    rate = min(COMMON_RATES, key=lambda other: abs(other - 1 / usual))
     raise FileFormatError(
         f"{path}: found a variable frame rate: frames last {1000 * usual:.1f} ms as a rule, but {what} "
         f"({1000 * durations.min():.1f} to {1000 * durations.max():.1f} ms); expected an even rate. "

@@ -19,8 +19,9 @@ from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.io.tables.frame_rates import check_rate
 from torchface.io.video.container import reason
-from torchface.io.video.video_file import MAX_FPS, VideoFile
+from torchface.io.video.video_file import VideoFile
 
 _SUFFIXES = (".avi", ".mkv", ".mp4")
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
@@ -41,13 +42,12 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     Raises:
         FileFormatError: another ending, or the file cannot be written.
         ShapeError: no frames, frames that differ in size, or grey ones among those in colour.
-        ValueRangeError: ``fps`` is not a positive number.
+        ValueRangeError: ``fps`` is no camera's.
     """
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
         raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_SUFFIXES)}")
-    if not (math.isfinite(fps) and 0 < fps <= MAX_FPS):
-        raise ValueRangeError(f"fps: found {fps}, expected a positive number")
+    check_rate(fps, "fps", ValueRangeError)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix.lower()}")
     single = _single(frames)
     first = next(single, None)
@@ -117,7 +117,7 @@ def _add_stream(container: OutputContainer, first: Tensor, fps: float) -> VideoS
 def _rate(fps: float, codec: str) -> Fraction:
     """Frames a second as the codec's header can hold it."""
     largest = _MAX_MPEG4_TICKS // math.ceil(fps) if codec == "mpeg4" else 100_000
-    return max(Fraction(fps).limit_denominator(largest), Fraction(1, 100_000))
+    return Fraction(fps).limit_denominator(largest)
 
 
 def _single(frames: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -69,21 +69,21 @@ def load_live_link(path: str | Path) -> Take:
     """
     path = Path(path)
     reader = TableReader(path)
-    spelled = {name.lower(): name for name in reader.header}
-    absent = [name for name in ("Timecode", "BlendshapeCount", *ARKIT) if name.lower() not in spelled]
-    if absent:
+    spelling = {name.lower(): name for name in reader.header}
+    missing = [name for name in ("Timecode", "BlendshapeCount", *ARKIT) if name.lower() not in spelling]
+    if missing:
         raise FileFormatError(
-            f"{path}: found no column {quoted(absent)}, expected Timecode, BlendshapeCount and ARKit's 52 shapes"
+            f"{path}: found no column {quoted(missing)}, expected Timecode, BlendshapeCount and ARKit's 52 shapes"
         )
-    if len(spelled) < len(reader.header) or "" in spelled:
+    if len(spelling) < len(reader.header) or "" in spelling:
         raise FileFormatError(
             f"{path}: found columns without a name, or whose names differ in case only; expected one each"
         )
     rotations = {name.lower() for name in ROTATIONS}
-    texts = [name for key, name in spelled.items() if key not in _SHAPES and key not in rotations]
-    count_column = reader.header.index(spelled[_COUNT])
+    texts = [name for key, name in spelling.items() if key not in _SHAPES and key not in rotations]
+    count_column = reader.header.index(spelling[_COUNT])
     table = reader.read(texts, lambda cells: len(cells) > count_column and cells[count_column].strip() == "0")
-    timing = read_timecodes(table.texts[spelled[_TIMECODE]], path)
+    timing = read_timecodes(table.texts[spelling[_TIMECODE]], path)
     names = tuple(name for name in table.names if name.lower() in _SHAPES)
     columns: dict[str, Any] = {}
     for name in reader.header:
@@ -93,12 +93,12 @@ def load_live_link(path: str | Path) -> Take:
             columns[name] = torch.from_numpy(table.column(name).copy())
     extras = {
         "columns": columns,
-        "blendshape_count": _counts(table.texts[spelled[_COUNT]], path),
+        "blendshape_count": _counts(table.texts[spelling[_COUNT]], path),
         "measured_fps": timing.measured,
         **({"gaps": timing.gaps} if timing.gaps else {}),
     }
     weights = torch.from_numpy(table.columns(names).astype(np.float32))[..., None]
-    return Take(timing.fps, weights=Track(names, weights), timecode=table.texts[spelled[_TIMECODE]], extras=extras)
+    return Take(timing.fps, weights=Track(names, weights), timecode=table.texts[spelling[_TIMECODE]], extras=extras)
 
 
 def _numbers_or_texts(cells: tuple[str, ...]) -> torch.Tensor | tuple[str, ...]:

@@ -22,7 +22,7 @@ VALUES = len(ARKIT) + len(ROTATIONS)
 """How many numbers a packet carries: ARKit's 52 weights and nine rotations."""
 
 _VERSION = 6
-_LONGEST_TEXT = 256
+_MAX_TEXT_BYTES = 256
 _TIME = struct.Struct("!ifii")
 _NUMBERS = struct.Struct(f"!{VALUES}f")
 _ADDRESS = re.compile(r"udp://(?P<host>\[[0-9a-fA-F:.]+\]|[^:/\[\]\s]+):(?P<port>[0-9]{1,5})/?")
@@ -165,14 +165,16 @@ class LiveLinkSender:
 
 def _text(text: str, what: str) -> bytes:
     data = text.encode()
-    if len(data) > _LONGEST_TEXT:
-        raise ValueRangeError(f"live link frame: found a {what} of {len(data)} bytes, expected at most {_LONGEST_TEXT}")
+    if len(data) > _MAX_TEXT_BYTES:
+        raise ValueRangeError(
+            f"live link frame: found a {what} of {len(data)} bytes, expected at most {_MAX_TEXT_BYTES}"
+        )
     return struct.pack("!i", len(data)) + data
 
 
 def _split_text(data: bytes, what: str) -> tuple[str, bytes]:
     length = int.from_bytes(data[:4], "big", signed=True)
-    if len(data) < 4 or not 0 <= length <= min(_LONGEST_TEXT, len(data) - 4):
+    if len(data) < 4 or not 0 <= length <= min(_MAX_TEXT_BYTES, len(data) - 4):
         raise FileFormatError(f"live link packet: found a {what} of {length} bytes in {len(data)}, expected it whole")
     try:
         return data[4 : 4 + length].decode(), data[4 + length :]

@@ -1,4 +1,4 @@
-"""Frames as they come: from a camera at this machine, or from a video played in its own time."""
+"""Frames in real time: from a camera at this machine, or from a video played at its own rate."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.io.video import VideoFile, open_video
 
-_USUAL_RATE = 30.0
-_PATIENCE = 5.0
+_DEFAULT_FPS = 30.0
+_MAX_WAIT = 5.0
 
 
 class PlayedVideo:
-    """A video file whose frames come in their own time, as a camera's would; those that come too early are dropped.
+    """A video file whose frames come at its own rate, as a camera's would; those that come too early are dropped.
 
     Args:
         path: of the file.
@@ -29,18 +29,18 @@ class PlayedVideo:
     """
 
     def __init__(self, path: Path) -> None:
-        self.film: VideoFile = open_video(path)
+        self.video: VideoFile = open_video(path)
         self.dropped = 0
 
     def frames(self) -> Iterator[tuple[float, Tensor]]:
         """When each frame was due, and the frame, uint8 (3,H,W)."""
-        begin = time.perf_counter()
-        for number, frame in enumerate(self.film.color_frames()):
-            due = begin + number / self.film.fps
+        started = time.perf_counter()
+        for number, frame in enumerate(self.video.color_frames()):
+            due = started + number / self.video.fps
             early = due - time.perf_counter()
             if early > 0:
                 time.sleep(early)
-            elif -early > 1 / self.film.fps:  # a camera would have shown the next one by now
+            elif -early > 1 / self.video.fps:  # a camera would have shown the next one by now
                 self.dropped += 1
                 continue
             yield due, frame
@@ -59,7 +59,7 @@ class Camera:
         number: of the device, from 0.
 
     Raises:
-        FileFormatError: there is none, or it gives no picture.
+        FileFormatError: there is none, or it gives no image.
     """
 
     def __init__(self, number: int) -> None:
@@ -71,7 +71,7 @@ class Camera:
             raise FileFormatError(f"camera {number}: cannot be opened, expected the number of a device, from 0")
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         height, width = frame.shape[:2]
-        self.film = VideoFile(Path(f"camera {number}"), rate if 1 <= rate <= 1000 else _USUAL_RATE, width, height, 1)
+        self.video = VideoFile(Path(f"camera {number}"), rate if 1 <= rate <= 1000 else _DEFAULT_FPS, width, height, 1)
         self.dropped = 0
         self._newest: tuple[float, object] | None = None
         self._change = threading.Condition()
@@ -83,7 +83,7 @@ class Camera:
         """When each frame came, and the frame, uint8 (3,H,W); until the camera gives no more."""
         while True:
             with self._change:
-                self._change.wait_for(lambda: self._newest is not None or not self._open, _PATIENCE)
+                self._change.wait_for(lambda: self._newest is not None or not self._open, _MAX_WAIT)
                 newest, self._newest = self._newest, None
             if newest is None:
                 return
@@ -107,5 +107,5 @@ class Camera:
 
     def __exit__(self, *error: object) -> None:
         self._open = False
-        self._thread.join(_PATIENCE)
+        self._thread.join(_MAX_WAIT)
         self._capture.release()

@@ -26,8 +26,8 @@ from torchface.workflows.track.track_files import save_curves
 from torchface.workflows.track.track_models import TrackModels, load_track_models
 from torchface.workflows.track.track_video import TrackSettings, camera_of, load_actor, solver_for
 
-_FEWEST = 6
-_EYES = 6
+_MIN_LANDMARKS = 6
+_EYE_ANGLES = 6
 _DEFAULT = TrackSettings()
 
 
@@ -83,7 +83,7 @@ class LiveSolver:
         rig: the actor's, with its 68 landmarks.
         models: what tracks and solves.
         calibration: of the camera.
-        face: which of several, the largest first.
+        face: number of the face, the largest first.
     """
 
     def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
@@ -99,7 +99,7 @@ class LiveSolver:
         seen = self._tracker.step(frame)
         landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
         pose = self._poses.step(landmarks, seen.confidence)
-        enough = int(torch.isfinite(landmarks).all(1).sum()) >= _FEWEST
+        enough = int(torch.isfinite(landmarks).all(1).sum()) >= _MIN_LANDMARKS
         if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
         before = self._state or self._solver.start()
@@ -122,7 +122,7 @@ def track_live(
     """Solves what a camera sees and sends it in Live Link Face's packets, until it ends or is interrupted.
 
     Args:
-        camera: a device's number, or a video file, which is played in its own time.
+        camera: a device's number, or a video file, which is played at its own rate.
         rig: the actor's.
         address: ``udp://HOST:PORT``.
         out: a folder for the curves of what was sent; none are kept without.
@@ -140,28 +140,28 @@ def track_live(
     source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
     with source:
         models = load_track_models(
-            actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.film.fps
+            actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.video.fps
         )
-        calibration = camera_of(source.film, settings.camera)
+        calibration = camera_of(source.video, settings.camera)
         solver = LiveSolver(actor, models, calibration, settings.face)
         rows: list[LiveFrame] = []
         latency: list[float] = []
-        begin = time.perf_counter()
-        with LiveLinkSender(address, actor.names, source.film.fps) as sender:
+        started = time.perf_counter()
+        with LiveLinkSender(address, actor.names, source.video.fps) as sender:
             try:
                 for came, frame in source.frames():
                     solved = solver.step(frame)
                     angles = head_angles(solved.rotation.double()).nan_to_num(0.0)
-                    sender.send(solved.weights, torch.cat([angles, angles.new_zeros(_EYES)]))
+                    sender.send(solved.weights, torch.cat([angles, angles.new_zeros(_EYE_ANGLES)]))
                     now = time.perf_counter()
                     latency.append(1000 * (now - came))
                     rows.append(solved)
                     progress(f"sending to {address}", len(rows))
-                    if seconds is not None and now - begin >= seconds:
+                    if seconds is not None and now - started >= seconds:
                         break
             except KeyboardInterrupt:  # how people end what has no end of its own
                 pass
-        took = time.perf_counter() - begin
+        took = time.perf_counter() - started
     if not rows:
         raise ValueRangeError(f"camera {camera}: found no frame, expected at least one")
     weights = torch.stack([row.weights for row in rows]).float()
@@ -169,9 +169,10 @@ def track_live(
     path = None
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        turned = torch.stack([row.rotation for row in rows])
-        still = torch.where(torch.isfinite(turned), turned, torch.eye(3).to(turned) * turned.new_tensor([1.0, -1, -1]))
-        fps = source.film.fps
-        take = Take(fps, weights=Track(actor.names, weights[..., None]), extras={"columns": rotation_columns(still)})
+        rotations = torch.stack([row.rotation for row in rows])
+        frontal = torch.eye(3).to(rotations) * rotations.new_tensor([1.0, -1, -1])
+        rotations = torch.where(torch.isfinite(rotations), rotations, frontal)
+        track, columns = Track(actor.names, weights[..., None]), rotation_columns(rotations)
+        take = Take(source.video.fps, weights=track, extras={"columns": columns})
         path = save_curves(take, out)["weights"]
     return LiveReport(weights, found, torch.tensor(latency), source.dropped, len(rows) / took, path)

@@ -32,7 +32,7 @@ from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.temporal import OneEuroFilter
-from torchface.workflows.marker_input import AS_THEY_ARE, MarkerOptions, frame_span, read_markers
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers
 from torchface.workflows.solve.head_camera import HeadCamera, Predicted, predicted_curves
 from torchface.workflows.solve.solution import Solution, SolveReport
 from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
@@ -179,7 +179,7 @@ def solve_take(
     stream: str | None = None,
     camera: HeadCamera | None = None,
     progress: Progress | None = None,
-    options: MarkerOptions = AS_THEY_ARE,
+    options: MarkerOptions = DEFAULT_OPTIONS,
     live_link: Path | None = None,
 ) -> SolveReport:
     """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
