@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from torchface import zoo
+from torchface.capture.action_units import RegionGroup
+from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
 from torchface.capture.priors import (
     DynamicsPrior,
     DynamicsSettings,
@@ -56,13 +58,17 @@ def under_old_keys(folder: Path, renames: Mapping[str, str], config: Mapping[str
         old[key.removesuffix(matching[0][1]) + matching[0][0] if matching else key] = tensor
     state = safetensors.torch.save(old)
     document = tomllib.loads((folder / DESCRIPTION).read_text())
+    document["config"] = renamed(document["config"], {now: before for before, now in (config or {}).items()})
     document |= {"sha256": hashlib.sha256(state).hexdigest(), "size": len(state)}
-    for before, now in (config or {}).items():
-        if now in document["config"]:
-            document["config"][before] = document["config"].pop(now)
     (folder / STATE).write_bytes(state)
     (folder / DESCRIPTION).write_text(tomli_w.dumps(document))
     return set(old)
+
+
+def renamed(value: Any, names: Mapping[str, str]) -> Any:
+    if isinstance(value, dict):
+        return {names.get(key, key): renamed(inner, names) for key, inner in value.items()}
+    return [renamed(inner, names) for inner in value] if isinstance(value, list) else value
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -88,19 +94,31 @@ def dynamics_prior() -> DynamicsPrior:
     return DynamicsPrior.fit(takes, NAMES, 3, settings=DynamicsSettings(inducing=10, subset=50, iterations=2))
 
 
+def action_units() -> ActionUnitClassifier:
+    model = ActionUnitClassifier([RegionGroup("mouth", ("mouth",), ("18L",), ("9",))], [GroupSize(2, 3)], 16)
+    part = model.group_classifiers()[0]
+    part.components.copy_(noise(*part.components.shape))
+    part.machine.weight.copy_(noise(*part.machine.weight.shape, seed=1))
+    part.intensities.copy_(torch.tensor([[0.0], [0.5], [1.0]]))
+    return model
+
+
 def outputs(model: nn.Module) -> list[Tensor]:
     """Numbers that depend on all of a model's state."""
     if isinstance(model, DynamicsPrior):
         return list(model(0.5 + 0.1 * noise(4, 3, 3, seed=5)))
+    if isinstance(model, ActionUnitClassifier):
+        return [model.group_classifiers()[0].scores(noise(4, 1, 16, 16, seed=5), noise(1, 16, 16, seed=6))]
     energy = model.energy(0.2 * noise(4, 3, seed=5).abs())
     return [energy.H, energy.f]
 
 
-@pytest.mark.parametrize("make", [shape_prior, reciprocal_prior, dynamics_prior])
+@pytest.mark.parametrize("make", [action_units, shape_prior, reciprocal_prior, dynamics_prior])
 def test_a_model_saved_under_old_keys_gives_the_same_numbers(make: Any, tmp_path: Path) -> None:
     model, folder = make(), tmp_path / "model"
     kind = zoo.save_model(model, folder, **FACTS).kind
     keys = under_old_keys(folder, STATE_RENAMES[kind], CONFIG_RENAMES.get(kind))
+    assert (read_record(folder).config != model.config) == (kind in CONFIG_RENAMES)
     assert keys != set(model.state_dict())
     for found, wanted in zip(outputs(zoo.get_model(folder)), outputs(model.eval()), strict=True):
         assert torch.equal(found, wanted)

@@ -107,9 +107,9 @@ def performed_groups(labels: list[ActionLabels]) -> tuple[RegionGroup, ...]:
     groups = []
     for group in GROUPS:
         units = tuple(unit for unit in group.units if unit in performed)
-        beside = tuple(unit for unit in group.beside if unit in performed)
+        other_units = tuple(unit for unit in group.other_units if unit in performed)
         if units:
-            groups.append(RegionGroup(group.name, group.regions, units, beside))
+            groups.append(RegionGroup(group.name, group.regions, units, other_units))
     return tuple(groups)
 
 

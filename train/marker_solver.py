@@ -34,7 +34,7 @@ class Settings:
         sparsity: Price of an active shape, mm² a marker.
         ridge: Price of a squared weight, mm² a marker.
         noise: Of the markers in the test, millimetres a coordinate.
-        frames: Of the made-up take of the test.
+        frames: Of the synthetic take of the test.
         seed: Draws take and noise.
         licence: Under which the model may be used; MIT for the performer, else that of the rig, if absent.
     """
@@ -53,7 +53,7 @@ class Settings:
 
 
 def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
-    """Builds the solver, tests it on a made-up take, saves it."""
+    """Builds the solver, tests it on a synthetic take, saves it."""
     progress = progress or silent
     progress("reading the rig")
     rig = performer(texture=False) if settings.rig is None else load_rig(settings.rig, part=settings.part)
@@ -61,7 +61,7 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
         place_markers(rig, settings.markers) if settings.attachment is None else Attachment.load(settings.attachment)
     )
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
-    progress("solving a made-up take")
+    progress("solving a synthetic take")
     metrics = measure(solver, rig, settings)
     effective = {key: value for key, value in asdict(settings).items() if value is not None}
     effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
@@ -80,7 +80,7 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
             "Weights of blendshapes from 3D markers in millimetres, NaN for not seen; every frame on its own, the "
             "exact minimum. Good for takes of this rig with this layout, in its space; another actor needs another "
             "one. "
-            f"Measured on a made-up take of {settings.frames} frames with {settings.noise} mm of noise a coordinate. "
+            f"Measured on a synthetic take of {settings.frames} frames with {settings.noise} mm of noise a coordinate. "
             "Shapes that no marker sees, such as where the eyes look, stay at rest."
         ),
         settings=effective,
@@ -89,7 +89,7 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
 
 
 def measure(solver: MarkerSolver, rig: BlendshapeRig, settings: Settings) -> dict[str, float]:
-    """Errors of weights, markers and the whole mesh on a made-up take."""
+    """Errors of weights, markers and the whole mesh on a synthetic take."""
     generator = torch.Generator().manual_seed(settings.seed)
     track = perform(settings.frames, generator).weights
     assert track is not None

@@ -1,7 +1,7 @@
 """``python -m train.priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
 
 From weight takes (Live Link Face, CSV), or from marker takes (C3D, TRC, CSV) with ``--rig`` and ``--attachment``: they
-are laid on the rig and solved first. ``--performances 12`` learns from made-up takes of the embedded performer
+are laid on the rig and solved first. ``--performances 12`` learns from synthetic takes of the embedded performer
 instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's own names out of takes with ARKit's.
 """
 
@@ -45,10 +45,10 @@ class Settings:
 
     Args:
         takes: Folder of takes.
-        performances: Learn from so many made-up takes of the embedded performer instead.
-        frames: Of each made-up take.
+        performances: Learn from so many synthetic takes of the embedded performer instead.
+        frames: Of each synthetic take.
         out: Folder for the model, its card and its pictures; two folders, OUT_shape and OUT_dynamics, for both kinds.
-        kind: shape (a bell with heavy tails), reciprocal (the paper's 1/P over a Parzen window),
+        kind: shape (Student's t-distribution), reciprocal (the paper's 1/P over a Parzen window),
             dynamics, or both (shape and dynamics).
         rig: The rig that the priors are for: its names, and marker takes are solved with it.
         attachment: Where the markers of marker takes sit, as JSON.
@@ -64,7 +64,7 @@ class Settings:
         trial_frames: How many frames of each take are solved in a trial.
         inducing: How many windows stand for all others.
         iterations: Of the ascent on the marginal likelihood.
-        seed: Draws made-up takes, windows and noise.
+        seed: Draws synthetic takes, windows and noise.
         licence: Under which the model may be used; MIT for the performer, else that of the takes, if absent.
         pictures: Folder for the pictures; OUT/pictures if absent.
     """
@@ -178,9 +178,9 @@ def _shape(settings: Settings, out: Path, material: Material, progress: Progress
         }
     prior = prior.float()
     card = (
-        "Which weights faces have: "
+        "The density of a face's weights: "
         + (
-            "a bell with heavy tails about the face at rest, with what shapes do together"
+            "Student's t-distribution about the face at rest, with the correlation of shapes"
             if settings.kind != "reciprocal"
             else "the paper's 1/P over a Parzen window for each half of the face"
         )
@@ -230,7 +230,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, progress: Progr
     trial = one_step(prior, test.weights, settings.input_noise)
     metrics = {"window": float(window)} | {f"held out, {key}": value for key, value in trial.metrics().items()}
     card = (
-        f"Where weights will be in the next frame, and how surely, from the last {window} frames at "
+        f"Mean and variance of the next frame's weights from the last {window} frames at "
         f"{learn.fps:g} frames a second: Gaussian processes, one for each region of the face, and a noise that grows "
         "with the motion. Holds a solve to how faces move and bridges frames without landmarks. "
         f"{_limits(settings, material)} Windows carried noise of {settings.input_noise:g} a weight, in learning and in "
@@ -319,10 +319,10 @@ def _limits(settings: Settings, material: Material) -> str:
     silent = f" The takes say nothing of {', '.join(material.silent)}: these stay at 0." if material.silent else ""
     if settings.takes is None:
         return (
-            "It has learned from made-up takes only: twelve gestures with smooth ramps, blinks, glances and syllables "
-            "of an actor made by code. Good for trying the tools, for tests and for footage of that performer; real "
-            "faces combine and time their shapes in ways it has never seen, so learn another prior from real takes for "
-            f"them.{silent}"
+            "It has learned from synthetic takes only: twelve gestures with smooth ramps, blinks, glances and "
+            "syllables of an actor made by code. Good for trying the tools, for tests and for footage of that "
+            "performer; real faces combine and time their shapes in ways it has never seen, so "
+            f"learn another prior from real takes for them.{silent}"
         )
     return f"Good for faces that move as those of these takes do, with a rig of these names.{silent}"
 
@@ -345,7 +345,7 @@ def _save(
     learn, test = material.learn, material.test
     frames = sum(map(len, learn.weights))
     if settings.takes is None:
-        source = f"{len(learn.weights)} made-up takes of the embedded performer, {frames} frames; no person's."
+        source = f"{len(learn.weights)} synthetic takes of the embedded performer, {frames} frames; no person's."
         flags = f"--performances {settings.performances} --frames {settings.frames}"
     else:
         solved = ", solved from markers" if learn.solved else ""

@@ -41,7 +41,7 @@ def test_combination_shapes_are_driven_by_products() -> None:
     shapes = shape_map(base, [*base, "jawOpen_mouthSmileLeft", "jawOpen+mouthSmileLeft+mouthSmileRight"])
     w = torch.tensor([[0.5, 0.4, 0.2]])
     assert shapes(w)[0, 3:].tolist() == pytest.approx([0.2, 0.04])
-    assert shapes.still == ()
+    assert shapes.undriven == ()
 
 
 def test_rules_in_a_table(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_rules_in_a_table(tmp_path: Path) -> None:
     shapes = shape_map(base, ["Smile", "Laugh", "jawOpen", "Wing"], load_shape_rules(table))
     moved = shapes(torch.tensor([[0.5, 0.4, 0.2, 0.9], [0.2, 0.2, 0.1, 0.0]]))
     assert torch.allclose(moved, torch.tensor([[0.6, 0.2, 0.2, 0.0], [0.3, 0.04, 0.1, 0.0]]))
-    assert (shapes.still, shapes.unused) == (("Wing",), ("cheekPuff",))
+    assert (shapes.undriven, shapes.unused) == (("Wing",), ("cheekPuff",))
 
 
 def test_a_frame_that_was_not_seen_stays_unseen_where_it_matters() -> None:
@@ -123,6 +123,6 @@ def test_a_real_performance_reaches_every_shape_that_both_rigs_have(ict_folder: 
     track = load_take(performances[0]).weights
     assert track is not None
     shapes = shape_map(track.names, rig.names)
-    assert set(shapes.still) == {"cheekRaiser_L", "cheekRaiser_R"} & set(rig.names)
+    assert set(shapes.undriven) == {"cheekRaiser_L", "cheekRaiser_R"} & set(rig.names)
     assert set(shapes.unused) == {"TongueOut"}
     assert torch.allclose(shapes(track.values[..., 0]), rig.weights_from(track).clamp(0, 1))

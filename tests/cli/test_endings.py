@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchface.cli import main
-from torchface.cli.ending import told_plainly
+from torchface.cli.ending import plain_errors
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import save_rig, save_take
@@ -54,11 +54,11 @@ def test_folders_are_made_or_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_what_a_system_call_says_is_told_with_the_file(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended, told_plainly():
+    with pytest.raises(SystemExit) as ended, plain_errors():
         raise PermissionError(13, "Permission denied", "/some/file")
     assert ended.value.code == 2
     assert "error: /some/file: Permission denied" in capsys.readouterr().err
-    with pytest.raises(OSError, match="nobody's"), told_plainly():
+    with pytest.raises(OSError, match="nobody's"), plain_errors():
         raise OSError("nobody's")
 
 

@@ -1,4 +1,4 @@
-"""The recipe end to end: made-up takes, weight takes, marker takes, another rig's names, bad input."""
+"""The recipe end to end: synthetic takes, weight takes, marker takes, another rig's names, bad input."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ QUICK = DetectorSettings(hog=HogLayout(stride=4))
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scans")
-    identities = draw_identities(6, torch.Generator().manual_seed(2), spread=0.7)
+    identities = draw_identities(6, torch.Generator().manual_seed(2), scale=0.7)
     settings = ScannerSettings(voxel=2.5, detail=2.5, photography=Photography(height=450))
     write_scans((eyes_closed(performer(identity)) for identity in identities), path, settings)
     return path

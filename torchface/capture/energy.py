@@ -66,7 +66,7 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
     With every marker of every frame seen, H is one matrix (N,N); otherwise it is (B,N,N).
 
     Args:
-        basis: :math:`B`, what a unit of each weight moves each marker, (M,3,N), millimetres.
+        basis: :math:`B`, the delta of each marker for a unit of each weight, (M,3,N), millimetres.
         rest: :math:`b`, where markers are at rest, (M,3), millimetres.
         targets: :math:`t`, where markers were seen, (B,M,3), millimetres; a NaN coordinate means not seen.
 

@@ -17,13 +17,13 @@ from torchface.files.whole_files import read_file
 from torchface.shape_names import mapping
 from torchface.take import Take, Track
 
-_LARGEST_TABLE = 2**20
-_MOST_FACTORS = 8
+_MAX_TABLE = 2**20
+_MAX_FACTORS = 8
 
 
 @dataclass(frozen=True)
 class ShapeRule:
-    r"""What drives one shape of the target rig.
+    r"""The rule that drives one shape of the target rig.
 
     .. math:: w = \mathrm{clip}\Big(g \, \big(\textstyle\sum_i c_i w_i\big) \textstyle\prod_j w_j, \; l, \; u\Big)
 
@@ -46,7 +46,7 @@ class ShapeRule:
 
 @dataclass(frozen=True, eq=False)
 class ShapeMap:
-    """How the weights of one rig become those of another.
+    """The map from the weights of one rig to those of another.
 
     Args:
         from_names, to_names: of the two rigs.
@@ -72,7 +72,7 @@ class ShapeMap:
         return tuple(name for name, is_used in zip(self.from_names, used.tolist(), strict=True) if not is_used)
 
     @property
-    def still(self) -> tuple[str, ...]:
+    def undriven(self) -> tuple[str, ...]:
         """Target shapes that nothing drives."""
         driven = self.matrix.any(1).tolist()
         rows = zip(self.to_names, driven, self.products, strict=True)
@@ -143,7 +143,7 @@ def shape_map(
         tuple(products),
         *(torch.tensor([getattr(rule, limit) for rule in found]) for limit in ("gain", "lower", "upper")),
     )
-    if len(made.still) == len(made.to_names):
+    if len(made.undriven) == len(made.to_names):
         raise NameMismatchError(
             f"retarget: found {', '.join(from_names[:5])}, ..., none of which is a shape of {', '.join(to_names[:5])}, "
             "...; expected common names, or a table that maps them"
@@ -180,7 +180,7 @@ def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(read_file(path, _LARGEST_TABLE).decode())
+        table = tomllib.loads(read_file(path, _MAX_TABLE).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileFormatError(f"{path}: found no TOML ({error}), expected a mapping table") from error
     return {name: _rule(path, name, entry) for name, entry in table.items()}
@@ -200,8 +200,8 @@ def _rule(path: Path, name: str, entry: Any) -> ShapeRule:
         raise fail(f"sum = {factors!r}", "source shapes with a factor each")
     if not isinstance(product, list) or not all(isinstance(source, str) for source in product):
         raise fail(f"product = {product!r}", "a list of source shapes")
-    if len(product) > _MOST_FACTORS:
-        raise fail(f"a product of {len(product)} shapes", f"at most {_MOST_FACTORS}")
+    if len(product) > _MAX_FACTORS:
+        raise fail(f"a product of {len(product)} shapes", f"at most {_MAX_FACTORS}")
     if not factors and not product:
         raise fail("neither sum nor product", "at least one of them")
     limits = {limit: entry[limit] for limit in ("gain", "lower", "upper") if limit in entry}
@@ -241,9 +241,9 @@ def _combination(name: str, from_names: Sequence[str]) -> tuple[int, ...]:
     """The source shapes whose names a combination shape's name joins; none if it joins no others."""
     for joint in ("+", "_"):
         parts = name.split(joint)
-        if not 2 <= len(parts) <= _MOST_FACTORS or not all(parts):
+        if not 2 <= len(parts) <= _MAX_FACTORS or not all(parts):
             continue
-        told = mapping(from_names, parts)
-        if bool((told == 1).any(1).all()) and bool((told.sum(1) == 1).all()):
-            return tuple(int(row.argmax()) for row in told)
+        matches = mapping(from_names, parts)
+        if bool((matches == 1).any(1).all()) and bool((matches.sum(1) == 1).all()):
+            return tuple(int(row.argmax()) for row in matches)
     return ()

@@ -21,7 +21,7 @@ from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
-from torchface.cli.ending import told_plainly
+from torchface.cli.ending import plain_errors
 from torchface.cli.evaluate import evaluate
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not words or words in (["--help"], ["-h"]):
         _overview()
         raise SystemExit(0 if words else 2)
-    with told_plainly():
+    with plain_errors():
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(export_model, prog="torchface export", args=words[1:])
         elif words[:1] == ["export"]:
@@ -93,7 +93,7 @@ def _overview() -> None:
     page = Console()
     page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
     page.print(table, highlight=False)
-    page.print("\ntorchface COMMAND --help tells more of each; torchface --version.", highlight=False)
+    page.print("\ntorchface COMMAND --help shows more of each; torchface --version.", highlight=False)
 
 
 def _export_help() -> None:

@@ -50,7 +50,7 @@ def annotate(
         import_viser()
     with progress_bars(quiet) as progress:
 
-        def track(film: VideoFile) -> tuple[Tensor, Tensor | None]:
+        def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
             from torchface import zoo
             from torchface.errors import NameMismatchError
             from torchface.landmarks import LandmarkTrees
@@ -61,7 +61,7 @@ def annotate(
                 raise NameMismatchError(
                     f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
                 )
-            found = track_landmarks(film, LandmarkTracker(model, face=face), progress)
+            found = track_landmarks(video, LandmarkTracker(model, face=face), progress)
             return found.values, found.confidence
 
         progress("reading")

@@ -1,4 +1,4 @@
-"""``torchface attach``: a range of motion tells where the markers sit."""
+"""``torchface attach``: where the markers sit, fitted to a range of motion."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def attach(
         initial: Where the markers sit roughly: an attachment or landmarks as `torchface pick` writes them, labelled
             like the markers. Without it the pose is found by the markers' shape alone.
         standoff: Markers stand off the skin by one unknown distance: estimate it.
-        picture: Also draw where each marker sat and sits, and its error after each round: .png or .jpg.
+        picture: Also draw where each marker sat and sits, and its error after each iteration: .png or .jpg.
         part: Keep this region of the rig only, such as face.
         labels: What the take's labels are called in INITIAL, and from then on: CSV, a row LABEL OF THE TAKE,LABEL
             each; an empty second cell leaves the marker out, with Jane:* all of a subject's. Unlabelled points and

@@ -14,7 +14,7 @@ _MISTAKE, _STOPPED = 2, 130
 
 
 @contextmanager
-def told_plainly() -> Iterator[None]:
+def plain_errors() -> Iterator[None]:
     """Ends with a message and status 2 where the user made a mistake or a file cannot be used, with 130 on Ctrl-C.
 
     Raises:

@@ -119,18 +119,18 @@ def video_solver(
     Inputs of the graph: `landmarks` (68,2), pixels, NaN where not seen, `confidence` (68,), and what the frame before
     gave, `previous_` and its name; all NaN for the first frame. Outputs: `weights` (N,), `rotation` (3,3),
     `translation` (3,), millimetres, and with a dynamics prior `window`, `mean` and `covariance`. Pixels are of pictures
-    without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a film. The
+    without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a video. The
     settings are those of `torchface track`, and in the file's metadata.
 
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
         camera: The camera's calibration, as `torchface calibrate` writes it.
         out: The .onnx file to write.
-        prior: Which weights faces have: a model's name in the zoo, or a folder.
-        dynamics: How weights go on: a model's name in the zoo, or a folder.
+        prior: A shape prior: a model's name in the zoo, or a folder.
+        dynamics: A dynamics prior: a model's name in the zoo, or a folder.
         fps: Frames a second of the application's camera; those that the dynamics prior has learned if absent.
         landmarks: The landmarks.csv that `torchface track` wrote of a video of this camera, to check the graph with; a
-            made-up film if absent.
+            synthetic video if absent.
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
@@ -144,11 +144,11 @@ def video_solver(
         progress("reading rig, camera and priors")
         loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
         priors = load_priors(loaded, prior, dynamics, fps)
-        film = None if landmarks is None else load_take(landmarks).landmarks
-        if landmarks is not None and film is None:
+        video = None if landmarks is None else load_take(landmarks).landmarks
+        if landmarks is not None and video is None:
             raise FileFormatError(f"{landmarks}: found no landmarks, expected the landmarks.csv of torchface track")
         progress("exporting and checking")
-        report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=film)
+        report = export_video_solver(loaded, calibration, out, priors.shapes, priors.dynamics, video=video)
     table = Table(show_header=False)
     for row in report.rows():
         table.add_row(*row)

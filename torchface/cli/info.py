@@ -18,7 +18,7 @@ def info(
 
     Args:
         path: A .glb, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's folder.
-        attachment: Report which shapes of the rig these markers tell apart.
+        attachment: Report which shapes of the rig these markers distinguish.
         part: Look at this region of the rig only, such as face.
     """
     from torchface.workflows.describe_file import describe

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from torchface.cli.progress import Quiet, console, progress_bars
 
-_MOST_ROWS = 40
+_MAX_ROWS = 40
 _NAMED = 3
 
 
@@ -86,7 +86,7 @@ def register(
         table.add_column(head)
     # The worst first: those are the ones to look at.
     ranked = sorted(entries, key=lambda entry: (entry.registered, -entry.median_distance if entry.registered else 0.0))
-    for entry in ranked[:_MOST_ROWS]:
+    for entry in ranked[:_MAX_ROWS]:
         numbers = (
             f"{entry.median_distance:.3f} mm",
             f"{entry.far_distance:.2f} mm",
@@ -107,10 +107,10 @@ def register(
     for entry in ranked:
         for remark in entry.notes or ([entry.error] if entry.error else []):
             remarks.setdefault(remark, []).append(entry.name)
-    for remark, names in list(remarks.items())[:_MOST_ROWS]:
+    for remark, names in list(remarks.items())[:_MAX_ROWS]:
         who = ", ".join(names) if len(names) <= _NAMED else f"{len(names)} of {len(entries)} scans"
         console.print(f"{escape(who)}: {escape(remark)}", highlight=False)
-    if len(entries) > _MOST_ROWS:
-        console.print(f"the {_MOST_ROWS} worst; all are in {done.report.summary}")
+    if len(entries) > _MAX_ROWS:
+        console.print(f"the {_MAX_ROWS} worst; all are in {done.report.summary}")
     print(done.report.summary)
     print(done.contact_sheet)

@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.progress import Quiet, console, print_lines, progress_bars
 
-_MOST_NAMES = 12
+_MAX_NAMES = 12
 
 
 def retarget(
@@ -44,11 +44,11 @@ def retarget(
 
     with progress_bars(quiet) as progress:
         done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, progress)
-    driven = len(done.shapes.to_names) - len(done.shapes.still)
+    driven = len(done.shapes.to_names) - len(done.shapes.undriven)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
-    for what, names in (("nothing drives", done.shapes.still), ("drives nothing:", done.shapes.unused)):
+    for what, names in (("nothing drives", done.shapes.undriven), ("drives nothing:", done.shapes.unused)):
         if names:
-            more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-            console.print(f"{what} {', '.join(names[:_MOST_NAMES])}{more}", highlight=False)
+            more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+            console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)
     print_lines(f"warning: {warning}" for warning in done.warnings)
     print(out)

@@ -46,9 +46,9 @@ def track(
         landmarks: Model that finds the 68 landmarks, by name or folder; see `python -m train.landmarks`.
         appearance: Model of the actor's own looks that refines them.
         prior: What weights faces have, for names of shapes that the rig has too; see `python -m train.priors`.
-        dynamics: How weights go on from frame to frame, at any frame rate.
+        dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
-        texture: A picture to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
+        texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
         whole_take: Smooth the head's pose over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.

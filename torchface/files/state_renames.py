@@ -15,6 +15,7 @@ _DYNAMICS_PRIOR = {
     "noise.together": "noise.group_average",
 }
 STATE_RENAMES: Mapping[str, Mapping[str, str]] = {
+    "action_units": {"machine.for_first": "machine.first_class", "machine.for_second": "machine.second_class"},
     "dynamics_prior": _DYNAMICS_PRIOR,
     "reciprocal_prior": _SHAPE_PRIOR,
     "shape_prior": _SHAPE_PRIOR,
@@ -22,7 +23,7 @@ STATE_RENAMES: Mapping[str, Mapping[str, str]] = {
 }
 """For each kind of model: a state key's last parts as they were, and as they are now."""
 
-CONFIG_RENAMES: Mapping[str, Mapping[str, str]] = {}
+CONFIG_RENAMES: Mapping[str, Mapping[str, str]] = {"action_units": {"beside": "other_units"}}
 """For each kind of model: a config key as it was, at any depth, and as it is now."""
 
 

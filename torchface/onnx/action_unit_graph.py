@@ -149,10 +149,10 @@ def _vote(build: GraphBuilder, part: GroupClassifier, number: int, features: str
     first = op("Cast", op("Greater", distance, "zero"), to=onnx.TensorProto.FLOAT)
     votes = op(
         "Add",
-        op("MatMul", first, constant("for_first", machine.for_first)),
-        op("MatMul", op("Sub", "one", first), constant("for_second", machine.for_second)),
+        op("MatMul", first, constant("for_first", machine.first_class)),
+        op("MatMul", op("Sub", "one", first), constant("for_second", machine.second_class)),
     )
-    margin = op("MatMul", distance, constant("between", machine.for_first - machine.for_second))
+    margin = op("MatMul", distance, constant("between", machine.first_class - machine.second_class))
     bounded = op("Div", margin, op("Mul", "three", op("Add", op("Abs", margin), "one")))
     best = op("ArgMax", op("Add", votes, bounded), axis=1, keepdims=0)
     return op("Gather", constant("intensities", part.intensities), best, axis=0)

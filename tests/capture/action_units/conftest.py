@@ -36,7 +36,7 @@ def other(stage_folder: Path) -> FilmedSession:
     """Another face, each unit once."""
     performance = PerformanceSettings(1, 1, (("4", "9"),), fps=20.0, pace=1.3)
     settings = StageSettings(128, 170, markers=20, performance=performance)
-    identity = draw_identities(3, torch.Generator().manual_seed(5), spread=0.7)[1]
+    identity = draw_identities(3, torch.Generator().manual_seed(5), scale=0.7)[1]
     return film_session(stage_folder, "second", identity, torch.Generator().manual_seed(2), settings)
 
 

@@ -182,7 +182,7 @@ def test_a_config_that_cannot_be_is_refused(classifier: ActionUnitClassifier) ->
         {"size": 40, "groups": [dict(good["groups"][0], classes=1)]},
         {"size": 40, "groups": [dict(good["groups"][0], classes=4000)]},
         {"size": 40, "groups": [dict(good["groups"][0], units=3)]},
-        {"size": 40, "groups": [dict(good["groups"][0], beside=None)]},
+        {"size": 40, "groups": [dict(good["groups"][0], other_units=None)]},
     ):
         with pytest.raises(FileFormatError):
             ActionUnitClassifier.from_config(broken)

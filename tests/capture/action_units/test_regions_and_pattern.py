@@ -77,7 +77,7 @@ def test_warps_are_small_smooth_and_the_same_again(regions: RegionVideo) -> None
 def test_bad_input_is_named(session: FilmedSession, regions: RegionVideo, tmp_path) -> None:  # type: ignore[no-untyped-def]
     video, labels = session.video, session.labels
     outside = replace(labels, regions=dict(labels.regions, mouth=(60.0, 100.0, 130.0, 150.0)))
-    with pytest.raises(ValueRangeError, match=r"region 'mouth' is .* inside the picture of 128 x 170"):
+    with pytest.raises(ValueRangeError, match=r"region 'mouth' is .* inside the image of 128 x 170"):
         read_regions(video, outside, ["mouth"])
     with pytest.raises(NameMismatchError, match="found no chin"):
         read_regions(video, labels, ["chin"])

@@ -35,7 +35,7 @@ def test_the_video_leads_what_markers_hardly_see(
         assert solved is not None
         errors.append((other.rig.weights_from(solved) - other.performance.weights).abs().mean(0))
     told = capsys.readouterr().err
-    assert "video: leads" in told
+    assert "video: predicts" in told
     led = other.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
     alone, hybrid = errors
     assert float(hybrid[led].mean()) < 0.7 * float(alone[led].mean())

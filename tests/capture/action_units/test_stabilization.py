@@ -81,9 +81,9 @@ def test_a_steady_picture_changes_less_at_rest(session: FilmedSession, regions: 
 def test_nothing_to_follow_is_said(session: FilmedSession) -> None:
     frame = session.video.frame(0)
     helmet, markers = torch.tensor(session.labels.helmet), torch.tensor(session.labels.markers)
-    with pytest.raises(AlignmentError, match="inside the picture"):
+    with pytest.raises(AlignmentError, match="inside the image"):
         PointTracker(frame, torch.tensor([500.0, 3.0]), markers)
-    with pytest.raises(AlignmentError, match="nothing to follow"):
+    with pytest.raises(AlignmentError, match="nothing to track"):
         PointTracker(torch.full_like(frame, 90), helmet, markers)
     with pytest.raises(ShapeError, match="frames"):
         PointTracker(frame, helmet, markers)(frame[None, :50])

@@ -14,6 +14,7 @@ from torchface.capture.priors import (
     ReciprocalPrior,
     StudentDensity,
     adapt_dynamics,
+    face_halves,
     resampled,
     unlearned,
     windows_of,
@@ -58,19 +59,21 @@ def test_a_student_density_in_other_names_is_scipys() -> None:
 
 
 def test_a_mixture_in_other_names_is_scipys_group_by_group() -> None:
-    prior = ShapePrior.fit_mixtures([samples(), samples(seed=1)], NAMES)
+    learned = torch.cat([samples(), samples(seed=1)])
+    halves = face_halves(NAMES)
+    prior = ShapePrior(NAMES, halves, [GaussianMixture.fit(learned[:, list(half)], 2) for half in halves])
     renamed = prior.renamed(SPLIT)
     assert renamed.groups == ((1, 2, 3), (0, 4))
     points = samples(5, seed=3) @ mapping(NAMES, SPLIT).double().T
     total = torch.zeros(5, dtype=torch.float64)
-    for group, learned, density in zip(renamed.groups, prior.groups, prior.densities, strict=True):
+    for group, half, density in zip(renamed.groups, prior.groups, prior.densities, strict=True):
         assert isinstance(density, GaussianMixture)
-        back = mapping([NAMES[i] for i in learned], [SPLIT[i] for i in group]).double()
+        back = mapping([NAMES[i] for i in half], [SPLIT[i] for i in group]).double()
         parts = []
         for mean, factor, share in zip(density.means, density.factors, density.log_mixing_weights, strict=True):
             covariance = back @ torch.linalg.inv(factor.double() @ factor.double().T) @ back.T
-            halves = torch.tensor([SPLIT[i].startswith("browInnerUp") for i in group]).double()
-            covariance = covariance + PARTING_VARIANCE * torch.diag(halves)
+            split = torch.tensor([SPLIT[i].startswith("browInnerUp") for i in group]).double()
+            covariance = covariance + PARTING_VARIANCE * torch.diag(split)
             gaussian = multivariate_normal((back @ mean.double()).numpy(), covariance.numpy())
             parts.append(share + torch.from_numpy(gaussian.logpdf(points[:, list(group)].numpy())))
         total += torch.stack(parts).logsumexp(0)

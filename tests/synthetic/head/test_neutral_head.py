@@ -186,7 +186,7 @@ def test_drawn_identities_are_clipped_repeatable_and_spread():
     assert drawn.abs().max() == 2.5
     assert float(drawn.std()) == pytest.approx(0.99, abs=0.02)
     assert torch.equal(drawn, draw_identities(4000, torch.Generator().manual_seed(0)))
-    near = draw_identities(4000, torch.Generator().manual_seed(0), spread=0.5)
+    near = draw_identities(4000, torch.Generator().manual_seed(0), scale=0.5)
     assert float(near.std()) == pytest.approx(0.5, abs=0.01)
 
 

@@ -20,7 +20,6 @@ from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.mesh import Annotations
 from torchface.workflows.evaluate.evaluate_result import ALL, EvaluationSettings, evaluate
-from torchface.workflows.evaluate.scan_truth import surface_distances
 
 FRAMES = 6
 NAMES = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
@@ -121,9 +120,9 @@ def test_alignment_is_done_where_it_is_asked_for(folder: Path, rig: BlendshapeRi
     assert evaluate(*paths).regions[ALL].mean > 5
     laid = evaluate(*paths, EvaluationSettings(align=True))
     assert laid.regions[ALL].mean < 1e-3
-    assert laid.turned is not None
+    assert laid.rotation is not None
     torch.testing.assert_close(
-        laid.turned, torch.full((FRAMES,), float(torch.rad2deg(torch.tensor(0.2)))), rtol=1e-3, atol=0
+        laid.rotation, torch.full((FRAMES,), float(torch.rad2deg(torch.tensor(0.2)))), rtol=1e-3, atol=0
     )
 
 
@@ -163,14 +162,6 @@ def test_what_does_not_fit_is_told(folder: Path, rig: BlendshapeRig, weights: to
     assert not (out / "summary.json").exists()
     with pytest.raises(SystemExit):
         main(["evaluate", str(true), str(true), "--align", "--as-is", "--quiet"])
-
-
-def test_distances_to_a_surface_are_trimeshs() -> None:
-    sphere = trimesh.creation.icosphere(2, 60.0)
-    points = 65 * np.random.default_rng(0).normal(size=(200, 3))
-    surface = Mesh(torch.from_numpy(sphere.vertices.copy()), torch.from_numpy(sphere.faces.astype(np.int64)))
-    _, expected, _ = trimesh.proximity.closest_point(sphere, points)
-    torch.testing.assert_close(surface_distances(torch.from_numpy(points), surface), torch.from_numpy(expected))
 
 
 def test_raw_scans_are_registered_once_and_then_compared(

@@ -7,7 +7,7 @@ import torch
 
 from torchface import Take, Track
 from torchface.capture.action_units import ActionUnitCurves
-from torchface.workflows.solve.head_camera import laid_beside
+from torchface.workflows.solve.head_camera import resampled_curves
 
 
 def curves(frames: int, fps: float) -> ActionUnitCurves:
@@ -24,7 +24,7 @@ def take(frames: int, fps: float) -> Take:
 
 
 def test_the_same_rate_leaves_the_curves_as_they_are() -> None:
-    found = laid_beside(curves(90, 60), take(90, 60))
+    found = resampled_curves(curves(90, 60), take(90, 60))
     assert found.weights.names == found.gamma.names == ("browInnerUp",)
     assert torch.equal(found.weights.values[:, 0, 0], curves(90, 60).weights[:, 0])
     assert found.notes == ("take and video are taken to begin together",)
@@ -34,7 +34,7 @@ def test_the_same_rate_leaves_the_curves_as_they_are() -> None:
 
 @pytest.mark.parametrize("fps", [30.0, 50.0, 120.0])
 def test_another_rate_is_brought_to_the_takes(fps: float) -> None:
-    found = laid_beside(curves(int(1.5 * fps), fps), take(85, 60))
+    found = resampled_curves(curves(int(1.5 * fps), fps), take(85, 60))
     true = curves(85, 60).weights[:, 0]
     inside = (torch.arange(85) > 33) & (torch.arange(85) < 57)
     assert float((found.weights.values[:, 0, 0] - true)[inside].abs().max()) < 0.05
@@ -42,9 +42,9 @@ def test_another_rate_is_brought_to_the_takes(fps: float) -> None:
 
 
 def test_where_the_video_ends_the_markers_are_alone() -> None:
-    found = laid_beside(curves(50, 60), take(90, 60))
+    found = resampled_curves(curves(50, 60), take(90, 60))
     assert "ends 40 frames before the take" in found.notes[0]
     assert not found.gamma.values[60:].any()
-    longer = laid_beside(curves(90, 60), take(50, 60))
+    longer = resampled_curves(curves(90, 60), take(50, 60))
     assert "40 frames after the take" in longer.notes[0]
     assert len(longer.weights) == 50

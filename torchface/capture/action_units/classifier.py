@@ -1,10 +1,10 @@
-"""Which action units a face shows, and how strongly, told from its painted regions."""
+"""A classifier of action units and their intensities from painted regions of the face."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -14,11 +14,8 @@ from torchface.capture.action_units.one_vs_one import OneVsOne
 from torchface.capture.action_units.regions import RegionGroup
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
 
-if TYPE_CHECKING:
-    pass
-
-_LARGEST = 4096
-_MOST_CLASSES = 256  # there is a plane for every two
+_MAX_COUNT = 4096
+_MAX_CLASSES = 256  # there is a plane for every two
 
 
 class GroupClassifier(nn.Module):
@@ -49,9 +46,9 @@ class GroupClassifier(nn.Module):
         self.register_buffer("intensities", torch.zeros(classes, len(group.units)))
 
     def features(self, images: Tensor, rest: Tensor) -> Tensor:
-        """By how much Gabor magnitudes differ from those at rest, (B,D).
+        """Gabor magnitudes less those at rest, (B,D).
 
-        Two faces are painted alike but not the same; what an expression changes is more alike.
+        Patterns differ between faces; the change that an expression makes differs less.
 
         Args:
             images: the group's regions, (B,G,h,w).
@@ -87,12 +84,12 @@ class ActionUnitClassifier(nn.Module):
     """Intensities of action units from painted regions, every frame on its own.
 
     Args:
-        groups: which regions tell which units.
+        groups: which regions show which units.
         sizes: what each group has learned.
         size: pixels a side of a region.
 
     Raises:
-        NameMismatchError: a unit is told by two groups, or a group holds nothing.
+        NameMismatchError: a unit is in two groups, or a group is empty.
 
     Source: thesis 4.1.10 to 4.1.12.
     """
@@ -111,7 +108,7 @@ class ActionUnitClassifier(nn.Module):
         self.parts = nn.ModuleList(
             GroupClassifier(group, size, own.components, own.classes) for group, own in zip(groups, sizes, strict=True)
         )
-        # The first training performer's face at rest, on which others are laid.
+        # The first training performer's face at rest, to which others are warped.
         self.register_buffer("neutral", torch.zeros(len(self.regions), size, size))
 
     @property
@@ -124,7 +121,7 @@ class ActionUnitClassifier(nn.Module):
                     "name": part.group.name,
                     "regions": list(part.group.regions),
                     "units": list(part.group.units),
-                    "beside": list(part.group.beside),
+                    "other_units": list(part.group.other_units),
                     "components": len(part.components),
                     "classes": len(part.intensities),
                 }
@@ -146,9 +143,9 @@ class ActionUnitClassifier(nn.Module):
         for entry in entries:
             if not isinstance(entry, Mapping):
                 raise FileFormatError(f"config: found the group {entry!r:.80}, expected a table")
-            names = [_texts(entry, name) for name in ("regions", "units", "beside")]
+            names = [_texts(entry, name) for name in ("regions", "units", "other_units")]
             groups.append(RegionGroup(str(entry.get("name")), *names))
-            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2, _MOST_CLASSES)))
+            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2, _MAX_CLASSES)))
         return cls(groups, sizes, _whole(config, "size", 8))
 
     def group_classifiers(self) -> list[GroupClassifier]:
@@ -159,7 +156,7 @@ class ActionUnitClassifier(nn.Module):
         """Intensities (B,A) in [0,1], in the order of ``units``.
 
         Args:
-            regions: patterns (B,R,h,w) in [0,1], in the order of ``regions``, laid on ``neutral``; see
+            regions: patterns (B,R,h,w) in [0,1], in the order of ``regions``, warped to ``neutral``; see
                 :func:`torchface.capture.action_units.read_regions`.
             rest: the same of this performer's face at rest, (R,h,w).
 
@@ -185,7 +182,7 @@ def group_regions(groups: Sequence[RegionGroup]) -> tuple[str, ...]:
 
 
 def check_groups(groups: Sequence[RegionGroup]) -> None:
-    """Raises ``NameMismatchError`` where groups hold nothing, or tell a unit twice."""
+    """Raises ``NameMismatchError`` where a group is empty, or a unit is in two."""
     units = [unit for group in groups for unit in group.units]
     if not groups or any(not group.regions or not group.units for group in groups):
         raise NameMismatchError(f"groups: found {list(groups)!r:.120}, expected regions and units in each")
@@ -201,7 +198,7 @@ def _texts(entry: Mapping[str, Any], name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1, largest: int = _LARGEST) -> int:
+def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1, largest: int = _MAX_COUNT) -> int:
     found = entry.get(name)
     if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found <= largest:
         raise FileFormatError(

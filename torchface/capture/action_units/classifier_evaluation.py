@@ -1,4 +1,4 @@
-"""How often a classifier is right: on performers it has learned from, by leaving frames out, and on others."""
+"""The accuracy of a classifier: by cross-validation over frames, and against the labels of other performers."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def cross_validation(
     folds: int = 5,
     split: Split = "frames",
 ) -> dict[str, float]:
-    """The share of frames put into the right class of unit and intensity, by group of regions.
+    """The fraction of frames in the right class of unit and intensity, by group of regions.
 
     Args:
         videos: as for :func:`torchface.capture.action_units.fit_classifier`.
         labels: of each.
-        groups: which regions tell which units.
+        groups: which regions show which units.
         settings: of the training; frames are not warped.
         folds: into how many parts the frames are split; each is left out once.
         split: ``frames`` draws frames at random, as is usual; ``repetitions`` leaves whole repetitions out, so that no
-            neighbour gives a frame away.
+            frame is tested with its neighbours.
 
     Returns:
         Accuracy by name of the group.
@@ -56,13 +56,13 @@ def cross_validation(
     found = {}
     for group in groups:
         own = patterns[:, [names.index(name) for name in group.regions]]
-        known = label_group(own, labels, group, settings)
+        labelled = label_group(own, labels, group, settings)
         still = rest[:, [names.index(name) for name in group.regions]]
         samples = group_features(GroupClassifier(group, own.shape[-1], 1, 2), own, still)
         right = torch.zeros(len(samples), dtype=torch.bool)
         for number in range(folds):
             out = fold == number
-            right[out] = _predicted(samples, known.classes, out, settings) == known.classes[out]
+            right[out] = _predicted(samples, labelled.classes, out, settings) == labelled.classes[out]
         found[group.name] = float(right.float().mean())
     return found
 
@@ -104,12 +104,12 @@ def labelled_intensities(
     groups: Sequence[RegionGroup] = GROUPS,
     settings: TrainingSettings = DEFAULTS,
 ) -> Tensor:
-    """Intensities (T,A) as a video's own labels and the clustering of its frames give them, what a test is held to."""
+    """Intensities (T,A) from a video's own labels and the clustering of its frames: the truth of a test."""
     found = []
     for group in groups:
         own = video.patterns[:, [video.names.index(name) for name in group.regions]]
-        known = label_group(own, [labels], group, settings)
-        found.append(known.table[known.classes])
+        labelled = label_group(own, [labels], group, settings)
+        found.append(labelled.table[labelled.classes])
     return torch.cat(found, dim=1)
 
 
@@ -122,8 +122,8 @@ def level_agreement(found: Tensor, truth: Tensor, levels: int = 4) -> dict[str, 
         levels: of intensity, rest included; both are rounded to them.
 
     Returns:
-        ``exact`` and ``within_one``: the share of frames in which every unit is at the true level, or at most one level
-        off; ``active_within_one``: the same over frames in which a unit is at level 1 at least in truth.
+        ``exact`` and ``within_one``: the fraction of frames in which every unit is at the true level, or at most one
+        level from it; ``active_within_one``: the same over frames in which a unit is at level 1 at least in truth.
 
     Raises:
         ShapeError: the shapes differ.
@@ -131,10 +131,10 @@ def level_agreement(found: Tensor, truth: Tensor, levels: int = 4) -> dict[str, 
     if found.shape != truth.shape or found.ndim != 2:
         raise ShapeError(f"intensities: found {tuple(found.shape)} and {tuple(truth.shape)}, expected (T,A) twice")
     own, true = (found * (levels - 1)).round(), (truth * (levels - 1)).round()
-    off = (own - true).abs().amax(1)
+    difference = (own - true).abs().amax(1)
     active = (true > 0).any(1)
     return {
-        "exact": float((off == 0).float().mean()),
-        "within_one": float((off <= 1).float().mean()),
-        "active_within_one": float((off[active] <= 1).float().mean()),
+        "exact": float((difference == 0).float().mean()),
+        "within_one": float((difference <= 1).float().mean()),
+        "active_within_one": float((difference[active] <= 1).float().mean()),
     }

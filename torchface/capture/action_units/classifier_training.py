@@ -142,7 +142,7 @@ def label_group(
     start = 0
     for own in labels:
         for together in sorted({stretch.units for stretch in own.performed}):
-            units = tuple(unit for unit in (*group.units, *group.beside) if unit in together)
+            units = tuple(unit for unit in (*group.units, *group.other_units) if unit in together)
             if not units:
                 continue
             frames, at_rest = _frames(own, together, start)
@@ -250,7 +250,7 @@ def check_training(
             f"training: {', '.join(never)} is never performed alone; expected at least one repetition of every unit of "
             f"the groups ({', '.join(wanted)}), or groups without it"
         )
-    wanted += [unit for group in groups for unit in group.beside]
+    wanted += [unit for group in groups for unit in group.other_units]
     unknown = sorted({unit for own in labels for unit in own.units} - set(wanted))
     if unknown:
         raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group of regions shows it")

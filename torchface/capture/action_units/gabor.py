@@ -43,7 +43,7 @@ class GaborBank(nn.Module):
         self.register_buffer("odd", kernels.imag.float().contiguous()[:, None])
 
     def places(self, size: int) -> int:
-        """How many places along a side of ``size`` pixels are kept."""
+        """Number of places along a side of ``size`` pixels are kept."""
         return (size - 1) // self.stride + 1
 
     def forward(self, images: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29}
 """Windows of units that have their own."""
 
 _RATE = 60.0
-_SHORTEST = 5
+_MIN_WINDOW = 5
 
 
 def smooth_intensities(
@@ -43,6 +43,6 @@ def smooth_intensities(
     """
     if intensities.ndim != 2 or intensities.shape[1] != len(units):
         raise ShapeError(f"intensities: found {tuple(intensities.shape)}, expected (T,{len(units)})")
-    frames = [max(round(windows.get(unit, WINDOW) * fps / _RATE), _SHORTEST) for unit in units]
+    frames = [max(round(windows.get(unit, WINDOW) * fps / _RATE), _MIN_WINDOW) for unit in units]
     curves = [savitzky_golay(intensities[:, a].double(), window, order) for a, window in enumerate(frames)]
     return torch.stack(curves, dim=1).clamp(0, 1).float()

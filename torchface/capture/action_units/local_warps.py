@@ -1,4 +1,4 @@
-"""Patterns warped at random, a little and smoothly, so that what is learned does not hang on one face."""
+"""Augmentation: small smooth random warps of patterns, so that a classifier generalises to other faces."""
 
 from __future__ import annotations
 

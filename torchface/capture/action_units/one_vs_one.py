@@ -1,4 +1,4 @@
-"""A linear support vector machine for many classes: a plane between every two, and a vote."""
+"""A linear support vector machine for many classes: a plane for each pair, and a vote."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class OneVsOne(nn.Module):
         s_c = \sum_{c\text{ wins}} 1 + \frac{m_c}{3 (\lvert m_c \rvert + 1)}, \quad
         m_c = \sum_j d_{cj} - \sum_i d_{ic}
 
-    where d > 0 is a vote for i. The second term, below a vote, decides between equally many.
+    where d > 0 is a vote for i. The second term is less than a vote and breaks ties.
 
     Args:
         classes: C, at least 2.
@@ -28,8 +28,8 @@ class OneVsOne(nn.Module):
 
     weight: Tensor
     bias: Tensor
-    for_first: Tensor
-    for_second: Tensor
+    first_class: Tensor
+    second_class: Tensor
 
     def __init__(self, classes: int, features: int) -> None:
         super().__init__()
@@ -37,15 +37,15 @@ class OneVsOne(nn.Module):
         self.register_buffer("weight", torch.zeros(len(pairs), features))
         self.register_buffer("bias", torch.zeros(len(pairs)))
         one_hot = torch.nn.functional.one_hot(pairs, classes).float()
-        self.register_buffer("for_first", one_hot[:, 0].clone())
-        self.register_buffer("for_second", one_hot[:, 1].clone())
+        self.register_buffer("first_class", one_hot[:, 0].clone())
+        self.register_buffer("second_class", one_hot[:, 1].clone())
 
     def forward(self, features: Tensor) -> Tensor:
         """Scores (B,C) of features (B,K); the highest wins."""
         distance = features @ self.weight.T + self.bias
         first = (distance > 0).to(distance.dtype)
-        votes = first @ self.for_first + (1 - first) @ self.for_second
-        margin = distance @ (self.for_first - self.for_second)
+        votes = first @ self.first_class + (1 - first) @ self.second_class
+        margin = distance @ (self.first_class - self.second_class)
         return votes + margin / (3 * (margin.abs() + 1))
 
     def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> OneVsOne:
@@ -60,7 +60,7 @@ class OneVsOne(nn.Module):
             ShapeError: the shapes do not fit.
             ValueRangeError: a class never occurs.
         """
-        count = self.for_first.shape[1]
+        count = self.first_class.shape[1]
         if features.shape != (len(classes), self.weight.shape[1]):
             raise ShapeError(
                 f"features: found {tuple(features.shape)}, expected ({len(classes)},{self.weight.shape[1]})"

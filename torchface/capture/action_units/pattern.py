@@ -1,4 +1,4 @@
-"""The painted pattern told from the skin by its brightness."""
+"""Segmentation of the painted pattern from the skin by brightness."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 
 _BINS = 128
-_LEAST_CONTRAST = 0.15
-_SHARES = (0.01, 0.45)
-_MOST_PAINT = 0.35  # of a region; what is brighter than Otsu's threshold and covers more is skin beside hair or eyes
-_FROM, _TO = 0.4, 0.9  # shares of the way from skin to paint at which a pixel begins and ceases to count in part
+_MIN_CONTRAST = 0.15
+_FRACTIONS = (0.01, 0.45)
+_MAX_PAINT = 0.35  # of a region; what is brighter than Otsu's threshold and covers more is skin beside hair or eyes
+_FROM, _TO = 0.4, 0.9  # between skin, 0, and paint, 1: where the soft threshold begins and ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,21 +25,21 @@ class PatternLevels:
     paint: Tensor
 
     def pattern(self, images: Tensor) -> Tensor:
-        """How much of a pixel is paint, (...,R,h,w) in [0,1].
+        """The fraction of a pixel that is paint, (...,R,h,w) in [0,1].
 
-        A threshold between skin and paint, nearer to the paint because skin that shines is brighter than skin; round it
-        a pixel that is partly covered counts in part, so that motion of less than a pixel is not lost.
+        A soft threshold between skin and paint, nearer to the paint because of highlights on the skin; partly covered
+        pixels count in part, so that motion of less than a pixel is kept.
         """
         skin, paint = self.skin[:, None, None], self.paint[:, None, None]
-        share = (images - skin) / (paint - skin)
-        return ((share - _FROM) / (_TO - _FROM)).clamp(0, 1)
+        fraction = (images - skin) / (paint - skin)
+        return ((fraction - _FROM) / (_TO - _FROM)).clamp(0, 1)
 
 
 def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
     """The greys of skin and paint, by Otsu's threshold in each region, taken again where it found skin.
 
     Args:
-        neutral: regions of a picture of the face at rest, (R,h,w) in [0,1].
+        neutral: regions of an image of the face at rest, (R,h,w) in [0,1].
         names: of the regions.
 
     Raises:
@@ -51,15 +51,16 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
     for name, region in zip(names, neutral, strict=True):
         values = region.flatten()
         threshold = otsu_threshold(values)
-        if float((values > threshold).float().mean()) > _MOST_PAINT:
+        if float((values > threshold).float().mean()) > _MAX_PAINT:
             threshold = otsu_threshold(values[values > threshold])
         bright, dark = values[values > threshold], values[values <= threshold]
         share = len(bright) / len(values)
         contrast = float(bright.mean() - dark.mean()) if len(bright) and len(dark) else 0.0
-        if contrast < _LEAST_CONTRAST or not _SHARES[0] <= share <= _SHARES[1]:
+        if contrast < _MIN_CONTRAST or not _FRACTIONS[0] <= share <= _FRACTIONS[1]:
             raise ValueRangeError(
                 f"region {name!r} shows no painted pattern: {share:.0%} of it is brighter than the rest by "
-                f"{contrast:.2f}, expected {_SHARES[0]:.0%} to {_SHARES[1]:.0%} brighter by {_LEAST_CONTRAST} at least"
+                f"{contrast:.2f}, expected {_FRACTIONS[0]:.0%} to {_FRACTIONS[1]:.0%} brighter by "
+                f"{_MIN_CONTRAST} at least"
             )
         skin.append(dark.median())
         paint.append(bright.median())

@@ -1,4 +1,4 @@
-"""One performer's pattern laid on another's: a dense flow between their neutral pictures that warps every frame."""
+"""One performer's pattern warped to another's: a dense flow between their neutral images, used for every frame."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _SOFTENING = 1.0  # pixels, standard deviation
 
 
 def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tensor:
-    r"""For each pixel of the reference's neutral pattern, how far off the same spot lies in one's own.
+    r"""The flow from each pixel of the reference's neutral pattern to the same spot of one's own.
 
     .. math:: \text{own}(x + u(x)) \approx \text{reference}(x)
 
-    Found once a performer, at rest, and used for every frame: a flow a frame would take the expression away.
+    Found once a performer, at rest, and used for every frame: a flow a frame would remove the expression.
 
     Args:
         own, reference: neutral patterns, (R,h,w) in [0,1].
@@ -42,7 +42,7 @@ def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tens
 
 
 def aligned_grid(grid: Tensor, flow: Tensor) -> Tensor:
-    """The pixels at which regions are read, moved by a flow in region pixels; both (R,h,w,2)."""
+    """The sampling grid of the regions moved by a flow in region pixels; both (R,h,w,2)."""
     step = torch.stack([grid[:, 0, 1, 0] - grid[:, 0, 0, 0], grid[:, 1, 0, 1] - grid[:, 0, 0, 1]], dim=-1)
     return grid + flow * step[:, None, None]
 

@@ -1,4 +1,4 @@
-"""From a head-camera video to steady pictures of its painted regions."""
+"""From a head-camera video to stabilised images of its painted regions."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _CHUNK = 64
 
 @dataclass(frozen=True, eq=False)
 class RegionVideo:
-    """The painted regions of a video, steady.
+    """The painted regions of a video, stabilised.
 
     Args:
         names: of the regions, R.
-        patterns: (T,R,h,w) in [0,1], how much of a pixel is paint.
-        neutral: the regions at rest, (R,h,w), as they are: what others are laid on.
-        rest: the regions at rest, (R,h,w), laid on another performer's as all frames are.
+        patterns: (T,R,h,w) in [0,1], the fraction of a pixel that is paint.
+        neutral: the regions at rest, (R,h,w), unwarped: the reference of other videos.
+        rest: the regions at rest, (R,h,w), warped to another performer's as all frames are.
         fps: frames a second.
     """
 
@@ -51,21 +51,21 @@ def read_regions(
     method: Method = "dis",
     progress: Progress | None = None,
 ) -> RegionVideo:
-    """Stabilises a video, cuts its regions out, thresholds the pattern and lays it on a reference's.
+    """Stabilises a video, cuts its regions out, thresholds the pattern and warps it to a reference's.
 
     Args:
         video: the file.
         labels: where helmet, markers and regions are.
         names: which regions, R, in which order.
-        reference: another performer's neutral patterns (R,h,w), on which these are laid; as they are if absent.
+        reference: another performer's neutral patterns (R,h,w), to which these are warped; none if absent.
         size: pixels a side of a region.
-        method: of the flow that lays them on the reference.
+        method: of the flow to the reference.
         progress: told each step and how far it is.
 
     Raises:
         FileFormatError: the video cannot be decoded.
         ShapeError: video and labels differ in length.
-        ValueRangeError: a region reaches out of the picture, or shows no pattern.
+        ValueRangeError: a region reaches out of the image, or shows no pattern.
         AlignmentError: helmet or markers cannot be followed.
         NameMismatchError: a region has no box.
     """

@@ -1,4 +1,4 @@
-"""Regions of the face cut out of every frame, held still, brought to one size."""
+"""Regions of the face sampled from every frame, stabilised, at one size."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from torchface.io.action_labels import Box
 
 @dataclass(frozen=True)
 class RegionGroup:
-    """Regions whose features are merged, and the action units that are told from them.
+    """Regions whose features are merged, and the action units that they show.
 
     Args:
         name: of the group.
         regions: names of its regions.
         units: names of its action units.
-        beside: units that move the regions too but are told from others: they are learned as classes of their own, so
-            that they are not taken for one of ``units``.
+        other_units: units that move the regions too but are classified by other groups: they are classes of their own,
+            so that they are not taken for one of ``units``.
     """
 
     name: str
     regions: tuple[str, ...]
     units: tuple[str, ...]
-    beside: tuple[str, ...] = ()
+    other_units: tuple[str, ...] = ()
 
 
 GROUPS: tuple[RegionGroup, ...] = (
@@ -39,22 +39,22 @@ GROUPS: tuple[RegionGroup, ...] = (
 )
 """The forehead's two regions and the two eyes merge their features; ``18L`` is the lip pucker to the left.
 
-Between the brows AU 4 shows too, but other performers' lowered brows are told better by the strokes over them.
+Between the brows AU 4 shows too, but other performers' lowered brows are classified better by the strokes over them.
 """
 
 
 def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:
-    """The pixels of a neutral picture at which regions of ``size`` x ``size`` are read, (R,size,size,2).
+    """The pixels of a neutral image at which regions of ``size`` x ``size`` are read, (R,size,size,2).
 
     Args:
         boxes: (left, top, right, bottom) by name.
         names: which regions, R, in which order.
         size: pixels a side that every region is brought to.
-        width, height: of the picture.
+        width, height: of the image.
 
     Raises:
         NameMismatchError: a region has no box.
-        ValueRangeError: a box reaches out of the picture.
+        ValueRangeError: a box reaches out of the image.
     """
     lacking = [name for name in names if name not in boxes]
     if lacking:
@@ -65,7 +65,7 @@ def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width
         if left < -0.5 or top < -0.5 or right > width - 0.5 or bottom > height - 0.5:
             raise ValueRangeError(
                 f"region {name!r} is ({left:.1f}, {top:.1f}) to ({right:.1f}, {bottom:.1f}), expected it inside the "
-                f"picture of {width} x {height} pixels"
+                f"image of {width} x {height} pixels"
             )
         step = (torch.arange(size) + 0.5) / size
         y, x = torch.meshgrid(top + (bottom - top) * step, left + (right - left) * step, indexing="ij")
@@ -78,8 +78,8 @@ def sample_regions(frames: Tensor, grid: Tensor, transforms: Tensor) -> Tensor:
 
     Args:
         frames: (t,H,W), floats.
-        grid: pixels of the neutral picture, (R,h,w,2).
-        transforms: neutral picture to frame, (t,2,3).
+        grid: pixels of the neutral image, (R,h,w,2).
+        transforms: neutral image to frame, (t,2,3).
 
     Raises:
         ShapeError: the shapes do not fit.

@@ -1,4 +1,4 @@
-"""What action units mean in a rig's shapes: a table a rig, in TOML."""
+"""Action units as weights of a rig's shapes: a table a rig, in TOML."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 
 _FORMAT = "torchface.action_unit_shapes/1"
-_LARGEST_TEXT = 2**20
+_MAX_TEXT = 2**20
 _BUILT_IN = Path(__file__).with_name("tables")
 
 
@@ -91,7 +91,7 @@ def load_shape_table(name_or_path: str | Path) -> ShapeTable:
             )
         path = _BUILT_IN / f"{path.name}.toml"
     try:
-        document = tomllib.loads(read_file(path, _LARGEST_TEXT).decode())
+        document = tomllib.loads(read_file(path, _MAX_TEXT).decode())
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise FileFormatError(f"{path}: not TOML ({error})") from error
     units = document.get("units")

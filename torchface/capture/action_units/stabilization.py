@@ -1,4 +1,4 @@
-"""A camera that hangs loose is held still: a point of the helmet and two markers are followed through the video."""
+"""Stabilisation of a loose camera: a point of the helmet and two markers are tracked through the video."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from torchface.errors import AlignmentError, ShapeError
 
 _WINDOW = 15
 _LEVELS = 3
-_REACH = 4  # pixels round where a marker should be in which its blob is weighed
-_LARGEST_RESIDUAL = 0.2  # of a grey value of 1, mean over the window
-_LARGEST_STEP = 20.0  # pixels from one frame to the next
+_REACH = 4  # pixels about a marker's expected place in which its centroid is taken
+_MAX_RESIDUAL = 0.2  # of a grey value of 1, mean over the window
+_MAX_STEP = 20.0  # pixels from one frame to the next
 
 
 class PointTracker:
     """Follows a point of the helmet and bright markers through a video.
 
     The helmet's point is found by pyramidal Lucas-Kanade optical flow, every frame against the reference, so that
-    nothing drifts. Most of what moves the picture moves the helmet in it: a marker is looked for where it was last,
-    moved along with the helmet, and is its blob's centre of brightness.
+    nothing drifts. Most image motion is the helmet's: a marker is searched at its last place, moved with the
+    helmet, and is the intensity centroid of its blob.
 
     Args:
-        reference: grey picture, (H,W) uint8.
+        reference: grey image, (H,W) uint8.
         helmet: a point of the helmet, (2,), pixels.
         markers: (M,2), pixels.
 
     Raises:
-        AlignmentError: a point lies outside the picture, or there is nothing to follow there.
+        AlignmentError: a point lies outside the image, or there is nothing to track there.
 
     Source: Lucas and Kanade 1981, Bouguet 2001; thesis 4.1.10.
     """
@@ -38,18 +38,18 @@ class PointTracker:
         for i, (x, y) in enumerate(torch.cat([helmet[None], markers]).tolist()):
             if not (2 <= x < width - 2 and 2 <= y < height - 2):
                 raise AlignmentError(
-                    f"stabilisation: point {i} is at ({x:.1f}, {y:.1f}), expected it inside the picture of "
+                    f"stabilisation: point {i} is at ({x:.1f}, {y:.1f}), expected it inside the image of "
                     f"{width} x {height} pixels"
                 )
             top, left = max(int(y) - 5, 0), max(int(x) - 5, 0)
             around = reference[top : int(y) + 7, left : int(x) + 7].float()
             if float(around.max() - around.min()) < 20:
                 raise AlignmentError(
-                    f"stabilisation: nothing to follow at point {i}, ({x:.1f}, {y:.1f}); expected a corner or a marker"
+                    f"stabilisation: nothing to track at point {i}, ({x:.1f}, {y:.1f}); expected a corner or a marker"
                 )
         self._reference = np.ascontiguousarray(reference.numpy())
         blobs, brightness = _blobs(reference, markers.float())
-        self._least_bright = 0.6 * brightness
+        self._min_brightness = 0.6 * brightness
         self.points = torch.cat([helmet[None].float(), blobs])
         self._last = self.points.clone()
 
@@ -65,7 +65,7 @@ class PointTracker:
                 self._last[1:] += helmet - self._last[0]
                 self._last[0] = helmet
             blobs, brightness = _blobs(frame, self._last[1:])
-            seen = (brightness > self._least_bright) & ((blobs - self._last[1:]).norm(dim=1) < _REACH)
+            seen = (brightness > self._min_brightness) & ((blobs - self._last[1:]).norm(dim=1) < _REACH)
             found[i, 1:][seen] = blobs[seen]
             self._last[1:][seen] = blobs[seen]
         return found
@@ -86,12 +86,12 @@ class PointTracker:
         )
         found = torch.from_numpy(place[0, 0].copy())
         step = float((found - self._last[0]).norm())
-        good = status[0, 0] > 0 and residual[0, 0] < 255 * _LARGEST_RESIDUAL and step < _LARGEST_STEP
+        good = status[0, 0] > 0 and residual[0, 0] < 255 * _MAX_RESIDUAL and step < _MAX_STEP
         return found if good else None
 
 
 def _blobs(frame: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The centre of brightness (P,2) round points (P,2), and the brightest grey there, (P,)."""
+    """The intensity centroids (P,2) about points (P,2), and the brightest grey there, (P,)."""
     height, width = frame.shape
     offsets = torch.arange(-_REACH, _REACH + 1)
     for _ in range(2):  # a blob that was cut off at first is whole the second time
@@ -107,7 +107,7 @@ def _blobs(frame: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
-    r"""The similarity of the picture plane that moves the reference's points to each frame's.
+    r"""The similarity of the image plane that moves the reference's points to each frame's.
 
     .. math:: \min_{a,b \in \mathbb{C}} \sum_p \lvert a z_p + b - z'_{tp} \rvert^2
 

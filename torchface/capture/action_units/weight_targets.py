@@ -23,15 +23,15 @@ _CHUNK = 256
 
 @dataclass(frozen=True, eq=False)
 class ActionUnitCurves:
-    """What a classifier saw, in a rig's shapes.
+    """A classifier's predictions in a rig's shapes.
 
     Args:
         names: of the shapes, N.
-        weights: what the classifier predicts, smooth, (T,N) in [0,1].
-        active: the frames in which it shall lead the solve, (T,N) bool; see ``action_unit_curves``.
+        weights: predicted, smoothed, (T,N) in [0,1].
+        active: the frames in which the prediction is used in the solve, (T,N) bool; see ``action_unit_curves``.
         units: of the classifier, A.
         intensities: smooth, (T,A) in [0,1].
-        levels: as they were told frame by frame, (T,A).
+        levels: predicted frame by frame, (T,A).
         fps: frames a second.
     """
 
@@ -57,9 +57,9 @@ def action_unit_curves(
 ) -> ActionUnitCurves:
     r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
 
-    A shape that several units move follows the one that moves it most. The classifier leads a shape where it sees a
-    unit that moves it, and where it sees that none does: shapes that markers hardly see take up the markers' noise
-    there. Where it sees only a unit that shall not lead, the markers have the shape to themselves.
+    A shape that several units move follows the one that moves it most. The prediction of a shape is used where a
+    unit that moves it is active, and where none is: shapes that markers hardly observe fit their noise there. Where
+    only a unit is active that is not to be used, the shape is left to the markers.
 
     Args:
         classifier: a trained one.
@@ -67,9 +67,9 @@ def action_unit_curves(
         labels: where helmet, markers and regions are in it.
         table: units in the rig's shapes.
         names: of the rig's shapes, N.
-        units: which of the classifier's may lead the solve; all if absent.
+        units: which of the classifier's are used in the solve; all if absent.
         windows: frames at 60 a second over which each unit is smoothed.
-        at_rest: lead also where no unit is seen; otherwise the markers take over there, as in the source.
+        at_rest: also use predictions where no unit is active; otherwise only the markers count, as in the source.
         progress: told each step and how far it is.
 
     Raises:

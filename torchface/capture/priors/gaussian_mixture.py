@@ -13,7 +13,6 @@ from torchface.capture.priors.parzen import checked_sizes
 from torchface.errors import ShapeError, ValueRangeError
 
 _MAX_ITERATIONS, _TOLERANCE = 200, 1e-5
-_SEED_ITERATIONS = 20
 
 
 class GaussianMixture(nn.Module):
@@ -43,21 +42,12 @@ class GaussianMixture(nn.Module):
             self.register_buffer(name, value.detach().float())
 
     @classmethod
-    def fit(
-        cls,
-        samples: Tensor,
-        components: int = 1,
-        shrinkage: float = 0.02,
-        floor: float = 1e-4,
-        seed: int = 0,
-    ) -> GaussianMixture:
-        """Fits by expectation maximisation from k-means, in float64.
+    def fit(cls, samples: Tensor, components: int = 1, floor: float = 1e-4, seed: int = 0) -> GaussianMixture:
+        """Fits by scikit-learn's expectation maximisation from k-means, in float64.
 
         Args:
             samples: weights, (T,D).
-            components: K; components without samples are dropped.
-            shrinkage: weight of the covariance of all samples in each component's, in [0,1]: a component with few
-                samples keeps variance in directions that it has not seen.
+            components: K.
             floor: added to each variance.
             seed: of the k-means.
 
@@ -71,30 +61,17 @@ class GaussianMixture(nn.Module):
             )
         if not torch.isfinite(samples).all():
             raise ValueRangeError("samples: found NaN or infinity, expected weights")
-        if components < 1 or not 0 <= shrinkage <= 1 or not floor > 0:
+        if components < 1 or not floor > 0:
             raise ValueRangeError(
-                f"Gaussian mixture: found {components} components, shrinkage {shrinkage}, floor {floor}, expected "
-                "at least one, a number in [0,1], and a positive variance"
+                f"Gaussian mixture: found {components} components and floor {floor}, expected at least one, and a "
+                "positive variance"
             )
-        from sklearn.cluster import KMeans  # takes a second, and only training needs it
+        from sklearn.mixture import GaussianMixture as Fitted  # takes a second, and only training needs it
 
-        x = samples.detach().double()
-        pooled = torch.cov(x.T, correction=0).reshape(x.shape[1], -1)
-        clusters = min(components, len(x.unique(dim=0)))
-        k_means = KMeans(clusters, n_init=1, max_iter=_SEED_ITERATIONS, random_state=seed)
-        members = k_means.fit_predict(x.cpu().numpy())
-        responsibilities = torch.nn.functional.one_hot(torch.from_numpy(members).long(), components).to(x)
-        before = -math.inf
-        # Each iteration needs the responsibilities of the one before.
-        for _ in range(_MAX_ITERATIONS):
-            responsibilities = responsibilities[:, responsibilities.sum(0) > 1e-6]
-            mixture = _maximised(x, responsibilities, pooled, shrinkage, floor)
-            joint = mixture._log_joint(x)
-            likelihood = float(joint.logsumexp(1).mean())
-            if likelihood - before < _TOLERANCE:
-                break
-            before, responsibilities = likelihood, joint.softmax(1)
-        return mixture.float()
+        fitted = Fitted(components, reg_covar=floor, tol=_TOLERANCE, max_iter=_MAX_ITERATIONS, random_state=seed)
+        fitted.fit(samples.detach().cpu().double().numpy())
+        means, precisions, weights = map(torch.from_numpy, (fitted.means_, fitted.precisions_, fitted.weights_))
+        return cls(means, torch.linalg.cholesky(precisions), weights.log())
 
     def log_density(self, samples: Tensor) -> Tensor:
         """:math:`\\log p` of samples (B,D), (B,)."""
@@ -148,20 +125,3 @@ class GaussianMixture(nn.Module):
         count, dimensions = checked_sizes(config, "components", "dimensions")
         checked_sizes({**config, "square": dimensions}, "components", "dimensions", "square")
         return cls(torch.zeros(count, dimensions), torch.zeros(count, dimensions, dimensions), torch.zeros(count))
-
-
-def _maximised(x: Tensor, responsibilities: Tensor, pooled: Tensor, shrinkage: float, floor: float) -> GaussianMixture:
-    """The mixture that is likeliest for samples x (T,D) with given responsibilities (T,K), in float64."""
-    count = responsibilities.sum(0)
-    means = (responsibilities.T @ x) / count[:, None]
-    # A loop over components keeps (T,K,D) out of the memory.
-    moments = torch.stack([(column[:, None] * x).T @ x for column in responsibilities.T])
-    own = moments / count[:, None, None] - means[:, :, None] * means[:, None]
-    covariance = (1 - shrinkage) * own + shrinkage * pooled
-    covariance = 0.5 * (covariance + covariance.transpose(1, 2))
-    covariance.diagonal(dim1=1, dim2=2).add_(floor)
-    factors = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance)))
-    mixture = GaussianMixture(means, factors, (count / count.sum()).log())
-    # The buffers are float32 in a finished module; the iterations need float64.
-    mixture.means, mixture.factors, mixture.log_mixing_weights = means, factors, (count / count.sum()).log()
-    return mixture

@@ -99,8 +99,8 @@ class MotionNoise(nn.Module):
             return value
 
         optimizer.step(loss)
-        own, group = log_coefficients.detach().exp().chunk(2)
-        return cls(log_rest.detach().exp() + floor**2, own, group, scale, average)
+        own, shared = log_coefficients.detach().exp().chunk(2)
+        return cls(log_rest.detach().exp() + floor**2, own, shared, scale, average)
 
     def forward(self, motion: Tensor) -> Tensor:
         """The variance (B,N) after windows with this motion, (B,K,N)."""

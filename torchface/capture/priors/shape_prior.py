@@ -25,9 +25,6 @@ _KINDS: dict[str, type[ParzenDensity] | type[GaussianMixture] | type[StudentDens
 }
 STRENGTH = 0.15
 """Of a fitted prior: chosen by the error of solves of real takes that were left out of the learning."""
-_MAX_COMPONENTS = 8
-_FLOORS = (1e-4, 3e-4, 1e-3, 3e-3)
-_SHRINKAGES = (0.3, 0.5)
 
 
 class Density(Protocol):
@@ -118,30 +115,6 @@ class ShapePrior(nn.Module):
         together = torch.cat(_seen_frames(takes, names))
         groups = (tuple(range(len(names))),) if groups is None else groups
         return cls(names, groups, [StudentDensity.fit(together[:, list(group)]) for group in groups], STRENGTH)
-
-    @classmethod
-    def fit_mixtures(
-        cls,
-        takes: Sequence[Tensor],
-        names: Sequence[str],
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int = 0,
-    ) -> ShapePrior:
-        """Learns a mixture of Gaussians a group; number and smoothness by cross-validation over takes.
-
-        Args:
-            takes: weights of each take, (T,N); frames with a NaN are left out.
-            names: of the N shapes.
-            groups: :func:`face_halves` if absent.
-            seed: of the fit.
-
-        Raises:
-            ShapeError, ValueRangeError: as ``fit``.
-        """
-        seen = _seen_frames(takes, names)
-        groups = face_halves(names) if groups is None else groups
-        chosen = [_chosen_mixture([take[:, list(group)] for take in seen], seed) for group in groups]
-        return cls(names, groups, chosen, STRENGTH)
 
     def log_density(self, weights: Tensor) -> Tensor:
         """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
@@ -313,30 +286,6 @@ class ReciprocalPrior(ShapePrior):
         made = ShapePrior.from_config(config)
         densities: list[Any] = list(made.densities)
         return cls(made.names, made.groups, densities, made.strength, float(config.get("guard", 1e-2)))
-
-
-def _chosen_mixture(takes: list[Tensor], seed: int) -> GaussianMixture:
-    """The mixture with the settings that make left-out takes likeliest; a single take is halved for that."""
-    parts = takes if len(takes) > 1 else list(takes[0].chunk(2))
-    best, likelihood = (1, _SHRINKAGES[0], _FLOORS[-1]), -float("inf")
-    count = 1
-    while count <= _MAX_COMPONENTS:
-        for shrinkage in _SHRINKAGES if count > 1 else _SHRINKAGES[:1]:
-            for floor in _FLOORS:
-                found = sum(_left_out(parts, i, count, shrinkage, floor, seed) for i in range(len(parts)))
-                if found > likelihood:
-                    best, likelihood = (count, shrinkage, floor), found
-        count *= 2
-    return GaussianMixture.fit(torch.cat(takes), *best, seed=seed)
-
-
-def _left_out(parts: list[Tensor], left: int, count: int, shrinkage: float, floor: float, seed: int) -> float:
-    """Mean log density of one part under a mixture of the others."""
-    others = torch.cat([part for i, part in enumerate(parts) if i != left])
-    if len(others) < max(count, 2):
-        return -float("inf")
-    mixture = GaussianMixture.fit(others, count, shrinkage, floor, seed)
-    return float(mixture.log_density(parts[left].double()).mean())
 
 
 def _seen_frames(takes: Sequence[Tensor], names: Sequence[str]) -> list[Tensor]:

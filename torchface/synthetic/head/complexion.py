@@ -1,4 +1,4 @@
-"""What makes one performer's skin differ from another's: melanin, blood, lips, hair, shadows under the eyes."""
+"""The variation of skin between performers: melanin, blood, lips, hair, shadows under the eyes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _HAIR = (-0.35, -0.35, -0.33)
 _SKEW = 0.6
 
 
-def draw_complexions(count: int, generator: torch.Generator, spread: float = 1.0) -> Tensor:
-    """Complexions (N,6) drawn from a normal distribution with ``spread`` standard deviations."""
-    return spread * torch.randn(count, len(COMPLEXION), generator=generator)
+def draw_complexions(count: int, generator: torch.Generator, scale: float = 1.0) -> Tensor:
+    """Complexions (N,6) drawn from a normal distribution with ``scale`` standard deviations."""
+    return scale * torch.randn(count, len(COMPLEXION), generator=generator)
 
 
 def complexion_colors(complexions: Tensor) -> Tensor:
@@ -70,21 +70,23 @@ def _skin() -> tuple[Tensor, Tensor]:
     regions = {name: mask.float() for name, mask in mesh.annotations.regions.items()}
     inside = sum(regions[n] for n in ("eyeball_left", "eyeball_right", "mouth_interior", "eye_sockets"))
     skin = 1 - torch.as_tensor(inside).clamp(max=1)
-    lips = _soft(regions["upper_lip"] + regions["lower_lip"], mesh.faces, 1) * skin
-    brows = _soft(regions["brow_left"] + regions["brow_right"], mesh.faces, 1) * skin
+    lips = _smoothed(regions["upper_lip"] + regions["lower_lip"], mesh.faces, 1) * skin
+    brows = _smoothed(regions["brow_left"] + regions["brow_right"], mesh.faces, 1) * skin
     dark = (base.mean(1) < 0.5 * base[regions["forehead"] > 0].mean()).float()
-    hair = torch.maximum(brows * dark, _soft(regions["cranium"] * dark, mesh.faces, 2)) * skin
-    lids = _soft(regions["lids_left"] + regions["lids_right"], mesh.faces, 4) * skin * (1 - brows)
-    flush = _soft(regions["cheek_left"] + regions["cheek_right"] + regions["nose"], mesh.faces, 6) * skin * (1 - lips)
+    hair = torch.maximum(brows * dark, _smoothed(regions["cranium"] * dark, mesh.faces, 2)) * skin
+    lids = _smoothed(regions["lids_left"] + regions["lids_right"], mesh.faces, 4) * skin * (1 - brows)
+    flush = (
+        _smoothed(regions["cheek_left"] + regions["cheek_right"] + regions["nose"], mesh.faces, 6) * skin * (1 - lips)
+    )
     bare = skin * (1 - hair)
     pairs = [(bare, _MELANIN), (bare, _BLOOD), (lips, _LIPS), (hair, _HAIR), (lids, _SHADOW), (flush, _FLUSH)]
     return base, torch.stack([field[:, None] * torch.tensor(tint) for field, tint in pairs])
 
 
-def _soft(field: Tensor, faces: Tensor, rounds: int) -> Tensor:
-    """A field (V,) spread over its neighbours, round by round, clipped to [0,1]."""
+def _smoothed(field: Tensor, faces: Tensor, iterations: int) -> Tensor:
+    """A field (V,) averaged with its neighbours, iteratively, clipped to [0,1]."""
     count = torch.zeros(len(field)).index_add_(0, faces.flatten(), torch.ones(faces.numel()))
-    for _ in range(rounds):
+    for _ in range(iterations):
         mean = field[faces].mean(1)
         field = torch.zeros(len(field)).index_add_(0, faces.flatten(), mean.repeat_interleave(3)) / count.clamp(min=1)
     return field.clamp(0, 1)

@@ -81,9 +81,9 @@ def eye_rings(border: Tensor, onto_form: OntoForm) -> Tensor:
     for k in range(1, EYE_SOCKET_RINGS + 1):
         share_k = k / EYE_SOCKET_RINGS
         polar = start + (2.55 - start) * share_k
-        turn = azimuth + share_k * (even - azimuth)
+        angle = azimuth + share_k * (even - azimuth)
         radius = EYE_RADIUS + 0.3 + 1.2 * share_k
-        loop = torch.stack([polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos()], 1) * radius
+        loop = torch.stack([polar.sin() * angle.cos(), polar.sin() * angle.sin(), polar.cos()], 1) * radius
         rings.append((centre + loop)[None])
     return torch.cat(rings)
 
@@ -218,9 +218,9 @@ def eyeball_points(loops: Tensor, front: Tensor, back: Tensor) -> tuple[Tensor, 
     """The left eyeball with its cornea: loops (K,S,3) and the grids that close it in front and behind."""
     count, segments = loops.shape
     # Clockwise seen from in front, starting at the upper left as closing grids do.
-    turn = 0.75 * math.pi - 2 * math.pi * torch.arange(segments).double() / segments
+    angle = 0.75 * math.pi - 2 * math.pi * torch.arange(segments).double() / segments
     polar = torch.linspace(0.20, math.pi - 0.28, count, dtype=torch.float64)[:, None].expand(count, segments)
-    ring = _on_eyeball(polar, turn.expand(count, segments))
+    ring = _on_eyeball(polar, angle.expand(count, segments))
     grids = []
     for grid, sign in ((front, 1.0), (back, -1.0)):
         side = grid.shape[0]
@@ -245,8 +245,8 @@ def _square_bearing(across: Tensor, down: Tensor) -> Tensor:
     return torch.where(horizontal, right, above)
 
 
-def _on_eyeball(polar: Tensor, turn: Tensor) -> Tensor:
+def _on_eyeball(polar: Tensor, angle: Tensor) -> Tensor:
     cornea = 0.9 * ((0.52 - polar) / 0.52).clamp(0, 1) ** 1.2
     radius = EYE_RADIUS - 0.15 + cornea * 0.25
-    way = torch.stack([polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos()], dim=-1)
+    way = torch.stack([polar.sin() * angle.cos(), polar.sin() * angle.sin(), polar.cos()], dim=-1)
     return torch.tensor(EYE_CENTRE).double() + radius[..., None] * way

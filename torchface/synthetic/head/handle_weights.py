@@ -1,4 +1,4 @@
-"""How far each handle's motion reaches over the skin: smooth weights, solved once on the mean head."""
+"""Weights by which the skin follows the lip handles and the jaw: smooth, solved once on the mean head."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ LIP_HANDLES = 52
 
 
 @dataclass(frozen=True, eq=False)
-class Influence:
+class HandleWeights:
     """Weights over the mean head's vertices.
 
     Args:
         lips: how much each vertex follows each lip handle, (V,52); rows of the red of the lips sum to 1.
-        jaw: how much each vertex turns with the jaw, (V,).
+        jaw: how much each vertex rotates with the jaw, (V,).
         lip_position: each lip vertex's handle, (V,) int64, -1 elsewhere; ``lip_ring`` its ring, -1 elsewhere.
     """
 
@@ -36,7 +36,7 @@ class Influence:
 
 
 @lru_cache(maxsize=1)
-def influence() -> Influence:
+def handle_weights() -> HandleWeights:
     """The weights, computed once."""
     t = topology()
     p = mean_vertices()
@@ -47,25 +47,25 @@ def influence() -> Influence:
         ids = both_sides(t.rings["mouth"])[side]
         position[ids] = handles.expand_as(ids)
         ring[ids] = torch.arange(len(ids))[:, None].expand_as(ids)
-    return Influence(_lip_weights(p, position, ring), _jaw_weights(p, position, ring), position, ring)
+    return HandleWeights(_lip_weights(p, position, ring), _jaw_weights(p, position, ring), position, ring)
 
 
 def _lip_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     on_lips = (ring >= MOUTH_BORDER) & (ring <= MOUTH_CONTACT + 2)
     values = torch.zeros(len(p), LIP_HANDLES, dtype=torch.float64)
     values[on_lips] = torch.nn.functional.one_hot(position[on_lips], LIP_HANDLES).double()
-    still = (p[:, 1] > -18) | (p[:, 1] < -111) | (p[:, 2] < 22) | (ring > MOUTH_CONTACT + 5) | _named("still_for_lips")
+    fixed_skin = (p[:, 1] > -18) | (p[:, 1] < -111) | (p[:, 2] < 22) | (ring > MOUTH_CONTACT + 5) | _unmoved_parts()
     # The nose stays: only the skin beside its wings gives.
-    still |= (p[:, 1] > -44.5) & (p[:, 0].abs() < 20)
-    return _spread(values, on_lips | still)
+    fixed_skin |= (p[:, 1] > -44.5) & (p[:, 0].abs() < 20)
+    return _interpolated(values, on_lips | fixed_skin)
 
 
 def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     values = torch.zeros(len(p), 1, dtype=torch.float64)
     side = torch.where(position > 26, 52 - position, position).double()
-    turn = ramp(side, 6.5, 20.0)
+    follow = ramp(side, 6.5, 20.0)
     lips = ring >= 3
-    values[lips, 0] = turn[lips]
+    values[lips, 0] = follow[lips]
     cap = torch.zeros(len(p), dtype=torch.bool)
     bag = topology().caps["mouth"]
     depth = torch.linspace(0, 1, bag.shape[0], dtype=torch.float64)[:, None].expand(bag.shape)
@@ -78,16 +78,15 @@ def _jaw_weights(p: Tensor, position: Tensor, ring: Tensor) -> Tensor:
     below_chin = (p[:, 1] < -106) & (p[:, 2] < 62)
     bone = (p[:, 1] < line) & (p[:, 1] > -117) & (p[:, 2] > 40) & ~lips & ~cap & ~below_chin & (ring < 3)
     values[bone] = 1.0
-    still = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -26) | _named("still_for_lips")
-    still |= (p[:, 1] > -50) & (p[:, 0].abs() < 22) & (p[:, 2] > 60) & (ring < 0)
-    still &= ~(lips | cap)
-    return _spread(values, bone | lips | cap | still)[:, 0].clamp(0, 1)
+    fixed_skin = (p[:, 1] > -36) | (p[:, 1] < -150) | (p[:, 2] < -26) | _unmoved_parts()
+    fixed_skin |= (p[:, 1] > -50) & (p[:, 0].abs() < 22) & (p[:, 2] > 60) & (ring < 0)
+    fixed_skin &= ~(lips | cap)
+    return _interpolated(values, bone | lips | cap | fixed_skin)[:, 0].clamp(0, 1)
 
 
-def _named(name: str) -> Tensor:
+def _unmoved_parts() -> Tensor:
     """Parts that no lip moves: eyes, ears, nostrils."""
     t = topology()
-    assert name == "still_for_lips"
     mask = torch.zeros(t.count, dtype=torch.bool)
     ids = [t.rings["eye"][1:], t.caps["eye"], t.rings["ear"], t.caps["ear"], t.rings["nostril"], t.caps["nostril"]]
     for half in (*ids, t.eyeball, t.caps["eyeball_front"], t.caps["eyeball_back"]):
@@ -96,8 +95,8 @@ def _named(name: str) -> Tensor:
     return mask
 
 
-def _spread(values: Tensor, fixed: Tensor) -> Tensor:
-    """Values known where fixed, (V,C), elsewhere as smooth as a bent plate: the squared Laplacian is zero there."""
+def _interpolated(values: Tensor, fixed: Tensor) -> Tensor:
+    """Values given where fixed, (V,C), elsewhere interpolated as a thin plate: the squared Laplacian is zero there."""
     t = topology()
     p = mean_vertices().numpy()
     quads = t.quads.numpy()

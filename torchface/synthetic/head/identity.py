@@ -66,8 +66,8 @@ def ramp(values: Tensor, start: float, end: float) -> Tensor:
 def bump(points: Tensor, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Tensor:
     """A Gaussian (N,) round a point of the left side and its mirror image."""
     folded = torch.cat([points[:, :1].abs(), points[:, 1:]], dim=1)
-    away = (folded - torch.tensor(centre, dtype=points.dtype)) / torch.tensor(width, dtype=points.dtype)
-    return torch.exp(-0.5 * (away**2).sum(1))
+    offset = (folded - torch.tensor(centre, dtype=points.dtype)) / torch.tensor(width, dtype=points.dtype)
+    return torch.exp(-0.5 * (offset**2).sum(1))
 
 
 def _along(axis: int, amount: Tensor) -> Tensor:
@@ -336,13 +336,13 @@ def anatomy(identity: Tensor | None = None) -> Anatomy:
     return Anatomy(vertices, probes[:2], radius, probes[2:])
 
 
-def draw_identities(count: int, generator: torch.Generator, spread: float = 1.0) -> Tensor:
+def draw_identities(count: int, generator: torch.Generator, scale: float = 1.0) -> Tensor:
     """Random heads: coefficients (count,K) in standard deviations, normal, clipped to ±2.5.
 
     Args:
         count: how many heads.
         generator: where the randomness comes from.
-        spread: 1 draws as varied as people are; less keeps nearer to the mean.
+        scale: of the standard deviations; 1 is the variation of people.
     """
     drawn = torch.randn(count, len(IDENTITY), generator=generator, device=generator.device)
-    return (spread * drawn).clamp(-2.5, 2.5).cpu()
+    return (scale * drawn).clamp(-2.5, 2.5).cpu()

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchface.synthetic.head.handle_weights import LIP_HANDLES, Influence, influence
+from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
 from torchface.synthetic.head.identity import Anatomy, bump, mean_vertices, mirrored, ramp
 from torchface.synthetic.head.topology import MOUTH_BORDER, MOUTH_CONTACT, topology
 
@@ -17,7 +17,7 @@ _SIDE = torch.where(_HANDLE > 26, 52 - _HANDLE, _HANDLE)  # 0 upper midline, 13 
 _LEFT = torch.where(_HANDLE > 26, -1.0, 1.0).double()
 
 
-# A lip turned in over the teeth: for each ring the motion up and forward, millimetres.
+# A lip rolled in over the teeth: for each ring the motion up and forward, millimetres.
 _ROLL_LOWER = {
     4: (0.6, -0.6), 5: (3.2, -2.2), 6: (3.6, -4.2), 7: (2.4, -5.6),
     8: (0.6, -5.0), 9: (0.0, -3.8), 10: (-0.6, -3.2), 11: (0.0, -2.4),
@@ -29,7 +29,7 @@ _ROLL_UPPER = {
 
 
 class Mouth:
-    """One head's mouth, measured: everything its shapes are made of.
+    """The measurements of one head's mouth, from which its shapes are made.
 
     Args:
         head: whose mouth.
@@ -37,7 +37,7 @@ class Mouth:
 
     def __init__(self, head: Anatomy) -> None:
         self.head = head
-        self.weights: Influence = influence()
+        self.weights: HandleWeights = handle_weights()
         self.mean = mean_vertices()
         rings = topology().rings["mouth"]
         line, mean_line = head.vertices[rings[MOUTH_CONTACT]], self.mean[rings[MOUTH_CONTACT]]
@@ -68,14 +68,14 @@ class Mouth:
         out = (now + x * self.across.sign()).clamp(min=0)
         return torch.stack([x, y, z - self.arch * (out**2.2 - now**2.2)], dim=1)
 
-    def spread(self, handles: Tensor) -> Tensor:
+    def skin_motion(self, handles: Tensor) -> Tensor:
         """Displacement (V,3) of the skin that follows the handles (52,3)."""
         return self.weights.lips @ handles
 
     def profile(
         self, upper: dict[int, tuple[float, float]], lower: dict[int, tuple[float, float]], share: Tensor
     ) -> Tensor:
-        """Lips turned over: for rings the motion (up, forward) in mm, times ``share`` (52,) round the mouth."""
+        """Rolled lips: for rings the motion (up, forward) in mm, times ``share`` (52,) round the mouth."""
         delta = torch.zeros_like(self.head.vertices)
         ring, position = self.weights.lip_ring, self.weights.lip_position
         for side, rows in ((self.is_upper, upper), (self.is_lower, lower)):
@@ -86,15 +86,17 @@ class Mouth:
                 delta[ids, 2] += forward * amount
         return delta * self.size
 
-    def jaw(self, turn: float = 0.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), yaw: float = 0.0) -> Tensor:
-        """The jaw turned about its own joints (radians, opening), swung aside (radians) and shifted (mm)."""
+    def jaw(
+        self, opening: float = 0.0, translation: tuple[float, float, float] = (0.0, 0.0, 0.0), yaw: float = 0.0
+    ) -> Tensor:
+        """The jaw opened about its own joints (radians), rotated aside (yaw, radians) and translated (mm)."""
         v, hinge = self.head.vertices, self.head.hinges.mean(0)
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = math.cos(opening), math.sin(opening)
         about_x = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
         c, s = math.cos(yaw), math.sin(yaw)
         about_y = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
         offset = v - hinge
-        moved = offset @ (about_y @ about_x).T - offset + torch.tensor(shift, dtype=torch.float64) * self.reach
+        moved = offset @ (about_y @ about_x).T - offset + torch.tensor(translation, dtype=torch.float64) * self.reach
         return self.weights.jaw[:, None] * moved
 
     def push(self, centre: tuple[float, float, float], width: tuple[float, float, float], way: Tensor) -> Tensor:
@@ -119,17 +121,17 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
     a, aa = m.across, m.across.abs()
     mid = (1 - aa**2).clamp(min=0)
     left_corner = m.corner * (_LEFT > 0)
-    opened = m.jaw(JAW_ANGLE, (0, -1.0, -1.5)) + m.spread(m.slide(-0.05 * a * w * m.corner, 0.0))
+    opened = m.jaw(JAW_ANGLE, (0, -1.0, -1.5)) + m.skin_motion(m.slide(-0.05 * a * w * m.corner, 0.0))
     vec = lambda *xyz: torch.tensor(xyz, dtype=torch.float64)  # noqa: E731
     chin = m.push((0, -96, 88), (16, 12, 16), vec(0, 3.4, 0.8))
     return {
         "jawOpen": opened,
-        "jawForward": m.jaw(shift=(0, -0.6, 6.5)),
-        "jawLeft": m.jaw(shift=(2.5, -0.4, 0.0), yaw=math.radians(4.5)),
+        "jawForward": m.jaw(translation=(0, -0.6, 6.5)),
+        "jawLeft": m.jaw(translation=(2.5, -0.4, 0.0), yaw=math.radians(4.5)),
         "mouthClose": _close(m, opened),
         "mouthFunnel": _funnel(m, mid),
         "mouthPucker": _pucker(m, mid),
-        "mouthLeft": m.spread(m.slide(0.24 * w * (0.65 + 0.35 * a), 0.8 * left_corner, 0.0)),
+        "mouthLeft": m.skin_motion(m.slide(0.24 * w * (0.65 + 0.35 * a), 0.8 * left_corner, 0.0)),
         "mouthSmileLeft": _smile(m, left_corner)
         + m.push((36, -34, 68), (13, 13, 20), vec(0.6, 3.2, 2.4))
         + m.push((37, -62, 60), (8, 14, 16), vec(1.8, 1.0, -1.6)),
@@ -138,13 +140,13 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
         "mouthDimpleLeft": _side_motion(m, 0.16 * w, 1.2 * size, -3.0, 2.8),
         "mouthStretchLeft": _side_motion(m, 0.24 * w, -3.6 * size, -0.6, 5.0),
         "mouthRollLower": m.profile({}, _ROLL_LOWER, mid)
-        + m.spread(m.slide(0.0, 0.8 * m.is_lower * mid, 0.0)),
+        + m.skin_motion(m.slide(0.0, 0.8 * m.is_lower * mid, 0.0)),
         "mouthRollUpper": m.profile(_ROLL_UPPER, {}, mid)
-        + m.spread(m.slide(0.0, -0.5 * m.is_upper * mid, 0.0)),
-        "mouthShrugLower": m.spread(
+        + m.skin_motion(m.slide(0.0, -0.5 * m.is_upper * mid, 0.0)),
+        "mouthShrugLower": m.skin_motion(
             m.slide(0.0, (3.6 * m.is_lower + 2.4 * m.is_upper) * mid * size, 1.6 * m.is_lower * mid)
         ) + chin + mirrored(chin),
-        "mouthShrugUpper": m.spread(
+        "mouthShrugUpper": m.skin_motion(
             m.slide(0.0, (3.2 * m.is_upper + 0.9 * m.is_lower) * mid * size, 1.4 * m.is_upper * mid)
         ),
         "mouthPressLeft": _press(m),
@@ -154,14 +156,16 @@ def lower_face(head: Anatomy) -> dict[str, Tensor]:
     }  # fmt: skip
 
 
-def _bell(across: Tensor, centre: float, width: float) -> Tensor:
+def _gaussian(across: Tensor, centre: float, width: float) -> Tensor:
     return torch.exp(-(((across - centre) / width) ** 2))
 
 
 def _lift(m: Mouth, lip: Tensor, out: float, up: float, forward: float) -> Tensor:
     """The left half of a lip drawn up or down; ``lip`` (52,) says which handles, the rest is in millimetres."""
     side = lip * m.left
-    return m.spread(m.slide(out * m.size * side, up * m.size * side * _bell(m.across, 0.35, 0.75), forward * side))
+    return m.skin_motion(
+        m.slide(out * m.size * side, up * m.size * side * _gaussian(m.across, 0.35, 0.75), forward * side)
+    )
 
 
 def _smile(m: Mouth, corner: Tensor) -> Tensor:
@@ -169,12 +173,12 @@ def _smile(m: Mouth, corner: Tensor) -> Tensor:
     pull = 0.8 * reach + 0.2 * corner + 0.12 * (1 - m.across.abs()) * m.left
     out = 0.27 * m.half_width * pull
     up = 8.2 * m.size * (0.75 * reach**1.5 + 0.25 * corner) + 0.6 * m.size * (m.is_upper * m.left) * (1 - reach)
-    return m.spread(m.slide(out, up, -0.8 * pull))
+    return m.skin_motion(m.slide(out, up, -0.8 * pull))
 
 
 def _side_motion(m: Mouth, out: Tensor, up: Tensor | float, back: float, breadth: float) -> Tensor:
     reach = torch.exp(-(((_SIDE - 13) / breadth) ** 2)) * m.left
-    return m.spread(m.slide(out * reach, up * reach, back * reach))
+    return m.skin_motion(m.slide(out * reach, up * reach, back * reach))
 
 
 def _close(m: Mouth, opened: Tensor) -> Tensor:
@@ -188,28 +192,28 @@ def _close(m: Mouth, opened: Tensor) -> Tensor:
     share = (0.28 + 0.22 * torch.exp(-(((_SIDE - 13) / 3.0) ** 2)))[:, None]
     upper, lower = torch.where(_SIDE < 13, _HANDLE, twin), torch.where(_SIDE < 13, twin, _HANDLE)
     meet = (1 - share) * motion[upper] + share * motion[lower]
-    return m.spread(meet - motion)
+    return m.skin_motion(meet - motion)
 
 
 def _funnel(m: Mouth, mid: Tensor) -> Tensor:
     narrow = -0.26 * m.half_width * m.across
     part = (5.0 * m.is_upper - 6.5 * m.is_lower) * m.size * mid
-    lips = m.spread(m.slide(narrow, part, (3.0 + 2.0 * mid) * m.size))
-    turned = {5: (0.6, 0.6), 6: (1.2, 1.4), 7: (1.2, 2.0), 8: (0.8, 1.6), 9: (0.2, 0.8)}
-    return lips + m.profile(turned, {k: (-up, forward) for k, (up, forward) in turned.items()}, mid)
+    lips = m.skin_motion(m.slide(narrow, part, (3.0 + 2.0 * mid) * m.size))
+    rolled = {5: (0.6, 0.6), 6: (1.2, 1.4), 7: (1.2, 2.0), 8: (0.8, 1.6), 9: (0.2, 0.8)}
+    return lips + m.profile(rolled, {k: (-up, forward) for k, (up, forward) in rolled.items()}, mid)
 
 
 def _pucker(m: Mouth, mid: Tensor) -> Tensor:
     narrow = -0.42 * m.half_width * m.across
-    lips = m.spread(m.slide(narrow, 0.0, (2.2 + 2.8 * mid) * m.size))
-    turned = {5: (0.2, 0.4), 6: (0.8, 1.0), 7: (0.8, 1.4), 8: (0.3, 0.9), 9: (0.0, 0.2)}
-    return lips + m.profile(turned, {k: (-up, forward) for k, (up, forward) in turned.items()}, mid)
+    lips = m.skin_motion(m.slide(narrow, 0.0, (2.2 + 2.8 * mid) * m.size))
+    rolled = {5: (0.2, 0.4), 6: (0.8, 1.0), 7: (0.8, 1.4), 8: (0.3, 0.9), 9: (0.0, 0.2)}
+    return lips + m.profile(rolled, {k: (-up, forward) for k, (up, forward) in rolled.items()}, mid)
 
 
 def _press(m: Mouth) -> Tensor:
-    share = m.left * (1 - m.across.abs() ** 4) * _bell(m.across, 0.45, 0.7)
+    share = m.left * (1 - m.across.abs() ** 4) * _gaussian(m.across, 0.45, 0.7)
     upper = {4: (-0.3, -0.1), 5: (-1.6, -0.5), 6: (-1.3, -1.2), 7: (-0.8, -1.4), 8: (-0.3, -1.1), 9: (0.0, -0.6)}
     lower = {k: (-up, forward) for k, (up, forward) in upper.items()}
-    return m.profile(upper, lower, share) + m.spread(
+    return m.profile(upper, lower, share) + m.skin_motion(
         m.slide(0.06 * m.half_width * m.corner * m.left, 0.6 * m.corner * m.left, -0.4 * share)
     )

@@ -114,8 +114,8 @@ def _guide(row: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
     width = GUIDE_WIDTH * (1 - 0.16 * (1 - elevation / 3) ** 2)
     x = width * sine
     tilt = torch.deg2rad(tilt)
-    turn = torch.atan2(sine / width, cosine / 88.0)
-    ray = torch.stack([turn.sin() * tilt.cos(), tilt.sin(), turn.cos() * tilt.cos()], dim=1)
+    azimuth = torch.atan2(sine / width, cosine / 88.0)
+    ray = torch.stack([azimuth.sin() * tilt.cos(), tilt.sin(), azimuth.cos() * tilt.cos()], dim=1)
     return torch.stack([x, y, z], dim=1), ray
 
 
@@ -224,7 +224,7 @@ def _neighbours(quads: Tensor, count: int) -> Tensor:
     return torch.sparse_coo_tensor(pairs.T, 1 / degree[pairs[:, 0]], (count, count), check_invariants=False).coalesce()
 
 
-def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> None:
+def _relax(t: Topology, vertices: Tensor, iterations: int = 6) -> None:
     """Evens the grid out along the form; ring systems come later, so only quads between grid and crown count."""
     present = torch.zeros(t.half_count, dtype=torch.bool)
     present[t.grid[t.grid >= 0]] = True
@@ -234,7 +234,7 @@ def _relax(t: Topology, vertices: Tensor, rounds: int = 6) -> None:
     fixed = ~present
     for edge in (t.grid[-1], *(t.rings[name][0] for name in t.rings)):
         fixed[edge] = True
-    for _ in range(rounds):
+    for _ in range(iterations):
         mean = average @ vertices
         step = torch.where(fixed[:, None], vertices, 0.5 * vertices + 0.5 * mean)
         step[~fixed] = project(step[~fixed], 1)

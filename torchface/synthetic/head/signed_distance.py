@@ -139,16 +139,16 @@ def gradient(points: Tensor, step: float = 0.05) -> Tensor:
     return torch.nn.functional.normalize(total, dim=-1)
 
 
-def cast(starts: Tensor, directions: Tensor, rounds: int = 40) -> Tensor:
+def cast(starts: Tensor, directions: Tensor, iterations: int = 40) -> Tensor:
     """Where rays from outside (N,3) along unit directions (N,3) first meet the form, (N,3)."""
     points = starts.clone()
-    for _ in range(rounds):  # sphere tracing: each round depends on the last
+    for _ in range(iterations):  # sphere tracing: each iteration depends on the last
         points = points + directions * 0.85 * signed_distance(points)[:, None]
     return points
 
 
-def project(points: Tensor, rounds: int = 3) -> Tensor:
+def project(points: Tensor, iterations: int = 3) -> Tensor:
     """Nearby points (N,3) moved onto the form along its gradient."""
-    for _ in range(rounds):
+    for _ in range(iterations):
         points = points - 0.9 * signed_distance(points)[:, None] * gradient(points)
     return points

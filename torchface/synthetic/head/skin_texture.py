@@ -56,7 +56,7 @@ def texel_values(size: int, table: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _vertex_marks() -> Tensor:
-    """What the painter must know beyond positions, (V,8), in the order of ``_MARKS``."""
+    """Vertex attributes beside the positions, (V,8), in the order of ``_MARKS``."""
     t, regions = topology(), head_annotations().regions
     marks = torch.zeros(t.count, len(_MARKS))
     lips = torch.tensor([0.0] * (MOUTH_BORDER - 1) + [0.0, 0.55, 1.0, 1.0, 1.0, 1.0] + [1.0] * 7)
@@ -136,7 +136,7 @@ def _brows(p: Tensor) -> Tensor:
     half = torch.from_numpy(np.interp(along.numpy(), knots, np.array([3.4, 3.7, 3.0, 2.2, 0.9]))).float()
     inside = 1 - ramp((y - middle).abs() / half, 0.55, 1.15)
     ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
-    # Strokes: noise drawn out along a direction that turns from upright to outward.
+    # Strokes: noise drawn out along a direction that rotates from upright to outward.
     lean = 0.9 - 0.6 * along.clamp(0, 1)
     stroke = torch.stack([(x - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.45, z * 0.3], dim=1)
     hair = 0.68 + 0.42 * _noise(stroke, 0.9, 7) + 0.12 * _noise(stroke, 2.4, 9)
@@ -157,10 +157,10 @@ def _eye(p: Tensor) -> Tensor:
     centre = torch.tensor(EYE_CENTRE)
     offset = torch.cat([p[:, :1].abs(), p[:, 1:]], dim=1) - centre
     polar = torch.acos(torch.nn.functional.normalize(offset, dim=1)[:, 2].clamp(-1, 1))
-    turn = torch.atan2(offset[:, 1], offset[:, 0])
+    angle = torch.atan2(offset[:, 1], offset[:, 0])
     color = torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3).clone()
     color = _mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
-    spokes = torch.stack([turn.cos() * 9, turn.sin() * 9, polar * 2.5], dim=1)
+    spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
     iris = torch.tensor((0.33, 0.24, 0.14)) * (1 + 0.45 * _noise(spokes, 1.0, 8))[:, None]
     iris = _mix(iris, (0.46, 0.34, 0.17), 1 - ramp(polar, 0.17, 0.34))
     iris = _mix(iris, (0.09, 0.06, 0.05), ramp(polar, 0.35, 0.45))

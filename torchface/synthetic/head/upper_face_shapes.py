@@ -1,4 +1,4 @@
-"""Shapes of the upper face: lids that slide over the eyeball, eyes that turn, brows, nose and cheeks."""
+"""Shapes of the upper face: lids that slide over the eyeball, eye rotation, brows, nose and cheeks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CLOSING_HEIGHT = 0.28
 """Where the lids meet, as a share of the way from the lower to the upper edge."""
 
 GAZE = math.radians(26.0)
-"""How far an eye turns at weight 1."""
+"""Rotation of an eye at weight 1."""
 
 # How much of the lid edge's way each ring goes: skin from the orbit to the edge (8), then the inner lid and socket.
 _FOLLOW = torch.tensor(
@@ -100,8 +100,8 @@ def _closing_heights(around: Tensor, above: Tensor, below: Tensor) -> Tensor:
     return height
 
 
-def _turn_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
-    """The left eyeball turned: pitch up, yaw toward the viewer's right, radians."""
+def _rotated_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
+    """The left eyeball rotated: pitch up, yaw toward the viewer's right, radians."""
     t = topology()
     ids = torch.cat([t.eyeball.flatten(), t.caps["eyeball_front"].flatten(), t.caps["eyeball_back"].flatten()]).unique()
     c, s = math.cos(yaw), math.sin(yaw)
@@ -166,10 +166,10 @@ def upper_face(head: Anatomy) -> dict[str, Tensor]:
         "eyeBlinkLeft": lids(1.0, 1.0) + push((30, 16, 80), (16, 7, 20), (0, -1.0, 0)),
         "eyeWideLeft": lids(-0.33, -0.12, lean=0.8) + push((30, 20, 82), (17, 8, 20), (0, 1.2, 0)),
         "eyeSquintLeft": lids(0.26, 0.85) + push((34, -17, 70), (15, 9, 22), (0.3, 2.2, 0.8)),
-        "eyeLookDownLeft": _turn_eye(head, -GAZE, 0) + lids(0.52, -0.35),
-        "eyeLookUpLeft": _turn_eye(head, GAZE, 0) + lids(-0.30, 0.35, lean=0.6),
-        "eyeLookInLeft": _turn_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),
-        "eyeLookOutLeft": _turn_eye(head, 0, 1.15 * GAZE) + _sideways(head, 0.55),
+        "eyeLookDownLeft": _rotated_eye(head, -GAZE, 0) + lids(0.52, -0.35),
+        "eyeLookUpLeft": _rotated_eye(head, GAZE, 0) + lids(-0.30, 0.35, lean=0.6),
+        "eyeLookInLeft": _rotated_eye(head, 0, -1.15 * GAZE) + _sideways(head, -0.55),
+        "eyeLookOutLeft": _rotated_eye(head, 0, 1.15 * GAZE) + _sideways(head, 0.55),
         "browDownLeft": push(brow_inner, (11, 11, 20), (-2.2, -6.5, 0.6))
         + push(brow_mid, (15, 10, 20), (-1.6, -4.6, 0.4))
         + push(brow_outer, (11, 9, 20), (-0.4, -1.4, 0.0))
@@ -206,8 +206,8 @@ def _sideways(head: Anatomy, amount: float) -> Tensor:
         ways[lid] = torch.sin(math.pi * torch.arange(17).double() / 16) ** 2
     delta = torch.zeros_like(head.vertices)
     radial = head.vertices[rings] - head.eye_centres[0]
-    turned = radial.clone()
-    turned[..., 0] += amount * 1.2 * (_FOLLOW[:, None] * ways)
-    turned *= (radial.norm(dim=-1) / turned.norm(dim=-1))[..., None]
-    delta[rings] = turned - radial
+    rotated = radial.clone()
+    rotated[..., 0] += amount * 1.2 * (_FOLLOW[:, None] * ways)
+    rotated *= (radial.norm(dim=-1) / rotated.norm(dim=-1))[..., None]
+    delta[rings] = rotated - radial
     return delta

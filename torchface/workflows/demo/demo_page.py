@@ -1,4 +1,4 @@
-"""The demo's report: what was true and what came back, as a performance that plays, in pictures, curves and tables."""
+"""The demo's report: what was true and what came back, as a performance that plays, in figures, curves and tables."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _FEW_RAYS = replace(DEFAULT_LIGHTING, occlusion_rays=3)
 def result_rows(result: DemoResult) -> list[tuple[str, str, str]]:
     """The figures of a demo, one a row: what, of the take solved at once, frame by frame."""
     names = result.rig.names
-    told = _told_apart(result)
+    distinct = _distinguishable(result)
     solves = (result.solved, result.frame_by_frame)
 
     def row(what: str, value: Callable[[Solved], str]) -> tuple[str, str, str]:
         return (what, value(solves[0]), value(solves[1]))
 
     def worst(solved: Solved) -> str:
-        shape = int(told[solved.weight_error.mean[told].argmax()])
+        shape = int(distinct[solved.weight_error.mean[distinct].argmax()])
         return f"{float(solved.weight_error.mean[shape]):.3f} ({names[shape]})"
 
     def median(values: Tensor) -> str:
@@ -58,9 +58,15 @@ def result_rows(result: DemoResult) -> list[tuple[str, str, str]]:
         row("mesh error, worst vertex of any frame", lambda s: f"{float(s.mesh_error.vertex_largest.max()):.2f} mm"),
         row("jitter of the curves, times the true ones'", lambda s: f"{s.jitter:.1f}"),
         row("correlation with the true curve, median shape", lambda s: f"{s.correlation:.3f}"),
-        row("the same of the shapes told apart", lambda s: median(s.weight_error.correlation[told])),
+        row(
+            "the same of the shapes that the markers distinguish",
+            lambda s: median(s.weight_error.correlation[distinct]),
+        ),
         row("weight error, mean", lambda s: f"{float(s.weight_error.mean.mean()):.4f}"),
-        row("weight error of the shapes told apart, mean", lambda s: f"{float(s.weight_error.mean[told].mean()):.4f}"),
+        row(
+            "weight error of the shapes that the markers distinguish, mean",
+            lambda s: f"{float(s.weight_error.mean[distinct].mean()):.4f}",
+        ),
         row("weight error of those, worst shape", worst),
         row("marker RMSE, median frame", lambda s: f"{float(s.marker_rmse.nanmedian()):.3f} mm"),
     ]
@@ -77,31 +83,31 @@ def scene_rows(result: DemoResult) -> list[tuple[str, str]]:
         ("shapes, vertices", f"{len(result.rig.names)}, {len(scene.head.vertices):,}"),
         ("markers, share of samples missing", f"{len(markers.names)}, {100 * missing:.1f} %"),
         ("marker noise, RMSE that it alone makes", f"{FLAWS.noise:g} mm a coordinate, {(3**0.5) * FLAWS.noise:.2f} mm"),
-        ("shapes that these markers tell apart", f"{len(_told_apart(result))} of {len(result.rig.names)}"),
+        ("shapes that these markers tell apart", f"{len(_distinguishable(result))} of {len(result.rig.names)}"),
         ("the solve of the whole take", f"{result.seconds:.1f} s"),
     ]
 
 
-def _told_apart(result: DemoResult) -> Tensor:
+def _distinguishable(result: DemoResult) -> Tensor:
     """Rows of the shapes that the markers see and do not confuse with others, (K,); all where they confuse all."""
     lost = {*result.seen.unseen, *result.seen.ambiguous}
-    told = [i for i, name in enumerate(result.rig.names) if name not in lost]
-    return torch.tensor(told or list(range(len(result.rig.names))))
+    distinct = [i for i, name in enumerate(result.rig.names) if name not in lost]
+    return torch.tensor(distinct or list(range(len(result.rig.names))))
 
 
 def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = None) -> Path:
     """Renders the report of a demo into a folder and returns the page's path."""
     progress = progress or silent
     scene = result.scene
-    names, told = result.rig.names, _told_apart(result)
-    telling = _telling_frame(result)
-    active = scene.weights[:, told].std(0).argsort(descending=True)[:_ACTIVE]
-    active = told[active]
+    names, distinct = result.rig.names, _distinguishable(result)
+    shown = _frame_of_figures(result)
+    active = scene.weights[:, distinct].std(0).argsort(descending=True)[:_ACTIVE]
+    active = distinct[active]
     progress("writing the performance for the page")
-    markup = _player(result, out, telling, [names[i] for i in active.tolist()])
+    markup = _player(result, out, shown, [names[i] for i in active.tolist()])
     progress("rendering the rig")
-    rig_picture = _rig_picture(result)
-    frame_picture = _frame_picture(result, telling)
+    rig_figure = _rig_figure(result)
+    frame_figure = _frame_figure(result, shown)
     progress("drawing curves and markers")
     solved, single = result.solved, result.frame_by_frame
     first = _busiest(scene.weights[:, active], round(_CURVE_SECONDS * scene.fps))
@@ -116,13 +122,13 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
     )
     markers = result.recording.take.markers
     assert markers is not None
-    on_mesh = result.attachment.on(scene.head.faces, result.rig(solved.weights[telling : telling + 1]))[0]
+    on_mesh = result.attachment.on(scene.head.faces, result.rig(solved.weights[shown : shown + 1]))[0]
     sections = [
         Section("The performance", _story(result), markup=markup),
         Section(
             "One frame",
             "The true and the solved face, and the distance between them. No marker tells where eyes look.",
-            pictures=[("frame_1.png", frame_picture)],
+            pictures=[("frame_1.png", frame_figure)],
         ),
         Section(
             "How close it came",
@@ -148,14 +154,14 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
             "Markers against the solved face",
             f"Their distance; noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
             pictures=[
-                ("markers.png", marker_views(markers.values[telling], on_mesh, f"frame {telling},")),
+                ("markers.png", marker_views(markers.values[shown], on_mesh, f"frame {shown},")),
                 ("marker_rmse.png", error_curve(solved.marker_rmse, scene.fps)),
             ],
         ),
         Section(
             "The rig",
             "Above the template, below the same shapes transferred to the new head.",
-            pictures=[("rig.png", rig_picture)],
+            pictures=[("rig.png", rig_figure)],
         ),
         Section(
             "Error of each shape",
@@ -163,7 +169,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
             pictures=[
                 (
                     "weight_error.png",
-                    named_bars(solved.weight_error.mean[told], [names[i] for i in told], "mean absolute error"),
+                    named_bars(solved.weight_error.mean[distinct], [names[i] for i in distinct], "mean absolute error"),
                 )
             ],
         ),
@@ -199,8 +205,8 @@ def _player(result: DemoResult, out: Path, start: int, curves: Sequence[str]) ->
         Played("frame by frame", result.rig, result.frame_by_frame.weights),
     ]
     panels = [Panel("true, with its markers", 0, markers=True), Panel("solved"), Panel("distance", error=True)]
-    filmed = Markers(markers.select(result.attachment.labels or ()).values)
-    return write_player(Player(takes, panels, scene.fps, (1, 2), 0, curves, filmed, _HEAT_MAXIMUM, start), out)
+    captured = Markers(markers.select(result.attachment.labels or ()).values)
+    return write_player(Player(takes, panels, scene.fps, (1, 2), 0, curves, captured, _HEAT_MAXIMUM, start), out)
 
 
 def _layout_text(result: DemoResult) -> str:
@@ -218,8 +224,8 @@ def _layout_pictures(result: DemoResult) -> list[tuple[str, Tensor]]:
 def _seen_rows(result: DemoResult) -> list[tuple[str, str]]:
     """What the markers see, what they mix up, what they do not see."""
     seen = result.seen
-    told = [name for name in result.rig.names if name not in {*seen.unseen, *seen.ambiguous}]
-    rows = [("tell apart", told), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
+    distinct = [name for name in result.rig.names if name not in {*seen.unseen, *seen.ambiguous}]
+    rows = [("tell apart", distinct), ("confuse with others", seen.ambiguous), ("do not see", seen.unseen)]
     return [(what, f"{len(shapes)}: {_both_sides(shapes)}") for what, shapes in rows if shapes]
 
 
@@ -257,7 +263,7 @@ def _posed(result: DemoResult, weights: dict[str, float]) -> tuple[Mesh, Mesh]:
     return pair[0], pair[1]
 
 
-def _rig_picture(result: DemoResult) -> Tensor:
+def _rig_figure(result: DemoResult) -> Tensor:
     upper, lower = [], []
     for title, weights in _POSES.items():
         template, actor = _posed(result, weights)
@@ -278,13 +284,13 @@ def _rig_picture(result: DemoResult) -> Tensor:
     return sheet([*upper, *lower], len(upper))
 
 
-def _telling_frame(result: DemoResult) -> int:
+def _frame_of_figures(result: DemoResult) -> int:
     """The frame in which the markers are farthest from rest."""
     rest = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices).flatten()
     return int((result.recording.markers.flatten(1) - rest).norm(dim=1).argmax())
 
 
-def _frame_picture(result: DemoResult, frame: int) -> Tensor:
+def _frame_figure(result: DemoResult, frame: int) -> Tensor:
     head = result.scene.head
     true = head.with_vertices(result.scene.truth(result.scene.weights[frame : frame + 1])[0])
     solved = head.with_vertices(result.rig(result.solved.weights[frame : frame + 1].to(result.rig.deltas))[0])

@@ -108,7 +108,7 @@ class DemoResult:
         frame_by_frame: every frame on its own.
         seconds: what the solve at once took.
         face: mask (V,) of the vertices that the mesh errors are about.
-        seen: what the markers can tell of the rig.
+        seen: what the markers observe of the rig.
         solver: how the exported solver compares.
         files: what was written, by purpose.
     """
@@ -129,7 +129,7 @@ class DemoResult:
 
 
 def embedded_scene(seed: int, frames: int = 1800) -> Scene:
-    """The mean performer's rig, a performer drawn at random, and a made-up performance."""
+    """The mean performer's rig, a performer drawn at random, and a synthetic performance."""
     generator = torch.Generator().manual_seed(seed)
     truth = performer(draw_identities(1, generator)[0])
     weights = perform(frames, generator)
@@ -227,7 +227,7 @@ def run_demo(
     save_rig(scene.template, files["template rig"])
     save_mesh(replace(scene.head, texture=None), files["new head"])
     save_rig(rig, files["transferred rig"])
-    progress("filming the markers")
+    progress("capturing the markers")
     layout = _layout(scene.truth)
     attachment = place_markers(scene.truth) if layout is None else layout.attachment
     attachment.save(files["marker sites"])
@@ -236,11 +236,11 @@ def run_demo(
     save_take(recording.take, files["marker take"])
     progress("solving the take")
     marker_solver = MarkerSolver(rig, attachment)
-    filmed = load_take(files["marker take"])
+    captured = load_take(files["marker take"])
     started = time.perf_counter()
-    solved = WholeTakeSolver(marker_solver).solve_take(filmed)
+    solved = WholeTakeSolver(marker_solver).solve_take(captured)
     seconds = time.perf_counter() - started
-    single = marker_solver.solve_take(filmed)
+    single = marker_solver.solve_take(captured)
     progress("writing weights, animation and solver")
     live = bool(mapping(rig.names, ARKIT).any())
     (save_live_link if live else save_weights_csv)(solved, files["solved weights"])

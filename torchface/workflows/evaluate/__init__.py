@@ -1,1 +1,1 @@
-"""Results held against the truth."""
+"""Results compared with the truth."""

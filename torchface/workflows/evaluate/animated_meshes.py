@@ -1,4 +1,4 @@
-"""Meshes over time from whatever file they lie in: weights with their rig, an animated rig, a mesh sequence, meshes."""
+"""Meshes over time from any of their files: weights with their rig, an animated rig, a mesh sequence, meshes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class AnimatedMesh:
         neutral: its topology and annotations; at rest where it came with a rig, else as in its first frame.
         count: of frames.
         read: vertices (t,V,3) of the frames from one number up to another, without it; NaN where a frame has none.
-        fps: frames a second, where that is told.
-        weights: what moves it, where that is told.
+        fps: frames a second, where that is known.
+        weights: what moves it, where that is known.
         rig: of its topology, where one came with it.
     """
 

@@ -17,7 +17,7 @@ _RATE = 30.0
 
 
 def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) -> Path:
-    """Writes the report's page and pictures into a folder.
+    """Writes the report's page and figures into a folder.
 
     Args:
         evaluation: what came of it.
@@ -38,16 +38,16 @@ def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) 
     sections.append(Section("Heat maps", _scale_text(evaluation), pictures=_heat_maps(evaluation, height)))
     if len(evaluation.frames) > 1:
         curve = error_curve(evaluation.frame_mean, evaluation.fps or _RATE, "mean error (mm)")
-        text = "" if evaluation.fps else f"No frame rate is told; {_RATE:g} a second are assumed."
+        text = "" if evaluation.fps else f"No frame rate is known; {_RATE:g} a second are assumed."
         sections.append(Section("Error over time", text, pictures=[("frames.png", curve)]))
-    if evaluation.aligned and evaluation.turned is not None and evaluation.moved is not None:
-        turned, moved = evaluation.turned, evaluation.moved
+    if evaluation.aligned and evaluation.rotation is not None and evaluation.translation is not None:
+        rotation, translation = evaluation.rotation, evaluation.translation
         sections.append(
             Section(
                 "Alignment",
-                f"Each frame was laid rigidly on the truth: turned by {float(turned.nanmedian()):.2f} degrees and "
-                f"moved by {float(moved.nanmedian()):.2f} mm in the median, by at most "
-                f"{float(turned.nan_to_num().max()):.2f} degrees and {float(moved.nan_to_num().max()):.2f} mm.",
+                f"Each frame was laid rigidly on the truth: rotated by {float(rotation.nanmedian()):.2f} degrees and "
+                f"moved by {float(translation.nanmedian()):.2f} mm in the median, by at most "
+                f"{float(rotation.nan_to_num().max()):.2f} degrees and {float(translation.nan_to_num().max()):.2f} mm.",
             )
         )
     sections.extend(_shapes(evaluation))
@@ -76,7 +76,7 @@ def _heat_maps(evaluation: Evaluation, height: int) -> list[tuple[str, Tensor]]:
 def _one_frame(evaluation: Evaluation, shown: Compared, height: int) -> Tensor:
     mean = float(shown.errors.nanmean())
     known = torch.isfinite(shown.true).all(1, keepdim=True) & torch.isfinite(shown.found).all(1, keepdim=True)
-    # Where the truth has no vertex the result's stands in, so that the picture has a whole face; it is grey below.
+    # Where the truth has no vertex the result's stands in, so that the figure has a whole face; it is grey below.
     found = torch.where(torch.isfinite(shown.found), shown.found, evaluation.mesh.vertices)
     true = torch.where(known, shown.true, found)
     title = f"frame {shown.frame}: mean {mean:.2f} mm, total {float(shown.errors.nansum()):.4e} mm"

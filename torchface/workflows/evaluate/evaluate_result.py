@@ -28,7 +28,7 @@ from torchface.workflows.evaluate.evaluation_result import ALL, Compared, Evalua
 from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
 
 _CHUNK = 32
-_MOST_DISTANCES = 2**29
+_MAX_DISTANCES = 2**29
 _SAME_RATE = 0.002
 
 
@@ -119,19 +119,19 @@ def compare(
     notes = [] if scans is None else list(scans.notes)
     if found.fps is not None and true.fps is not None and abs(found.fps / true.fps - 1) > _SAME_RATE:
         notes.append(f"found {found.fps:g} and {true.fps:g} frames a second; frames were compared by their number")
-    if len(frames) * len(found.neutral.vertices) > _MOST_DISTANCES:
+    if len(frames) * len(found.neutral.vertices) > _MAX_DISTANCES:
         raise ValueRangeError(
             f"{found.path}: found {len(frames)} frames of {len(found.neutral.vertices)} vertices, more than "
-            f"{_MOST_DISTANCES} distances; expected fewer (--part face, or --frames)"
+            f"{_MAX_DISTANCES} distances; expected fewer (--part face, or --frames)"
         )
-    errors, turned, moved, surface = [], [], [], []
+    errors, rotation, translation, surface = [], [], [], []
     for begin in range(0, len(frames), _CHUNK):  # some frames at a time: all of a take's vertices fill the memory
         rows = frames[begin : begin + _CHUNK]
         a, b, motion = _pair(found, true, rows, begin, aligned)
         errors.append(vertex_errors(a, b))
         if motion is not None:
-            turned.append(motion[0])
-            moved.append(motion[1])
+            rotation.append(motion[0])
+            translation.append(motion[1])
         if scans is not None:
             surface.append(scans.surface_errors(begin, scans.settled(begin, a) if aligned else a))
     distances = torch.cat(errors)
@@ -156,8 +156,8 @@ def compare(
         figures,
         _shapes(found, true, frames),
         aligned,
-        torch.cat(turned) if turned else None,
-        torch.cat(moved) if moved else None,
+        torch.cat(rotation) if rotation else None,
+        torch.cat(translation) if translation else None,
         tuple(_shown(found, true, frames, distances, aligned)),
         round_maximum(figures[ALL].percentile_95) if maximum is None else maximum,
         tuple(notes),
@@ -185,7 +185,7 @@ def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | N
 def _pair(
     found: AnimatedMesh, true: AnimatedMesh, rows: Tensor, begin: int, aligned: bool
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
-    """Vertices (t,V,3) of the result's frames and of the truth's, and by how much the former were turned and moved."""
+    """Vertices (t,V,3) of the result's frames and of the truth's, and the rotation and translation of the former."""
     first, last = int(rows.min()), int(rows.max()) + 1
     together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
     a = found.read(first, last) if together else torch.cat([found.read(r, r + 1) for r in rows.tolist()])
@@ -193,13 +193,13 @@ def _pair(
     if not aligned:
         return a, b, None
     usable = (torch.isfinite(a) & torch.isfinite(b)).all(2).sum(1) >= 3
-    laid, turned, moved = a.clone(), torch.full((len(a),), torch.nan), torch.full((len(a),), torch.nan)
+    moved, rotation, translation = a.clone(), torch.full((len(a),), torch.nan), torch.full((len(a),), torch.nan)
     if usable.any():
         motion = rigidly_aligned(a[usable], b[usable])
-        laid[usable], turned[usable] = motion.vertices, motion.degrees.to(turned)
-        moved[usable] = (motion.vertices - a[usable]).nanmean(1).norm(dim=-1).to(moved)
-    laid[~usable] = torch.nan
-    return laid, b, (turned, moved)
+        moved[usable], rotation[usable] = motion.vertices, motion.degrees.to(rotation)
+        translation[usable] = (motion.vertices - a[usable]).nanmean(1).norm(dim=-1).to(translation)
+    moved[~usable] = torch.nan
+    return moved, b, (rotation, translation)
 
 
 def _shown(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, errors: Tensor, aligned: bool) -> list[Compared]:

@@ -27,7 +27,7 @@ def write_tables(evaluation: Evaluation, out: Path) -> None:
     values[empty] = 0.0  # so that no quantile is asked of nothing; these rows are written empty
     high, largest = np.nanquantile(values, 0.95, axis=1), np.nanmax(values, axis=1)
     means, totals = np.nanmean(values, axis=1), np.nansum(values, axis=1)
-    moved = (evaluation.turned, evaluation.moved)
+    moved = (evaluation.rotation, evaluation.translation)
     rows = [
         [
             str(frame),
@@ -44,7 +44,7 @@ def write_tables(evaluation: Evaluation, out: Path) -> None:
         rows = [[name, *(_number(float(x)) for x in numbers)] for name, *numbers in columns_of]
         write_table(out / "shapes.csv", ["shape", "mean", "largest", "correlation"], rows)
     else:
-        (out / "shapes.csv").unlink(missing_ok=True)  # one of an earlier run would tell of other files
+        (out / "shapes.csv").unlink(missing_ok=True)  # one of an earlier run would be of other files
     write_file(out / "summary.json", json.dumps(summary(evaluation), indent=1).encode())
 
 

@@ -1,4 +1,4 @@
-"""How far a result is from the truth, as figures, frames for pictures and lines to read."""
+"""How far a result is from the truth, as figures, frames for figures and lines to read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ALL = "all vertices"
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One frame as it was compared, for pictures.
+    """One frame as it was compared, for figures.
 
     Args:
         frame: of the result.
@@ -37,16 +37,16 @@ class Evaluation:
         result, truth: names of the files.
         mesh: topology and annotations, in the pose that errors are painted on.
         frames: which of the result were compared, (T,) int64.
-        fps: frames a second, where that is told.
+        fps: frames a second, where that is known.
         errors: (T,V), millimetres; NaN was not compared.
         regions: figures by region, all vertices first.
         shapes: by shape, where both have weights.
         aligned: whether each frame was laid rigidly on the truth.
-        turned, moved: by how many degrees and millimetres that was, (T,); none without.
-        shown: frames for pictures: the one of median error and the worst.
+        rotation, translation: degrees and millimetres of that, (T,); none without.
+        shown: frames for figures: the one of median error and the worst.
         maximum: of the heat maps' scale, millimetres.
         notes: what was found and done, for people to read.
-        surface: where the truth was scans, how far the result is from their surface, laid on it anew where it was
+        surface: where the truth was scans, how far the result is from their surface, aligned with it again where it was
             aligned.
     """
 
@@ -59,8 +59,8 @@ class Evaluation:
     regions: dict[str, ErrorFigures]
     shapes: ShapeErrors | None
     aligned: bool
-    turned: Tensor | None
-    moved: Tensor | None
+    rotation: Tensor | None
+    translation: Tensor | None
     shown: tuple[Compared, ...]
     maximum: float
     notes: tuple[str, ...]
@@ -70,11 +70,6 @@ class Evaluation:
     def frame_mean(self) -> Tensor:
         """Mean error of each frame, (T,); NaN where nothing was compared."""
         return self.errors.nanmean(1)
-
-    @property
-    def frame_total(self) -> Tensor:
-        """The sum of errors over the vertices of each frame, (T,)."""
-        return self.errors.nansum(1)
 
     @property
     def vertex_mean(self) -> Tensor:

@@ -13,14 +13,13 @@ from torchface.errors import AlignmentError, TopologyError
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
-from torchface.mesh import Mesh
 from torchface.progress import Progress
 from torchface.registration import register_corpus
 from torchface.workflows.evaluate.animated_meshes import AnimatedMesh
 
 NEAR = 2.0
 """Millimetres; a vertex that came to lie further from the scan, or on its border, only followed its neighbours."""
-_FEWEST, _ROUNDS = 12, 20
+_MIN_VERTICES, _MAX_ITERATIONS = 12, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +50,12 @@ class ScanTruth:
         """Vertices (t,V,3) of the frames from ``begin`` on, moved rigidly to where they lie best on the scans'
         surfaces, by iterated closest points from where they are.
 
-        A registered mesh tells where a vertex is along the surface only as well as registration does; this asks
+        A registered mesh places a vertex along the surface only as exactly as registration does; this asks
         nothing of it.
         """
         moved = vertices.clone()
         for row, (usable, surface) in enumerate(self._surfaces(begin, vertices)):
-            if int(usable.sum()) >= _FEWEST:
+            if int(usable.sum()) >= _MIN_VERTICES:
                 moved[row] = settled_on(surface, vertices[row], usable)
         return moved
 
@@ -72,30 +71,25 @@ def settled_on(surface: SurfaceIndex, vertices: Tensor, usable: Tensor) -> Tenso
 
     .. math:: \min_{R,t} \sum_i \left( n_i \cdot (R x_i + t - y_i) \right)^2
 
-    over the nearest points :math:`y_i` and their normals :math:`n_i`, found anew in each round.
+    over the nearest points :math:`y_i` and their normals :math:`n_i`, found again in each iteration.
 
     Source: Chen and Medioni 1992.
     """
     moved = vertices.double()
-    for _ in range(_ROUNDS):  # each round looks for other nearest points
+    for _ in range(_MAX_ITERATIONS):  # each iteration looks for other nearest points
         points = moved[usable]
         nearest = surface.nearest(points)
         normals = surface.normals_at(nearest)
         centre = points.mean(0)
-        # Small turns about the points' centre: n · (r × x) = r · (x × n).
+        # Small rotations about the points' centre: n · (r × x) = r · (x × n).
         system = torch.cat([torch.linalg.cross(points - centre, normals), normals], dim=1)
         wanted = ((nearest.points - points) * normals).sum(1)
-        # Where the surface leaves a motion open (a sphere may turn), none is made.
+        # A motion that the surface does not determine (the rotation of a sphere) stays zero.
         step = torch.linalg.lstsq(system, wanted, driver="gelsd", rcond=1e-6).solution
         moved = (moved - centre) @ rotation_matrix(step[:3]).T + centre + step[3:]
         if float(step[:3].norm()) < 1e-6 and float(step[3:].norm()) < 1e-4:
             break
     return moved.to(vertices)
-
-
-def surface_distances(points: Tensor, surface: Mesh) -> Tensor:
-    """How far points (Q,3) are from a mesh's surface, (Q,), float64, millimetres."""
-    return SurfaceIndex(surface.vertices, surface.faces).nearest(points).distance
 
 
 def scan_truth(

@@ -1,4 +1,4 @@
-"""What a head camera saw between the markers, as curves beside a marker take."""
+"""A head camera's predictions as weight curves for a marker take."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from torchface.progress import Progress
 from torchface.take import Take, Track
 
 _SAME_RATE = 1e-3
-_FADE, _SHORTEST_FADE = 15 / 60, 5  # seconds, as 15 frames at 60 a second are; frames at least
+_BLEND_SECONDS, _MIN_BLEND_FRAMES = 15 / 60, 5
 
 
 @dataclass(frozen=True)
 class HeadCamera:
-    """A video of the face with painted patterns, and what reads it.
+    """A video of the face with painted patterns, and its classifier.
 
     Args:
         video: the file.
         classifier: a trained ``ActionUnitClassifier``, by name or folder.
         labels: where helmet, markers and regions are in the video; the video's name with ``.toml`` if absent.
-        table: what action units mean in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two knows
+        table: action units in the rig's shapes: ``arkit``, ``ict`` or a file; whichever of the two has
             the rig's names if absent.
     """
 
@@ -44,8 +44,8 @@ class Predicted:
     """Curves for the hybrid solve, frame by frame of a take.
 
     Args:
-        weights: what the classifier says, (T,K,1).
-        gamma: how much that counts, (T,K,1), mm² over all markers.
+        weights: the classifier's predictions, (T,K,1).
+        gamma: their weights, (T,K,1), mm² over all markers.
         notes: what had to be assumed, for people to read.
     """
 
@@ -61,9 +61,9 @@ class Predicted:
 def predicted_curves(
     camera: HeadCamera, take: Take, names: tuple[str, ...], progress: Progress | None = None
 ) -> Predicted:
-    """Classifies the video and brings what it says to the take's frames.
+    """Classifies the video and resamples its predictions to the take's frames.
 
-    Video and take begin together; a video of another rate is brought to the take's, and where it ends before the
+    Video and take begin together; a video of another rate is resampled to the take's, and where it ends before the
     take the markers are left alone.
 
     Args:
@@ -83,10 +83,10 @@ def predicted_curves(
         )
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
-    return laid_beside(action_unit_curves(classifier, camera.video, labels, table, names, progress=progress), take)
+    return resampled_curves(action_unit_curves(classifier, camera.video, labels, table, names, progress=progress), take)
 
 
-def laid_beside(curves: ActionUnitCurves, take: Take) -> Predicted:
+def resampled_curves(curves: ActionUnitCurves, take: Take) -> Predicted:
     """Curves of a video, frame by frame of a take that began when it did; shapes it never moves are left out."""
     moved = curves.active.any(0)
     names = tuple(name for name, moves in zip(curves.names, moved.tolist(), strict=True) if moves)
@@ -97,17 +97,17 @@ def laid_beside(curves: ActionUnitCurves, take: Take) -> Predicted:
     at = torch.arange(len(take), dtype=torch.float64) * (curves.fps / take.fps)
     before = at.floor().long().clamp(max=len(weights) - 1)
     after = (before + 1).clamp(max=len(weights) - 1)
-    share = (at - before).clamp(0, 1).to(weights)[:, None]
-    there = torch.lerp(weights[before], weights[after], share)
+    fraction = (at - before).clamp(0, 1).to(weights)[:, None]
+    there = torch.lerp(weights[before], weights[after], fraction)
     within = (at <= len(weights) - 1 + 1e-6)[:, None]
-    led = (active[before] | active[after]) & within
+    active_frames = (active[before] | active[after]) & within
     if not bool(within.all()):
         missing = int((~within).sum())
         notes.append(f"the video ends {missing} frames before the take; there the markers are alone")
     elif len(weights) - 1 - float(at[-1]) > 1.5:
         notes.append(f"the video goes on for {len(weights) - 1 - float(at[-1]):.0f} frames after the take; left out")
     notes.append("take and video are taken to begin together")
-    gamma = gamma_curves(led, window=max(round(_FADE * take.fps), _SHORTEST_FADE))
+    gamma = gamma_curves(active_frames, window=max(round(_BLEND_SECONDS * take.fps), _MIN_BLEND_FRAMES))
     return Predicted(Track(names, there[..., None]), Track(names, gamma[..., None]), tuple(notes))
 
 

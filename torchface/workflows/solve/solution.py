@@ -1,4 +1,4 @@
-"""What a solve gave: weights, the markers as it used them, and what there is to say of it."""
+"""The result of a solve: weights, the markers as it used them, and its report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SHOWN_DEFECTS = 12
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What came of a take's markers.
+    """The solution of a take's markers.
 
     Args:
         take: with the solved weights.
@@ -41,12 +41,12 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class SolveReport:
-    """What a solve did.
+    """The report of a solve.
 
     Args:
         take: the solved weights.
         rmse: marker RMSE a frame, (T,), millimetres.
-        seen: share of the samples of the attachment's markers that were seen.
+        seen: fraction of the samples of the attachment's markers that were seen.
         alignment: the similarity from marker space to rig space, where one was estimated.
         seconds: what the solve itself took.
         motion: the helmet's, where it was asked for.
@@ -85,9 +85,9 @@ class SolveReport:
                 f"({moved[0]:.1f}, {moved[1]:.1f}, {moved[2]:.1f}) mm",
             )
         if self.motion is not None:
-            slid = float(self.motion.translation.norm(dim=1).max())
-            turned = float(self.motion.degrees().norm(dim=1).max())
-            lines.append(f"helmet: moved by up to {slid:.1f} mm and {turned:.1f} degrees; not in the weights")
+            translation = float(self.motion.translation.norm(dim=1).max())
+            rotation = float(self.motion.degrees().norm(dim=1).max())
+            lines.append(f"helmet: moved by up to {translation:.1f} mm and {rotation:.1f} degrees; not in the weights")
         if self.cleanup is not None:
             lines.append(f"cleanup: {self.cleanup.summary()}")
             rows = self.cleanup.table(gaps=False)
@@ -95,9 +95,9 @@ class SolveReport:
             if len(rows) > _SHOWN_DEFECTS:
                 lines.append(f"  and {len(rows) - _SHOWN_DEFECTS} more; the report (--report DIR) lists all")
         if self.predicted is not None:
-            led = (self.predicted.gamma.values > 0).any(2)
+            active = (self.predicted.gamma.values > 0).any(2)
             shapes = ", ".join(self.predicted.gamma.names) or "no shape"
-            lines.append(f"video: leads {shapes} in {100 * float(led.any(1).float().mean()):.0f} % of the frames")
+            lines.append(f"video: predicts {shapes} in {100 * float(active.any(1).float().mean()):.0f} % of the frames")
             lines.extend(f"  {note}" for note in self.predicted.notes)
         if self.sent is not None:
             lines.extend(self.sent.lines())

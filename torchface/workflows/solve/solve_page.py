@@ -23,7 +23,7 @@ from torchface.viz.reports.player import Markers, Panel, Played, Player, write_p
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.solve.solution import Solution, SolveReport
 
-_CURVES_A_PICTURE = 13
+_CURVES_A_FIGURE = 13
 _ACTIVE, _SHOWN_FRAMES, _SIDE = 8, 8, 55.0
 _WORST_MARKERS = 12
 _KINDS = {
@@ -31,12 +31,12 @@ _KINDS = {
     "displaced": "Markers that drift, fell off or carry another's label",
     "spike": "Spikes",
 }
-_HEADING = ("markers", "frames", "seconds", "off by", "done")
-_MOST_ROWS = 60
+_HEADING = ("markers", "frames", "seconds", "distance", "done")
+_MAX_ROWS = 60
 
 
 def write_solve_page(folder: Path, title: str, report: SolveReport, rig: BlendshapeRig, solution: Solution) -> Path:
-    """Writes the report's page and pictures into a folder.
+    """Writes the report's page and figures into a folder.
 
     Args:
         folder: where to; made if absent.
@@ -75,8 +75,8 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
         sections.append(Section("Helmet", text, pictures=[("helmet.png", curves)]))
     order = weights.amax(0).argsort(descending=True).tolist()
     pictures = []
-    for number, first in enumerate(range(0, len(order), _CURVES_A_PICTURE)):
-        rows_of_page = order[first : first + _CURVES_A_PICTURE]
+    for number, first in enumerate(range(0, len(order), _CURVES_A_FIGURE)):
+        rows_of_page = order[first : first + _CURVES_A_FIGURE]
         part = weights[:, rows_of_page]
         label = [names[i] for i in rows_of_page]
         pictures.append((f"weights{number + 1}.png", weight_curves(part, None, label, take.fps, len(label))))
@@ -117,11 +117,11 @@ def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
     camera = frame_face(rig.neutral, width=150, height=188)
     lighting, seen = replace(DEFAULT_LIGHTING, occlusion_rays=4), as_seen(rig.neutral)
 
-    def picture(frame: int) -> Tensor:
+    def image(frame: int) -> Tensor:
         moved = rig(weights[frame : frame + 1].to(rig.deltas))[0]
         return caption(render(seen.with_vertices(moved), camera, lighting=lighting), f"frame {frame}", 12)
 
-    return sheet([picture(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
+    return sheet([image(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
 
 
 def _marker_sections(
@@ -165,9 +165,9 @@ def _defects(cleanup: Cleanup, fps: float) -> Section:
         found = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
         rows = [_row(defect, fps) for defect in found]
         if rows:
-            tables.append(Table((title, *_HEADING[1:]), rows[:_MOST_ROWS]))
-        if len(rows) > _MOST_ROWS:
-            tables.append(Table(_HEADING, rows[_MOST_ROWS:], f"{len(rows) - _MOST_ROWS} more of them"))
+            tables.append(Table((title, *_HEADING[1:]), rows[:_MAX_ROWS]))
+        if len(rows) > _MAX_ROWS:
+            tables.append(Table(_HEADING, rows[_MAX_ROWS:], f"{len(rows) - _MAX_ROWS} more of them"))
     gaps = [defect for defect in cleanup.defects if defect.kind == "gap"]
     if gaps:
         filled = sum(defect.action == "filled" for defect in gaps)

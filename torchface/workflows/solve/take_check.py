@@ -1,4 +1,4 @@
-"""Whether a marker take can be solved with a rig and an attachment at all: what is refused, what only doubted."""
+"""Checks of a marker take against a rig and an attachment: what is refused, and what only warned of."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
 from torchface.errors import AlignmentError, NameMismatchError
 from torchface.take import Take
 
-_MOST_SHAPES_A_MARKER = 3  # a marker has three coordinates
-_FEW, _MOST_OF_THEM = 0.5, 0.9
+_COORDINATES = 3  # of a marker
+_MIN_PRESENT, _USUAL_PRESENT = 0.5, 0.9
 _INSIST = "--insist writes the weights all the same"
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of an attachment a take shows.
+    """The markers of an attachment that a take shows.
 
     Args:
         markers: of the attachment.
@@ -36,24 +36,24 @@ class Coverage:
     @property
     def refused(self) -> bool:
         """Most of the markers are not there, and the rest have fewer coordinates than the rig has shapes."""
-        return self._too_few and self.present < _FEW * self.markers
+        return self._too_few and self.present < _MIN_PRESENT * self.markers
 
     @property
     def _too_few(self) -> bool:
-        return _MOST_SHAPES_A_MARKER * self.present < self.shapes
+        return _COORDINATES * self.present < self.shapes
 
     def warnings(self) -> list[str]:
         """For people to read."""
-        said = []
-        if self._too_few or self.present < _MOST_OF_THEM * self.markers:
+        lines = []
+        if self._too_few or self.present < _USUAL_PRESENT * self.markers:
             blind = f"; too few for {self.shapes} shapes, many of which are guessed" if self._too_few else ""
-            said.append(f"the take shows {self.present} of the attachment's {self.markers} markers{blind}")
+            lines.append(f"the take shows {self.present} of the attachment's {self.markers} markers{blind}")
         if self.poor:
-            said.append(
-                f"{self.poor} frames show fewer than {math.ceil(self.shapes / _MOST_SHAPES_A_MARKER)} markers: too few "
+            lines.append(
+                f"{self.poor} frames show fewer than {math.ceil(self.shapes / _COORDINATES)} markers: too few "
                 f"for {self.shapes} shapes"
             )
-        return said
+        return lines
 
 
 def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool = False) -> Coverage:
@@ -67,9 +67,9 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
     known = take.markers.select([name for name in take.markers.names if name in labels])
     seen = ~torch.isnan(known.values).any(-1)
     count = seen.sum(1)
-    enough = math.ceil(shapes / _MOST_SHAPES_A_MARKER)
-    usual = float(count.double().median()) if len(count) else 0.0
-    poor = int(((count > 0) & (count < enough)).sum()) if usual >= enough else 0
+    enough = math.ceil(shapes / _COORDINATES)
+    typical = float(count.double().median()) if len(count) else 0.0
+    poor = int(((count > 0) & (count < enough)).sum()) if typical >= enough else 0
     found = Coverage(len(labels), int(seen.any(0).sum()), shapes, poor)
     if found.refused and not insist:
         missing = [label for label in labels if label not in known.names]
@@ -108,7 +108,7 @@ def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool =
 
 
 def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
-    """What to say of a take that the rig explains badly; nothing of one that it explains."""
+    """Warnings for a take that the rig explains badly; none for one that it explains."""
     if not fit.cause:
         return []
     return [

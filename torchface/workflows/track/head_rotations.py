@@ -13,7 +13,7 @@ def head_angles(rotation: Tensor) -> Tensor:
 
     .. math:: \mathrm{diag}(1,-1,-1) \, R = R_y(\text{yaw}) \, R_x(\text{pitch}) \, R_z(\text{roll})
 
-    Zero is a face that looks straight into the lens. Positive yaw turns it to the viewer's right, positive pitch
+    Zero is a face that looks straight into the lens. Positive yaw rotates it to the viewer's right, positive pitch
     nods it down, positive roll tilts it counter-clockwise as the viewer sees it.
     """
     upright = rotation * rotation.new_tensor([1.0, -1.0, -1.0])[:, None]

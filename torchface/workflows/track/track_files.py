@@ -26,7 +26,7 @@ SOLUTION, LIGHT, WEIGHTS, LIVE_LINK = "solution.safetensors", "light.safetensors
 LANDMARKS, ANIMATION, OVERLAY, SUMMARY = "landmarks.csv", "animation.glb", "overlay.mp4", "summary.json"
 
 _FORMAT = "torchface.track-summary/1"
-_LARGEST_SOLUTION = 2**31
+_MAX_SOLUTION = 2**31
 
 
 def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
@@ -46,7 +46,7 @@ def kept_solution(state: TrackState, key: str, frames: int, shapes: int) -> Vide
     if not state.is_current(path, key):
         return None
     try:
-        found = load(read_file(path, _LARGEST_SOLUTION))
+        found = load(read_file(path, _MAX_SOLUTION))
         if found["weights"].shape != (frames, shapes) or found["rotation"].shape != (frames, 3, 3):
             return None
         return VideoSolution(**found)
@@ -70,7 +70,7 @@ def kept_light(state: TrackState, key: str) -> PointLight | None:
     if not state.is_current(path, key):
         return None
     try:
-        return PointLight(**load(read_file(path, _LARGEST_SOLUTION)))
+        return PointLight(**load(read_file(path, _MAX_SOLUTION)))
     except (SafetensorError, TorchfaceError, KeyError, TypeError, ValueError):
         return None  # found anew
 

@@ -30,7 +30,7 @@ _LIGHT_FRAMES = 2
 _EVEN_SKIN = (0.80, 0.62, 0.53)
 _SKIN = (0.62, 0.74, 0.90)
 _FOUND, _SOLVED = (60, 230, 60), (250, 70, 60)
-_LARGEST_SIDE = 480
+_MAX_SIDE = 480
 _SUBPIXEL = 4  # binary digits of OpenCV's drawing coordinates
 
 
@@ -163,7 +163,7 @@ def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -
     if x1 - x0 < 2 or y1 - y0 < 2:
         return frame
     # Large pictures are drawn at a part of their resolution: rays cost, and the mesh is shown half through anyway.
-    step = max(1, -(-max(x1 - x0, y1 - y0) // _LARGEST_SIDE))
+    step = max(1, -(-max(x1 - x0, y1 - y0) // _MAX_SIDE))
     part = _part_of(camera, x0, y0, x1, y1, step)
     origins, ways = part.rays()
     origins, ways = origins.reshape(-1, 3), ways.reshape(-1, 3)

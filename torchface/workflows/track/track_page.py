@@ -24,7 +24,7 @@ _MARGIN = 0.6
 
 
 def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -> Path:
-    """Writes the report's page and pictures into a folder.
+    """Writes the report's page and figures into a folder.
 
     Args:
         tracked: what came of the video.
@@ -62,7 +62,7 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
     head = motion_curves(still.float(), angles[:, [1, 0, 2]].float(), fps)
     text = (
         "Where the head is before the camera, about its mean place (x right, y down, z away from the camera), and how "
-        "it is turned: pitch about x, yaw about y, roll about z."
+        "it is rotated: pitch about x, yaw about y, roll about z."
     )
     sections.append(Section("Head", text, pictures=[("head.png", head)]))
     weights, names = solution.weights.detach(), tracked.rig.names
@@ -114,22 +114,22 @@ def frames_sheet(tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: 
 
 
 def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
-    """A part of the picture, x0, y0, x1, y1, that holds the head in these frames."""
+    """A part of the image, x0, y0, x1, y1, that holds the head in these frames."""
     marks = tracked.rig.neutral.landmarks
     weights = tracked.solution.weights.detach().to(tracked.rig.deltas)
     pixels = torch.cat([camera_at(tracked, t).project(tracked.rig(weights[t : t + 1])[0, marks].double())
                         for t in frames])  # fmt: skip
     low, high = pixels.amin(0), pixels.amax(0)
     room = _MARGIN * float((high - low).max())
-    film = tracked.video
+    video = tracked.video
     x0, y0 = max(0, int(low[0] - room)), max(0, int(low[1] - room))
-    x1, y1 = min(film.width, int(high[0] + room) + 1), min(film.height, int(high[1] + room) + 1)
-    return (x0, y0, x1, y1) if x1 - x0 > 8 and y1 - y0 > 8 else (0, 0, film.width, film.height)
+    x1, y1 = min(video.width, int(high[0] + room) + 1), min(video.height, int(high[1] + room) + 1)
+    return (x0, y0, x1, y1) if x1 - x0 > 8 and y1 - y0 > 8 else (0, 0, video.width, video.height)
 
 
-def _cut(picture: Tensor, box: tuple[int, int, int, int]) -> Tensor:
+def _cut(image: Tensor, box: tuple[int, int, int, int]) -> Tensor:
     x0, y0, x1, y1 = box
-    part = picture[:, y0:y1, x0:x1]
+    part = image[:, y0:y1, x0:x1]
     scale = _WIDTH / part.shape[2]
     size = (max(1, round(part.shape[1] * scale)), _WIDTH)
     return torch.nn.functional.interpolate(part[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)

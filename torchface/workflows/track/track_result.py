@@ -20,7 +20,7 @@ from torchface.workflows.track.track_state import TrackedFrames
 FEWEST_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
-_AT_BOUND, _OFTEN, _MOST_NAMED = 1e-3, 0.2, 5
+_AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Tracked:
         bounds = self.bounds()
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
-            named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MOST_NAMED])
+            named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
             lines.append(f"often at their bound of 1: {named}")
         span = (self.pinhole[:, 36] - self.pinhole[:, 45]).norm(dim=1).nanmedian()
         if float(errors.nanmedian()) > _POOR * float(span):

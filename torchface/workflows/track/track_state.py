@@ -23,8 +23,8 @@ _RECORD = "track.json"
 _FORMAT = "torchface.track/1"
 _LANDMARKS = 68
 _BLOCK = 2**22
-_LARGEST_RECORD = 2**16
-_LARGEST_PIECE = 2**28
+_MAX_RECORD = 2**16
+_MAX_PIECE = 2**28
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class TrackState:
     """The state of one run in its folder; a run killed at any moment finds what it had finished.
 
     Landmarks are kept in pieces, each a complete file; pieces of other videos, models or settings, damaged ones and
-    those behind them are thrown away.
+    those behind them are deleted.
 
     Args:
         out: the folder of results; it is made with the first piece.
@@ -117,7 +117,7 @@ class TrackState:
         write_file(self.folder / _RECORD, json.dumps({**self._record(), product.name: key}, indent=1).encode())
 
     def clear(self) -> None:
-        """Throws everything away; folders that are empty then go too."""
+        """Deletes everything; folders that are empty then go too."""
         for path in [*self._files(), self.folder / _RECORD]:
             path.unlink(missing_ok=True)
         for folder in (self.folder, self.folder.parent):
@@ -136,7 +136,7 @@ class TrackState:
 
     def _read(self, path: Path) -> TrackedFrames | None:
         """A piece, if it is one of this run and whole."""
-        data = read_file(path, _LARGEST_PIECE)
+        data = read_file(path, _MAX_PIECE)
         try:
             length = int.from_bytes(data[:8], "little")
             header = json.loads(data[8 : 8 + length])["__metadata__"]
@@ -155,7 +155,7 @@ class TrackState:
 
     def _record(self) -> dict[str, str]:
         try:
-            found = json.loads(read_file(self.folder / _RECORD, _LARGEST_RECORD))
+            found = json.loads(read_file(self.folder / _RECORD, _MAX_RECORD))
         except (FileFormatError, ValueError, RecursionError):
             return {}  # what is not known is made anew
         return found if isinstance(found, dict) else {}

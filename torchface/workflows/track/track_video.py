@@ -60,7 +60,7 @@ class TrackSettings:
         face: which of several, from 0, the largest first.
         whole_take: poses from all frames, those after each too; weights as well where there is a dynamics prior.
         part: keep this region of the rig only.
-        texture: a picture to put on the face in the overlay, in the rig's texture coordinates.
+        texture: an image to put on the face in the overlay, in the rig's texture coordinates.
         overlay: draw the overlay video.
     """
 
@@ -92,33 +92,33 @@ def track_video(
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
     progress = progress or silent
-    film = open_video(video)
-    film.check()
+    clip = open_video(video)
+    clip.check()
     actor = load_actor(rig, settings.part)
-    calibration = camera_of(film, settings.camera)
+    calibration = camera_of(clip, settings.camera)
     models = load_track_models(
-        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, film.fps
+        actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, clip.fps
     )
-    check_length(film.count, models, film.path)
+    check_length(clip.count, models, clip.path)
     if settings.texture is not None:
         check_texture(actor, settings.texture)
-    see_key = digest(_VERSION, file_digest(film.path), models.seeing, str(settings.face))
+    see_key = digest(_VERSION, file_digest(clip.path), models.seeing, str(settings.face))
     state = TrackState(out, see_key)
     reused = state.done
     seconds: dict[str, float] = {}
     begin = time.perf_counter()
-    faces = _track(film, models, settings.face, state, progress)
+    faces = _track(clip, models, settings.face, state, progress)
     if state.done > reused:
         seconds["landmarks"] = time.perf_counter() - begin
     frames = state.frames()
-    check_length(len(frames), models, film.path)
+    check_length(len(frames), models, clip.path)
     if not torch.isfinite(frames.landmarks).any():
         state.clear()
-        raise ValueRangeError(f"{film.path}: found no face in any of its {len(frames)} frames, expected one")
+        raise ValueRangeError(f"{clip.path}: found no face in any of its {len(frames)} frames, expected one")
     begin = time.perf_counter()
     steadied = smooth_landmarks if settings.whole_take else filter_landmarks
     pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
-    poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, film.path)
+    poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, clip.path)
     seconds["pose"] = time.perf_counter() - begin
     solver = solver_for(actor, models, calibration)
     solve_key = digest(
@@ -138,7 +138,7 @@ def track_video(
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
     tracked = Tracked(
-        film, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
+        clip, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
     )
     products |= write_curves(tracked, out)
     if settings.overlay:
@@ -174,7 +174,7 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     return actor
 
 
-def camera_of(film: VideoFile, camera: Path | None) -> CameraCalibration:
+def camera_of(clip: VideoFile, camera: Path | None) -> CameraCalibration:
     """The video's camera: as calibrated, brought to its resolution, or assumed.
 
     Raises:
@@ -182,9 +182,9 @@ def camera_of(film: VideoFile, camera: Path | None) -> CameraCalibration:
         ValueRangeError: it was made for another aspect.
     """
     if camera is None:
-        return assumed_calibration(film.width, film.height)
+        return assumed_calibration(clip.width, clip.height)
     try:
-        return load_calibration(camera).resized(film.width, film.height)
+        return load_calibration(camera).resized(clip.width, clip.height)
     except ValueRangeError as error:
         raise ValueRangeError(f"{camera}: {error}") from error
 
@@ -199,7 +199,7 @@ def check_length(frames: int, models: TrackModels, path: Path) -> None:
 
 
 def check_texture(rig: BlendshapeRig, texture: Path) -> None:
-    """Raises where the rig cannot wear a texture, or the picture cannot be read."""
+    """Raises where the rig cannot wear a texture, or the image cannot be read."""
     load_paint(texture)
     if rig.neutral.uvs is None:
         raise ValueRangeError(f"{texture}: found a rig without texture coordinates, expected some to put it on")
@@ -218,12 +218,12 @@ def actor_digest(rig: BlendshapeRig) -> str:
     return digest(*(digest(data.hex()) for data in numbers), *rig.names)
 
 
-def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:
+def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:
     """Landmarks of all frames into the state; how many faces the first frame shows."""
     tracker = LandmarkTracker(models.trees, models.appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
-    for chunk in film.chunks(PIECE):
+    for chunk in clip.chunks(PIECE):
         if at == 0:
             faces = len(find_faces(chunk[0]))
         if at >= kept:
@@ -233,7 +233,7 @@ def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, p
             found = []
             for number, frame in enumerate(chunk):  # a frame's box is the one before's
                 found.append(tracker.step(frame))
-                progress("tracking landmarks", at + number + 1, max(film.count, at + number + 1))
+                progress("tracking landmarks", at + number + 1, max(clip.count, at + number + 1))
             last = TrackedFrames(
                 torch.stack([one.landmarks for one in found]),
                 torch.stack([one.confidence for one in found]),
@@ -242,7 +242,7 @@ def _track(film: VideoFile, models: TrackModels, face: int, state: TrackState, p
             state.append(last)
         at += len(chunk)
         if at <= kept:
-            progress("tracking landmarks", at, max(film.count, at))
+            progress("tracking landmarks", at, max(clip.count, at))
     return faces
 
 
@@ -295,11 +295,11 @@ def _solve(
         states.append(state)
         progress("solving for weights", t + 1, len(landmarks))
     states = [states[0]] * first + states
-    weights, turned, moved = (
+    weights, rotation, translation = (
         torch.stack([getattr(one, name) for one in states]).detach().to(landmarks)
         for name in ("weights", "rotation", "translation")
     )
     if whole_take:
         weights = interpolated(weights, enough)
-    errors = solver.reprojection_errors(landmarks, weights, turned, moved)
-    return VideoSolution(weights, turned, moved, errors, enough)
+    errors = solver.reprojection_errors(landmarks, weights, rotation, translation)
+    return VideoSolution(weights, rotation, translation, errors, enough)
