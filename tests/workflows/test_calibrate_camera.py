@@ -16,6 +16,7 @@ from torchface.geometry.cameras.distortion import distort, undistort
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_calibration, load_image, save_image
 from torchface.io.video import write_video
+from torchface.progress import silent
 from torchface.workflows.calibrate_camera import Board, View, calibrate, calibrate_views, find_boards, find_corners
 
 BOARD = Board(7, 5, 25.0)
@@ -152,7 +153,7 @@ def test_useless_pictures_are_refused(pictures: list[Tensor]) -> None:
     assert [name for name, _ in report.left_out] == ["bent.png"]
     assert "pixels from where" in report.left_out[0][1]
     with pytest.raises(ShapeError, match="found b with 600 x 480 pixels and a with 640 x 480"):
-        find_boards(iter([("a", pictures[0]), ("b", pictures[1][:, :600])]), BOARD, lambda line: None)
+        find_boards(iter([("a", pictures[0]), ("b", pictures[1][:, :600])]), BOARD, silent)
 
 
 def test_bad_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
-from torchface.io.tables.csv_table import MAX_TABLE_BYTES, number_texts, parse_number, quoted
+from torchface.io.tables.csv_table import MAX_TABLE_BYTES, number_texts, parse_number, parse_numbers, quoted
 from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
 from torchface.take import Take
@@ -67,7 +67,8 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
         raise FileFormatError(
             f"{path}: found {len(body)} rows and NumFrames {fields['NumFrames'][:40]}, expected the same, not 0"
         )
-    table = np.array([_row(cells, 2 + 3 * len(labels), number, path) for number, cells in body])
+    columns = ["Frame#", "Time", *(f"{axis}{i + 1}" for i in range(len(labels)) for axis in "XYZ")]
+    table = np.array([_row(cells, columns, f"{path}: row {number}") for number, cells in body])
     extras = numbering_extras(table[:, 0], first=1, where=str(path))
     return marker_take(path, fps, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
 
@@ -79,18 +80,12 @@ def _field(fields: dict[str, str], name: str, path: Path) -> float:
     return value
 
 
-def _row(cells: list[str], width: int, number: int, path: Path) -> list[float]:
-    while len(cells) > width and not cells[-1].strip():
+def _row(cells: list[str], columns: list[str], where: str) -> list[float]:
+    while len(cells) > len(columns) and not cells[-1].strip():
         cells.pop()
-    if len(cells) != width:
-        raise FileFormatError(f"{path}: row {number}: found {len(cells)} cells, expected {width}")
-    values = [parse_number(cell) for cell in cells]
-    if None in values:
-        column = values.index(None)
-        raise FileFormatError(
-            f"{path}: row {number}, column {column + 1}: found {quoted([cells[column]])}, expected a number"
-        )
-    return values  # type: ignore[return-value]
+    if len(cells) != len(columns):
+        raise FileFormatError(f"{where}: found {len(cells)} cells, expected {len(columns)}")
+    return parse_numbers(cells, columns, where)
 
 
 def _scaled(values: np.ndarray, factor: float) -> np.ndarray:

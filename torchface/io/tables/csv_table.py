@@ -90,6 +90,7 @@ class TableReader:
         kept: dict[str, list[str]] = {name: [] for name in texts}
         text_columns = [i for i, name in enumerate(self.header) if name in kept]
         number_columns = [i for i, name in enumerate(self.header) if name not in kept]
+        names = tuple(self.header[i] for i in number_columns)
         numbers, rows = array("d"), 0
         while (cells := self._next()) is not None:
             if not cells:
@@ -102,36 +103,44 @@ class TableReader:
                 )
             for i in text_columns:
                 kept[self.header[i]].append(cells[i].strip())
-            numbers.extend(self._numbers(cells, number_columns))
+            wanted = [cells[i] for i in number_columns]
+            numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
             rows += 1
         if rows == 0:
             raise FileFormatError(f"{self.path}: found a header and no rows, expected at least one frame")
         return Table(
-            tuple(self.header[i] for i in number_columns),
+            names,
             np.frombuffer(numbers, np.float64).reshape(rows, len(number_columns)),
             {name: tuple(column) for name, column in kept.items()},
         )
 
-    def _numbers(self, cells: list[str], columns: list[int]) -> list[float]:
-        wanted = [cells[i] for i in columns]
-        joined = "".join(wanted)
-        if joined.isascii() and "_" not in joined:  # Python would take 1_000 and other scripts' digits for numbers
-            try:
-                values = list(map(float, wanted))
-                if all(-_MAX_NUMBER <= value <= _MAX_NUMBER or value != value for value in values):
-                    return values
-            except ValueError:
-                pass
-        return [self._number(cells[i], i) for i in columns]
 
-    def _number(self, cell: str, column: int) -> float:
+def parse_numbers(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:
+    """A row's numbers, NaN where a cell is empty.
+
+    Args:
+        cells: one a column.
+        names: of the columns, for messages.
+        where: file and row, which begin a message.
+
+    Raises:
+        FileFormatError: a cell is no number.
+    """
+    joined = "".join(cells)
+    if joined.isascii() and "_" not in joined:  # Python would take 1_000 and other scripts' digits for numbers
+        try:
+            values = list(map(float, cells))
+            if all(-_MAX_NUMBER <= value <= _MAX_NUMBER or value != value for value in values):
+                return values
+        except ValueError:
+            pass
+    numbers = []
+    for name, cell in zip(names, cells, strict=True):
         value = parse_number(cell)
         if value is None:
-            raise FileFormatError(
-                f"{self.path}: row {self._rows.line_num}, column {quoted([self.header[column]])}: "
-                f"found {quoted([cell])}, expected a number"
-            )
-        return value
+            raise FileFormatError(f"{where}, column {quoted([name])}: found {quoted([cell])}, expected a number")
+        numbers.append(value)
+    return numbers
 
 
 def parse_number(cell: str) -> float | None:
