@@ -98,7 +98,7 @@ def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
     settings = TrackSettings(camera=filmed.camera)
 
     def killed(what: str, frames: int, total: int) -> None:
-        if what == "landmarks" and frames == 2 * PIECE + 2:
+        if what == "tracking landmarks" and frames == 2 * PIECE + 2:
             raise KeyboardInterrupt
 
     steps = 0
