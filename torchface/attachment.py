@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.documents import read_json, write_json
 from torchface.mesh import Mesh
 
 _FORMAT = "torchface.attachment/1"
@@ -130,7 +129,7 @@ class Attachment:
             "barycentric": self.barycentric.tolist(),
             "residual": None if self.residual is None else self.residual.tolist(),
         }
-        write_file(path, json.dumps(document, indent=1).encode())
+        write_json(path, document)
 
     @staticmethod
     def load(path: str | Path) -> Attachment:
@@ -139,21 +138,16 @@ class Attachment:
         Raises:
             FileFormatError: the file is missing, too large, not JSON, or lacks a field.
         """
-        path = Path(path)
+        document = read_json(path, _FORMAT, _LARGEST_FILE)
+        triangles = document["triangles"].tensor(None, dtype=torch.int64, expected="a list of triangles")
+        residual, fingerprint = document["residual"], document["fingerprint"]
         try:
-            document = json.loads(read_file(path, _LARGEST_FILE))
-            if not isinstance(document, dict) or document.get("format") != _FORMAT:
-                raise FileFormatError(f'{path}: no field "format": "{_FORMAT}"; expected an attachment saved as JSON')
-            residual = document.get("residual")
             return Attachment(
-                torch.tensor(document["triangles"], dtype=torch.int64).reshape(-1),
-                torch.tensor(document["barycentric"], dtype=torch.float32).reshape(-1, 3),
-                tuple(str(label) for label in document["labels"]),
-                None if residual is None else torch.tensor(residual, dtype=torch.float32).reshape(-1, 3),
-                document.get("fingerprint"),
+                triangles,
+                document["barycentric"].tensor(len(triangles), 3, dtype=torch.float32),
+                document["labels"].texts(),
+                residual.tensor(len(triangles), 3, dtype=torch.float32) if residual else None,
+                fingerprint.text() if fingerprint else None,
             )
-        except (ValueError, KeyError, TypeError, RuntimeError, RecursionError, OverflowError) as error:
-            raise FileFormatError(
-                f"{path}: not an attachment ({type(error).__name__}: {error}); "
-                "expected the JSON that Attachment.save writes"
-            ) from error
+        except (ShapeError, NameMismatchError, ValueRangeError) as error:
+            raise FileFormatError(f"{path}: {error}") from error

@@ -110,7 +110,7 @@ def test_ten_thousand_from_disk_within_four_gigabytes_killed_once(on_disk: Path,
             if killed_at > 0.6 * step["total"]:
                 child.send_signal(signal.SIGKILL)
                 break
-    kept = len(list((tmp_path / "check").glob("gram_*.npy")))
+    kept = len(list((tmp_path / "check").glob("gram_*.safetensors")))
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout.splitlines()[-1])
     print(f"\n{SAMPLES} samples x {VERTICES} vertices, {on_disk.stat().st_size / 2**30:.2f} GiB on disk")

@@ -10,6 +10,7 @@ import torch
 
 from torchface import BlendshapeRig, TorchfaceError, save_mesh, save_rig, zoo
 from torchface.errors import NameMismatchError
+from torchface.progress import silent
 from train.expression import Settings, Trained, fit, gather, settle, train
 from train.expression_table import METHODS
 
@@ -79,7 +80,7 @@ def test_expressions_are_laid_onto_neutrals(dome_rig: BlendshapeRig) -> None:
 
 
 def test_more_components_than_people_are_cut(pairs: Path) -> None:
-    people = gather(Settings(pairs), lambda line: None)
+    people = gather(Settings(pairs), silent)
     model = fit(people, Settings(pairs, neutral_components=50))
     assert len(model.neutral_components) <= 7
     chosen = fit(people, Settings(pairs, neutral_components=None, offset_components=None, ridge=None))

@@ -83,7 +83,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
 ) -> None:
     settings = Settings(data=(folder, folder / "faces.xml"), out=tmp_path / "faces", held_out=4, trees=FEW)
     lines: list[str] = []
-    model, errors = train(settings, lines.append)
+    model, errors = train(settings, lambda step, *_: lines.append(step))
     assert len(errors) == 4
     mean = LandmarkTrees(cascades=1, trees=1, depth=1, features=2, components=1)
     mean.mean.copy_(model.mean)
@@ -107,7 +107,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
     assert (tmp_path / "again" / "checkpoint.safetensors").exists()
     monkeypatch.undo()
     lines.clear()
-    again, _ = train(other, lines.append)
+    again, _ = train(other, lambda step, *_: lines.append(step))
     assert not [line for line in lines if "trees" in line]  # all of them came from the checkpoint
     for name, value in model.state_dict().items():
         assert torch.equal(value, again.state_dict()[name])

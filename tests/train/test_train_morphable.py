@@ -176,7 +176,7 @@ def test_meshes_without_colours_make_a_model_of_shape(
     for number, mesh in enumerate(heads[:4]):
         save_mesh(replace(mesh, colors=mesh.colors if number < 2 else None), tmp_path / f"{number}.glb")
     said: list[str] = []
-    result = train(Settings(scans=tmp_path, out=tmp_path / "model", held_out=0), said.append)
+    result = train(Settings(scans=tmp_path, out=tmp_path / "model", held_out=0), lambda step, *_: said.append(step))
     assert result.model.color is None
     assert "2.glb has no colours: the model will have none" in said
 

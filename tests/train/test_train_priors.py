@@ -49,7 +49,7 @@ def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
         strength=0.3,
         trial_frames=4,
     )
-    measured = train(settings, lines.append)
+    measured = train(settings, lambda step, *_: lines.append(step))
     assert set(measured) == {"own_shape", "own_dynamics"}
     shape, dynamics = (zoo.get_model(tmp_path / name) for name in measured)
     assert isinstance(shape, ShapePrior)

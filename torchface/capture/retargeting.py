@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.files.whole_files import read_file
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.documents import Value, read_toml
 from torchface.shape_names import mapping
 from torchface.take import Take, Track
 
-_MAX_TABLE = 2**20
 _MAX_FACTORS = 8
 
 
@@ -178,41 +175,22 @@ def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
     Raises:
         FileFormatError: the file is no such table.
     """
-    path = Path(path)
-    try:
-        table = tomllib.loads(read_file(path, _MAX_TABLE).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: found no TOML ({error}), expected a mapping table") from error
-    return {name: _rule(path, name, entry) for name, entry in table.items()}
+    return {name: _rule(entry) for name, entry in read_toml(path).table().items()}
 
 
-def _rule(path: Path, name: str, entry: Any) -> ShapeRule:
-    def fail(found: str, expected: str) -> FileFormatError:
-        return FileFormatError(f"{path}: [{name}]: found {found:.80}, expected {expected}")
-
-    if not isinstance(entry, dict):
-        raise fail(repr(entry), "a table with sum or product")
-    unknown = sorted(set(entry) - {"sum", "product", "gain", "lower", "upper"})
-    if unknown:
-        raise fail(f"{', '.join(unknown)}", "only sum, product, gain, lower, upper")
-    factors, product = entry.get("sum", {}), entry.get("product", [])
-    if not isinstance(factors, dict) or not all(map(_is_number, factors.values())):
-        raise fail(f"sum = {factors!r}", "source shapes with a factor each")
-    if not isinstance(product, list) or not all(isinstance(source, str) for source in product):
-        raise fail(f"product = {product!r}", "a list of source shapes")
-    if len(product) > _MAX_FACTORS:
-        raise fail(f"a product of {len(product)} shapes", f"at most {_MAX_FACTORS}")
-    if not factors and not product:
-        raise fail("neither sum nor product", "at least one of them")
-    limits = {limit: entry[limit] for limit in ("gain", "lower", "upper") if limit in entry}
-    for limit, value in limits.items():
-        if not _is_number(value):
-            raise fail(f"{limit} = {value!r}", "a number")
-    return ShapeRule({source: float(factor) for source, factor in factors.items()}, tuple(product), **limits)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _rule(entry: Value) -> ShapeRule:
+    entry.table("sum", "product", "gain", "lower", "upper", expected="a table with sum or product")
+    factors, product = entry["sum"], entry["product"]
+    if not factors.found and not product.found:
+        raise entry.error("sum or product")
+    if product and len(product.texts("a list of source shapes")) > _MAX_FACTORS:
+        raise product.error(f"at most {_MAX_FACTORS} source shapes")
+    sums = factors.table(expected="source shapes with a factor each") if factors else {}
+    return ShapeRule(
+        {source: factor.number("a factor") for source, factor in sums.items()},
+        product.texts() if product else (),
+        **{limit: entry[limit].number() for limit in ("gain", "lower", "upper") if entry[limit]},
+    )
 
 
 def _check_rules(rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_names: Sequence[str]) -> None:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import math
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, Self, TypeVar
 
-import tomli_w
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
+from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config
 from torchface.files.states import pack_state, read_state
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.whole_files import make_folder, write_file
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
-_LARGEST_TEXT = 2**20
 _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
 
 
@@ -91,14 +89,10 @@ def write_model(
     folder = Path(folder)
     state = pack_state(model.state_dict(), half)
     record = replace(record, sha256=hashlib.sha256(state).hexdigest(), size=len(state), config=dict(model.config))  # type: ignore[arg-type]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
-    document = {"format": FORMAT, **_without_none(dict(vars(record)))}
+    make_folder(folder)
     write_file(folder / STATE, state)
     write_file(folder / CARD, card_text(folder.name, record, card).encode())
-    write_file(folder / DESCRIPTION, tomli_w.dumps(document).encode())
+    write_toml(folder / DESCRIPTION, {"format": FORMAT, **vars(record)})
     return record
 
 
@@ -108,32 +102,19 @@ def read_record(folder: str | Path) -> ModelRecord:
     Raises:
         FileFormatError: the file is missing, too large, no TOML, of a newer format, or lacks a field.
     """
-    path = _inside(Path(folder), DESCRIPTION)
-    try:
-        document = tomllib.loads(read_file(path, _LARGEST_TEXT).decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise FileFormatError(f"{path}: not TOML ({error})") from error
-    found = document.get("format")
-    if not isinstance(found, int) or isinstance(found, bool) or found < 1:
-        raise FileFormatError(f"{path}: found format = {found!r}, expected {FORMAT}")
+    document = read_toml(_inside(Path(folder), DESCRIPTION))
+    found = document["format"].whole(1, expected=str(FORMAT))
     if found > FORMAT:
-        raise FileFormatError(f"{path}: found format {found}, made by a newer torchface; expected {FORMAT} at most")
-    for name in _TEXTS:
-        if not isinstance(document.get(name, ""), str):
-            raise FileFormatError(f"{path}: found {name} = {document[name]!r}, expected text")
-    size, metrics = document.get("size"), document.get("metrics", {})
-    if not isinstance(size, int) or isinstance(size, bool) or not 0 < size < 2**48:
-        raise FileFormatError(f"{path}: found size = {size!r}, expected the bytes of {STATE}")
-    if not isinstance(metrics, dict) or not all(
-        isinstance(v, int | float) and abs(v) < 1e300 for v in metrics.values()
-    ):
-        raise FileFormatError(f"{path}: found metrics = {metrics!r}, expected a table of numbers")
-    tables = {name: document.get(name, {}) for name in ("settings", "config")}
-    for name, table in tables.items():
-        if not isinstance(table, dict):
-            raise FileFormatError(f"{path}: found {name} = {table!r}, expected a table")
-    texts = {name: document.get(name, "") for name in _TEXTS}
-    return ModelRecord(**texts, metrics={key: float(v) for key, v in metrics.items()}, size=size, **tables)
+        raise document["format"].error(f"{FORMAT} at most: the file was made by a newer torchface")
+    texts: dict[str, Any] = {name: document[name].text() for name in _TEXTS if document[name]}
+    tables: dict[str, Any] = {name: document[name].plain_table() for name in ("settings", "config") if document[name]}
+    metrics = document["metrics"].table(expected="a table of numbers") if document["metrics"] else {}
+    return ModelRecord(
+        **{"kind": "", "licence": "", "data": "", **texts},
+        metrics={name: value.number(max_size=1e300) for name, value in metrics.items()},
+        size=document["size"].whole(1, 2**48, f"the bytes of {STATE}"),
+        **tables,
+    )
 
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -191,10 +172,6 @@ def card_text(name: str, record: ModelRecord, text: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
 def _inside(folder: Path, name: str) -> Path:
     """A file of the folder; a link that leads out of it is refused."""
     path = folder / name
@@ -204,12 +181,3 @@ def _inside(folder: Path, name: str) -> Path:
     except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL
         raise FileFormatError(f"{path}: cannot be followed ({error})") from error
     return path
-
-
-def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
-    """TOML has no null: what is absent is None."""
-    return {
-        key: _without_none(value) if isinstance(value, Mapping) else value
-        for key, value in table.items()
-        if value is not None
-    }

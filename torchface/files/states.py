@@ -2,44 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.state_renames import current_state_keys
 
-_LARGEST_HEADER = 2**20
-_TYPES = {
-    "F16": torch.float16,
-    "F32": torch.float32,
-    "F64": torch.float64,
-    "I8": torch.int8,
-    "I16": torch.int16,
-    "I32": torch.int32,
-    "I64": torch.int64,
-    "U8": torch.uint8,
-    "BOOL": torch.bool,
+_MAX_HEADER_BYTES = 2**20
+_FAMILIES = {
+    **dict.fromkeys(("F16", "F32", "F64"), "float"),
+    **dict.fromkeys(("I8", "I16", "I32", "I64", "U8"), "int"),
+    "BOOL": "bool",
 }
-
-
-@dataclass(frozen=True)
-class StoredTensor:
-    """What a header says of one tensor."""
-
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-
-    @property
-    def bytes(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
+"""Which types of a file fit which of a module: the width of a number may differ."""
 
 
 def pack_state(state: Mapping[str, Tensor], half: Collection[str] = ()) -> bytes:
@@ -88,15 +69,16 @@ def read_state(
         if found != size:
             raise FileFormatError(f"{path}: found {found} bytes, expected {size}: cut off, or of another model")
         with path.open("rb") as file:
-            stored = _header(path, file.read(min(size, 8 + _LARGEST_HEADER)), size)
-            names = current_state_keys(kind, stored, expected)
-            _check(path, {names[key]: tensor for key, tensor in stored.items()}, expected)
+            if int.from_bytes(file.read(8), "little") > _MAX_HEADER_BYTES:
+                raise FileFormatError(f"{path}: no readable state (found a header above {_MAX_HEADER_BYTES} bytes)")
+            with safe_open(path, framework="pt") as stored:  # reads and checks the header alone
+                names = current_state_keys(kind, stored.keys(), expected)
+                _check(path, {names[key]: stored.get_slice(key) for key in stored.keys()}, expected)  # noqa: SIM118
             file.seek(0)
             data = file.read(size + 1)
+        loaded = load(data)
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        loaded = load(data)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise FileFormatError(f"{path}: no readable state ({error})") from error
     state = {names[key]: tensor.to(expected[names[key]].dtype) for key, tensor in loaded.items()}
@@ -114,33 +96,7 @@ def _smallest(values: Tensor) -> torch.dtype:
     return torch.int64
 
 
-def _header(path: Path, start: bytes, size: int) -> dict[str, StoredTensor]:
-    """The tensors that a file says it holds; they fill it exactly."""
-    length = int.from_bytes(start[:8], "little")
-    if len(start) < 8 or length > min(_LARGEST_HEADER, size - 8):
-        raise FileFormatError(f"{path}: no readable state (found a header of {length} bytes in {size})")
-    try:
-        document = json.loads(start[8 : 8 + length])
-        tensors = {
-            str(name): StoredTensor(_TYPES[entry["dtype"]], tuple(_count(n) for n in entry["shape"]))
-            for name, entry in document.items()
-            if name != "__metadata__"
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: no readable state ({type(error).__name__}: {error})") from error
-    claimed = sum(tensor.bytes for tensor in tensors.values())
-    if claimed != size - 8 - length:
-        raise FileFormatError(f"{path}: the header claims {claimed} bytes of numbers, found {size - 8 - length}")
-    return tensors
-
-
-def _count(number: object) -> int:
-    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**48:
-        raise ValueError(f"found {number!r} as a size")
-    return number
-
-
-def _check(path: Path, stored: Mapping[str, StoredTensor], expected: Mapping[str, Tensor]) -> None:
+def _check(path: Path, stored: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:
     if set(stored) != set(expected):
         odd = sorted(set(stored) ^ set(expected))
         raise FileFormatError(
@@ -148,10 +104,10 @@ def _check(path: Path, stored: Mapping[str, StoredTensor], expected: Mapping[str
             f"expected {', '.join(sorted(expected)[:8])}; {', '.join(odd[:5])} in one of them only)"
         )
     for name, tensor in expected.items():
-        found = stored[name]
-        if found.shape != tuple(tensor.shape) or _family(found.dtype) != _family(tensor.dtype):
+        dtype, shape = stored[name].get_dtype(), tuple(stored[name].get_shape())
+        if shape != tuple(tensor.shape) or _FAMILIES.get(dtype) != _family(tensor.dtype):
             raise FileFormatError(
-                f"{path}: config and state do not fit ({name}: found {found.dtype} {found.shape}, "
+                f"{path}: config and state do not fit ({name}: found {dtype} {shape[:8]}, "
                 f"expected {tensor.dtype} {tuple(tensor.shape)})"
             )
 

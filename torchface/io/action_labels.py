@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files.documents import Value, read_toml, write_toml
 
 _FORMAT = "torchface.action_labels/1"
-_LARGEST_TEXT = 2**22
-_MOST = 10_000_000
+_MAX_BYTES = 2**22
+_MAX_FRAMES = 10_000_000
 
 Box = tuple[float, float, float, float]
 Pixel = tuple[float, float]
@@ -61,8 +58,8 @@ class ActionLabels:
     performed: tuple[Performed, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 1 <= self.frames <= _MOST:
-            raise ValueRangeError(f"labels: found {self.frames} frames, expected 1 to {_MOST}")
+        if not 1 <= self.frames <= _MAX_FRAMES:
+            raise ValueRangeError(f"labels: found {self.frames} frames, expected 1 to {_MAX_FRAMES}")
         if not 0 <= self.neutral < self.frames:
             raise ValueRangeError(f"labels: found neutral frame {self.neutral}, expected 0 to {self.frames - 1}")
         if not all(math.isfinite(v) for point in (self.helmet, *self.markers) for v in point):
@@ -80,7 +77,7 @@ class ActionLabels:
                     f"labels: {' '.join(stretch.units)} is performed from frame {stretch.first} to before "
                     f"{stretch.last}, expected a stretch within the video's {self.frames} frames"
                 )
-            if not stretch.units or len(set(stretch.units)) < len(stretch.units):
+            if not all(stretch.units) or not stretch.units or len(set(stretch.units)) < len(stretch.units):
                 raise NameMismatchError(f"labels: found the units {stretch.units!r}, expected distinct names")
 
     @property
@@ -96,31 +93,20 @@ def load_action_labels(path: str | Path) -> ActionLabels:
         FileFormatError: the file is missing, too large, no TOML, or lacks a field.
         ValueRangeError, NameMismatchError: what it says cannot be; see :class:`ActionLabels`.
     """
-    path = Path(path)
+    document = read_toml(path, _FORMAT, _MAX_BYTES)
+    helmet, left, right = (
+        _pixels(point) for point in (document["helmet"], *document["markers"].rows(2, 2, "two markers"))
+    )
+    performed = document["performed"].rows() if document["performed"] else []
     try:
-        document = tomllib.loads(read_file(path, _LARGEST_TEXT).decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise FileFormatError(f"{path}: not TOML ({error})") from error
-    if document.get("format") != _FORMAT:
-        raise FileFormatError(f'{path}: found format {document.get("format")!r:.60}, expected "{_FORMAT}"')
-    try:
-        markers = [_numbers(point, 2) for point in document["markers"]]
-        if len(markers) != 2:
-            raise ValueError(f"found {len(markers)} markers, expected two")
-        performed = tuple(
-            Performed(tuple(_text(unit) for unit in entry["units"]), _whole(entry["first"]), _whole(entry["last"]))
-            for entry in document.get("performed", [])
-        )
         return ActionLabels(
-            _whole(document["frames"]),
-            _whole(document["neutral"]),
-            _numbers(document["helmet"], 2),
-            (markers[0], markers[1]),
-            {name: _numbers(box, 4) for name, box in document["regions"].items()},
-            performed,
+            document["frames"].whole(),
+            document["neutral"].whole(),
+            helmet,
+            (left, right),
+            {name: _pixels(box, 4) for name, box in document["regions"].table().items()},
+            tuple(Performed(one["units"].texts(), one["first"].whole(), one["last"].whole()) for one in performed),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FileFormatError(f"{path}: no labels of a video ({type(error).__name__}: {error})") from error
     except (ValueRangeError, NameMismatchError) as error:
         raise type(error)(f"{path}: {error}") from error
 
@@ -138,24 +124,8 @@ def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
             {"units": list(stretch.units), "first": stretch.first, "last": stretch.last} for stretch in labels.performed
         ],
     }
-    write_file(path, tomli_w.dumps(document).encode())
+    write_toml(path, document)
 
 
-def _whole(value: object) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not -_MOST <= value <= _MOST:
-        raise ValueError(f"found {value!r:.40}, expected a whole number")
-    return value
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"found {value!r:.40}, expected a name")
-    return value
-
-
-def _numbers(values: object, count: int) -> Any:
-    if not isinstance(values, list) or len(values) != count:
-        raise ValueError(f"found {values!r:.60}, expected {count} numbers")
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e9 for v in values):
-        raise ValueError(f"found {values!r:.60}, expected {count} numbers")
-    return tuple(float(v) for v in values)
+def _pixels(value: Value, count: int = 2) -> Any:
+    return tuple(value.tensor(count, expected=f"{count} numbers").tolist())

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import torch
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.files.whole_files import read_file
+from torchface.files.documents import read_json
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.length_units import millimetres_per
@@ -66,8 +65,5 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
 def _is_correspondences(path: Path) -> bool:
     if path.suffix.lower() != ".json":
         return False
-    try:
-        document = json.loads(read_file(path, _LARGEST_FILE))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not JSON ({error})") from error
+    document = read_json(path, max_bytes=_LARGEST_FILE).found
     return isinstance(document, dict) and "format" in document

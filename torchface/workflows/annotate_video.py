@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.documents import read_json, write_json
+from torchface.files.whole_files import make_folder
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.annotated_frames import AnnotatedFrame, save_annotated_frame
@@ -139,47 +138,22 @@ def _write(folder: Path, film: VideoFile, proposals: _Proposals) -> None:
             for number, points in proposals.landmarks.items()
         ],
     }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
-    write_file(folder / PROPOSALS, json.dumps(document).encode())
+    write_json(make_folder(folder) / PROPOSALS, document, indent=None)
 
 
 def _read(path: Path, film: VideoFile) -> _Proposals | None:
     if not path.exists():
         return None
-    try:
-        document = json.loads(read_file(path, _LARGEST_FILE))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not JSON ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
-        raise FileFormatError(f'{path}: found no "format" of {_FORMAT!r}, expected one')
-    found = {key: document.get(key) for key in _identity(film)}
+    document = read_json(path, _FORMAT, _LARGEST_FILE)
+    found = {key: document[key].found for key in _identity(film)}
     if found != _identity(film):
         raise FileFormatError(
             f"{path}: found proposals for {found['video']!r} ({found['frames']} frames of {found['width']} x "
             f"{found['height']}), expected {film.path.name!r} ({film.count} of {film.width} x {film.height}): name "
             "another folder, or remove this file"
         )
-    asked, rows = document.get("asked"), document.get("proposals")
-    if type(asked) is not int or not isinstance(rows, list) or not 1 <= len(rows) <= _MOST:
-        raise FileFormatError(f"{path}: found no numbers of frames, expected those proposed")
-    landmarks = {}
-    for row in rows:
-        number, points = (row.get("frame"), row.get("landmarks")) if isinstance(row, dict) else (None, None)
-        if type(number) is not int or not 0 <= number < film.count:
-            raise FileFormatError(f"{path}: found the frame {number!r}, expected 0 to {film.count - 1}")
-        landmarks[number] = _checked(path, points)
-    return _Proposals(asked, landmarks)
-
-
-def _checked(path: Path, points: Any) -> Tensor:
-    """68 finite points."""
-    try:
-        found = torch.tensor(points, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise FileFormatError(f"{path}: found landmarks that are no points ({error})") from error
-    if found.shape != (68, 2) or not bool(torch.isfinite(found).all()):
-        raise FileFormatError(f"{path}: found landmarks of {tuple(found.shape)}, expected 68 finite points")
-    return found
+    landmarks = {
+        row["frame"].whole(0, film.count - 1): row["landmarks"].tensor(68, 2, expected="68 finite points")
+        for row in document["proposals"].rows(1, _MOST)
+    }
+    return _Proposals(document["asked"].whole(), landmarks)

@@ -162,8 +162,8 @@ def test_names_that_make_no_files_and_other_endings_are_refused(tmp_path: Path) 
 def test_broken_notes_are_named(tmp_path: Path) -> None:
     save_rig(sheet_rig(), tmp_path / "actor")
     for text, told in (
-        ("{", "found broken JSON"),
-        ("[]", "found JSON that is no object"),
+        ("{", "not JSON"),
+        ("[]", "expected a rig's notes"),
         ('{"shapes": 3}', "shapes: found 3, expected an array"),
         ('{"mesh": {"version": 1, "vertices": 30, "landmarks": [30]}}', "vertices 30 to 30, expected 0 to 29"),
     ):

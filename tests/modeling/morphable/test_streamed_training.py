@@ -51,13 +51,13 @@ def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch:
 def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
 
-    def stop(done: int, total: int) -> None:
+    def stop(step: str, done: int = 0, total: int = 0) -> None:
         if done == total - 9:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
-    finished = sorted((tmp_path / "check").glob("gram_*.npy"))
+    finished = sorted((tmp_path / "check").glob("gram_*.safetensors"))
     assert len(finished) == 6
     finished[1].write_bytes(finished[1].read_bytes()[:-8])  # this one is computed again
     again, whole = InMemory(values), InMemory(values)

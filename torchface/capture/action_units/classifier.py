@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one import OneVsOne
 from torchface.capture.action_units.regions import RegionGroup
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.errors import NameMismatchError, ShapeError
+from torchface.files.documents import Value
 
 _MAX_COUNT = 4096
 _MAX_CLASSES = 256  # there is a plane for every two
@@ -136,17 +137,13 @@ class ActionUnitClassifier(nn.Module):
         Raises:
             FileFormatError: a value is missing or out of range.
         """
-        entries = config.get("groups")
-        if not isinstance(entries, list) or not 1 <= len(entries) <= 64:
-            raise FileFormatError(f"config: found groups = {entries!r:.80}, expected a list of tables")
+        values = Value("config", "", config)
         groups, sizes = [], []
-        for entry in entries:
-            if not isinstance(entry, Mapping):
-                raise FileFormatError(f"config: found the group {entry!r:.80}, expected a table")
-            names = [_texts(entry, name) for name in ("regions", "units", "other_units")]
-            groups.append(RegionGroup(str(entry.get("name")), *names))
-            sizes.append(GroupSize(_whole(entry, "components"), _whole(entry, "classes", 2, _MAX_CLASSES)))
-        return cls(groups, sizes, _whole(config, "size", 8))
+        for entry in values["groups"].rows(1, 64):
+            names = [entry[name].texts() for name in ("regions", "units", "other_units")]
+            groups.append(RegionGroup(entry["name"].text(), *names))
+            sizes.append(GroupSize(entry["components"].whole(1, _MAX_COUNT), entry["classes"].whole(2, _MAX_CLASSES)))
+        return cls(groups, sizes, values["size"].whole(8, _MAX_COUNT))
 
     def group_classifiers(self) -> list[GroupClassifier]:
         """One a group."""
@@ -189,19 +186,3 @@ def check_groups(groups: Sequence[RegionGroup]) -> None:
     twice = sorted({unit for unit in units if units.count(unit) > 1})
     if twice:
         raise NameMismatchError(f"groups: found {', '.join(twice)} in more than one group, expected each unit in one")
-
-
-def _texts(entry: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    found = entry.get(name)
-    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
-        raise FileFormatError(f"config: found {name} = {found!r:.80}, expected a list of names")
-    return tuple(found)
-
-
-def _whole(entry: Mapping[str, Any], name: str, smallest: int = 1, largest: int = _MAX_COUNT) -> int:
-    found = entry.get(name)
-    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found <= largest:
-        raise FileFormatError(
-            f"config: found {name} = {found!r:.80}, expected a whole number from {smallest} to {largest}"
-        )
-    return found

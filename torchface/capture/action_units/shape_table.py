@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import tomli_w
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.files.documents import read_toml, write_toml
 
 _FORMAT = "torchface.action_unit_shapes/1"
-_MAX_TEXT = 2**20
 _BUILT_IN = Path(__file__).with_name("tables")
 
 
@@ -67,7 +64,7 @@ class ShapeTable:
 
     def save(self, path: str | Path) -> None:
         """Writes TOML; the file appears only when it is complete."""
-        write_file(path, tomli_w.dumps({"format": _FORMAT, "units": self.units}).encode())
+        write_toml(path, {"format": _FORMAT, "units": self.units})
 
 
 def built_in_tables() -> list[str]:
@@ -90,19 +87,12 @@ def load_shape_table(name_or_path: str | Path) -> ShapeTable:
                 f"shape table: found no {path.name!r}, expected {', '.join(built_in_tables())}, or a .toml file"
             )
         path = _BUILT_IN / f"{path.name}.toml"
+    units = {unit: shapes.table() for unit, shapes in read_toml(path, _FORMAT)["units"].table().items()}
+    weights = {
+        unit: {name: weight.number("a weight for each shape") for name, weight in shapes.items()}
+        for unit, shapes in units.items()
+    }
     try:
-        document = tomllib.loads(read_file(path, _MAX_TEXT).decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise FileFormatError(f"{path}: not TOML ({error})") from error
-    units = document.get("units")
-    if document.get("format") != _FORMAT or not isinstance(units, Mapping):
-        raise FileFormatError(f'{path}: no table of shapes; expected format = "{_FORMAT}" and [units]')
-    for unit, shapes in units.items():
-        if not isinstance(shapes, Mapping) or not all(
-            isinstance(weight, int | float) and not isinstance(weight, bool) for weight in shapes.values()
-        ):
-            raise FileFormatError(f"{path}: found {unit} = {shapes!r:.80}, expected a weight for each shape")
-    try:
-        return ShapeTable({unit: {shape: float(w) for shape, w in shapes.items()} for unit, shapes in units.items()})
+        return ShapeTable(weights)
     except (ValueRangeError, NameMismatchError) as error:
         raise type(error)(f"{path}: {error}") from error

@@ -16,6 +16,7 @@ from torchface.capture.priors.learned_names import require_same_names
 from torchface.capture.priors.motion_features import motion_basis, moving_parts, newest_frames
 from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.files.documents import Value
 
 _MAX_NUMBERS = 2**26
 _MAX_WINDOW = 120
@@ -198,14 +199,13 @@ class DynamicsPrior(nn.Module):
         Raises:
             FileFormatError: a part of it is not what it should be.
         """
-        try:
-            names, groups = [str(name) for name in config["names"]], [list(group) for group in config["groups"]]
-            window, points = (_whole(config, name) for name in ("window", "inducing"))
-            fps, input_noise = float(config["fps"]), float(config.get("input_noise", 0.0))
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"dynamics prior: found a config without a usable {error}, expected one") from error
+        values = Value("dynamics prior", "", config)
+        names = values["names"].texts()
+        groups = [group.tensor(None, dtype=torch.int64).tolist() for group in values["groups"].rows()]
+        window, points = (values[name].whole(1, 2**20) for name in ("window", "inducing"))
+        fps, input_noise = values["fps"].number(), values["input_noise"].number() if values["input_noise"] else 0.0
         n, orders, g = len(names), min(window, 3), len(groups)
-        if not 0 < fps < math.inf or window > _MAX_WINDOW or g * points * max(orders * n, points, n) > _MAX_NUMBERS:
+        if not fps > 0 or window > _MAX_WINDOW or g * points * max(orders * n, points, n) > _MAX_NUMBERS:
             raise FileFormatError(
                 f"dynamics prior: found {n} shapes in {g} groups, a window of {window} frames at {fps} a second and "
                 f"{points} inducing points, expected a window of {_MAX_WINDOW} and {_MAX_NUMBERS} numbers at most"
@@ -254,10 +254,3 @@ class DynamicsPrior(nn.Module):
                 raise ValueRangeError(f"dynamics prior: found {name} that is not positive, expected all to be")
         if bool((noise.own_coefficients < 0).any()) or bool((noise.group_coefficients < 0).any()):
             raise ValueRangeError("dynamics prior: found negative coefficients of the noise, expected none")
-
-
-def _whole(config: Mapping[str, Any], name: str) -> int:
-    value = config[name]
-    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 2**20:
-        raise ValueError(name)
-    return value

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.files.documents import Value
 from torchface.optim.mean_shift import mean_shift
 
 _MAX_NUMBERS = 2**28
@@ -125,14 +126,10 @@ def checked_sizes(config: Mapping[str, Any], *names: str) -> tuple[int, ...]:
     Raises:
         FileFormatError: one is missing, no whole number from 1, or all together are too large.
     """
-    sizes = tuple(config.get(name) for name in names)
-    found = dict(zip(names, sizes, strict=True))
-    if not all(isinstance(size, int) and not isinstance(size, bool) and size >= 1 for size in sizes):
-        raise FileFormatError(f"density: found sizes {found}, expected whole numbers from 1")
-    whole = tuple(int(size) for size in sizes if size is not None)
-    if math.prod(whole) > _MAX_NUMBERS:
-        raise FileFormatError(f"density: found sizes {found}, expected at most {_MAX_NUMBERS} numbers")
-    return whole
+    sizes = tuple(Value("density", "", config)[name].whole(1) for name in names)
+    if math.prod(sizes) > _MAX_NUMBERS:
+        raise FileFormatError(f"density: found sizes {sizes}, expected at most {_MAX_NUMBERS} numbers")
+    return sizes
 
 
 def _check_samples(samples: Tensor) -> None:

@@ -13,6 +13,7 @@ from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, Recipr
 from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
 from torchface.capture.video.video_settings import VideoSettings
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig
 
 CONTOUR_WEIGHT = 0.5
@@ -147,15 +148,14 @@ class VideoSolverParts(nn.Module):
         names = config["names"]
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
             raise NameMismatchError(f"names: found {names!r:.80}, expected a list of distinct names")
-        count, curve = _whole(config, "points"), _whole(config, "curve")
+        values = Value("video solver", "", config)
+        count, curve = values["points"].whole(1), values["curve"].whole(1)
         if not 0 < len(names) <= _MOST_SHAPES or not LANDMARKS <= count <= _MOST_POINTS or curve > count:
             raise FileFormatError(
                 f"video solver: found {len(names)} shapes, {count} points and curves of {curve}, expected 1 to "
                 f"{_MOST_SHAPES} shapes, {LANDMARKS} to {_MOST_POINTS} points and no longer curves"
             )
-        settings = config["settings"]
-        if not isinstance(settings, Mapping):
-            raise FileFormatError(f"video solver: found settings {settings!r:.80}, expected a table")
+        settings = values["settings"].plain_table()
         prior, dynamics = _made(config.get("prior"), _PRIORS), _made(config.get("dynamics"), _DYNAMICS)
         for learned in (prior, dynamics):
             if learned is not None:
@@ -242,10 +242,3 @@ def _made(config: Any, kinds: Mapping[str, type]) -> Any:
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(f"video solver: found a prior of kind {kind!r:.80}, expected {' or '.join(kinds)}")
     return kinds[kind].from_config(config)  # type: ignore[attr-defined]
-
-
-def _whole(config: Mapping[str, Any], name: str) -> int:
-    value = config[name]
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise FileFormatError(f"video solver: found {name} = {value!r:.80}, expected a whole number from 1")
-    return value

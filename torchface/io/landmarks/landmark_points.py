@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.documents import read_json
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.landmarks.picks import load_correspondences
 
@@ -98,7 +98,7 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
         return _pts(path)
     if ending not in (".ljson", ".json"):
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected .ljson, .pts or .json")
-    document = _json(path)
+    document = read_json(path, max_bytes=_LARGEST_FILE).found
     if ending == ".json" and isinstance(document, dict) and "format" in document:
         return LandmarkPoints(load_correspondences(path).points, source=str(path))
     return _ljson(path, document)
@@ -122,13 +122,6 @@ def save_pts(points: Tensor, path: str | Path) -> None:
         raise ValueRangeError(f"{path}: found points that are NaN or infinite, expected numbers")
     rows = "\n".join(f"{x + 1:.3f} {y + 1:.3f}" for x, y in points.double().tolist())
     write_file(path, f"version: 1\nn_points: {len(points)}\n{{\n{rows}\n}}\n".encode())
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(read_file(path, _LARGEST_FILE))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not JSON ({error})") from error
 
 
 def _ljson(path: Path, document: Any) -> LandmarkPoints:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
-from torchface.files.whole_files import read_file, write_file
+from torchface.errors import NameMismatchError, ShapeError, TopologyError
+from torchface.files.documents import Value, read_json, write_json
 from torchface.mesh import Mesh
 
 _LANDMARKS, _CORRESPONDENCES = "torchface.landmarks/1", "torchface.correspondences/1"
-_LARGEST_FILE = 16 * 2**20
+_MAX_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +82,7 @@ def load_landmarks(path: str | Path) -> LandmarkVertices:
     Raises:
         FileFormatError: the file is missing, too large, not JSON, or a field is missing or of another kind.
     """
-    document = _read(path, _LANDMARKS)
-    return LandmarkVertices(_vertices(document, path), _labels(document, path), _fingerprint(document, path))
+    return LandmarkVertices(*_picks(read_json(path, _LANDMARKS, _MAX_BYTES)))
 
 
 def save_correspondences(pairs: Correspondences, path: str | Path) -> None:
@@ -99,13 +96,10 @@ def load_correspondences(path: str | Path) -> Correspondences:
     Raises:
         FileFormatError: the file is missing, too large, not JSON, or a field is missing or of another kind.
     """
-    document = _read(path, _CORRESPONDENCES)
-    vertices, points = _vertices(document, path), document.get("points")
-    good = isinstance(points, list) and len(points) == len(vertices) and all(map(_is_point, points))
-    if not good:
-        raise FileFormatError(f"{path}: found no {len(vertices)} points under 'points', expected three numbers a pair")
-    values = torch.tensor(points, dtype=torch.float64).reshape(-1, 3)
-    return Correspondences(vertices, values, _labels(document, path), _fingerprint(document, path))
+    document = read_json(path, _CORRESPONDENCES, _MAX_BYTES)
+    vertices, labels, fingerprint = _picks(document)
+    points = document["points"].tensor(len(vertices), 3, expected=f"three numbers for each of {len(vertices)} vertices")
+    return Correspondences(vertices, points, labels, fingerprint)
 
 
 def _write(path: str | Path, kind: str, picks: LandmarkVertices | Correspondences, more: dict[str, Any]) -> None:
@@ -116,48 +110,16 @@ def _write(path: str | Path, kind: str, picks: LandmarkVertices | Correspondence
         "vertices": picks.vertices.tolist(),
         **more,
     }
-    write_file(path, json.dumps(document, indent=1).encode())
+    write_json(path, document)
 
 
-def _read(path: str | Path, kind: str) -> dict[str, Any]:
-    try:
-        document = json.loads(read_file(path, _LARGEST_FILE))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not JSON ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != kind:
-        raise FileFormatError(f'{path}: found no field "format": "{kind}", expected it')
-    return document
-
-
-def _vertices(document: dict[str, Any], path: str | Path) -> Tensor:
-    found = document.get("vertices")
-    if not isinstance(found, list) or not all(type(i) is int and 0 <= i < 2**31 for i in found):
-        raise FileFormatError(f"{path}: found no list of vertex ids under 'vertices', expected one")
-    return torch.tensor(found, dtype=torch.int64)
-
-
-def _labels(document: dict[str, Any], path: str | Path) -> tuple[str, ...]:
-    found, count = document.get("labels"), len(document["vertices"])
-    if not isinstance(found, list) or not all(isinstance(label, str) for label in found):
-        raise FileFormatError(f"{path}: found no list of texts under 'labels', expected one")
-    if len(set(found)) != count or len(found) != count:
-        raise FileFormatError(
-            f"{path}: found {len(set(found))} distinct labels, expected one for each of {count} vertices"
-        )
-    return tuple(found)
-
-
-def _fingerprint(document: dict[str, Any], path: str | Path) -> str | None:
-    found = document.get("fingerprint")
-    if found is not None and not isinstance(found, str):
-        raise FileFormatError(f"{path}: found a fingerprint that is no text, expected a mesh's")
-    return found
-
-
-def _is_point(point: object) -> bool:
-    if not isinstance(point, list) or len(point) != 3:
-        return False
-    return all(type(x) in (int, float) and abs(x) < 1e9 and math.isfinite(x) for x in point)
+def _picks(document: Value) -> tuple[Tensor, tuple[str, ...], str | None]:
+    """Vertices, labels and fingerprint."""
+    vertices = document["vertices"].tensor(None, dtype=torch.int64, expected="a list of vertex ids")
+    labels, fingerprint = document["labels"].texts(), document["fingerprint"]
+    if not len(labels) == len(set(labels)) == len(vertices):
+        raise document["labels"].error(f"{len(vertices)} distinct labels, one a vertex")
+    return vertices, labels, fingerprint.text() if fingerprint else None
 
 
 def _check_labels(vertices: Tensor, labels: tuple[str, ...]) -> None:

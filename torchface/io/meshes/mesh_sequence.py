@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, TopologyError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.documents import read_json, write_json
 
 FORMAT = "torchface.mesh-sequence/1"
 _LARGEST_COUNT = 2**31
@@ -142,7 +142,7 @@ class MeshSequenceWriter:
         except OSError as error:
             raise FileFormatError(f"{self.path}: cannot be written ({error.strerror})") from error
         self.done += len(several)
-        write_file(self._note, json.dumps({"done": self.done}).encode())
+        write_json(self._note, {"done": self.done}, indent=None)
 
     def close(self) -> None:
         """Puts a complete file in its place; what is incomplete stays beside for another run."""
@@ -169,11 +169,10 @@ class MeshSequenceWriter:
         if not (self._part.is_file() and self._note.is_file()):
             return 0
         try:
-            done = json.loads(read_file(self._note, 2**16))["done"]
+            done = read_json(self._note)["done"].whole(0, self.count)
             with self._part.open("rb") as file:
                 same = file.read(len(self._begin)) == self._begin
-            inside = isinstance(done, int) and 0 <= done <= self.count
-            whole = inside and self._part.stat().st_size >= self._offset(done)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, FileFormatError):
+            whole = self._part.stat().st_size >= self._offset(done)
+        except (OSError, FileFormatError):
             return 0  # a damaged note is as good as none
         return done if same and whole else 0

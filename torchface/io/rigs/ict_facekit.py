@@ -5,7 +5,6 @@ Source: ICT-VGL/ICT-FaceKit (MIT); Li et al. 2020, Learning Formation of Physica
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.files.documents import read_json
 from torchface.files.whole_files import read_file
 from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices
 from torchface.io.rigs.mirror_vertices import mirror_by_parts
@@ -190,16 +190,7 @@ def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: by
 
 
 def _read_indices(folder: Path) -> dict[str, list]:
-    path = folder / _INDICES
-    try:
-        found = json.loads(read_file(path, _LARGEST_INDICES))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not JSON ({error})") from error
-    kinds = {"expressions": str, "idx_to_landmark_verts": int}
-    for key, kind in kinds.items():
-        rows = found.get(key) if isinstance(found, dict) else None
-        if not isinstance(rows, list) or not all(type(row) is kind for row in rows):
-            raise FileFormatError(f"{path}: found no list {key!r}, expected one of {kind.__name__}")
-    if any(not 0 <= i < 2**31 for i in found["idx_to_landmark_verts"]):
-        raise FileFormatError(f"{path}: found a landmark vertex below 0 or above 2**31, expected a vertex id")
-    return found
+    document = read_json(folder / _INDICES, max_bytes=_LARGEST_INDICES)
+    document["expressions"].texts()
+    document["idx_to_landmark_verts"].tensor(None, dtype=torch.int64, expected="a list of vertex ids")
+    return document.found

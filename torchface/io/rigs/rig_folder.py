@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from dataclasses import replace
@@ -12,7 +11,8 @@ from typing import Any
 import torch
 
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.documents import read_json, write_json
+from torchface.files.whole_files import read_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.container import Document
 from torchface.io.gltf.mesh_extras import read_annotations, write_extras
@@ -104,7 +104,7 @@ def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
     write_obj_shapes(mesh, moved, folder / f"{NEUTRAL}.obj")
     notes = write_extras(mesh)
     notes.pop("polygons", None)  # the OBJ files have them
-    write_file(folder / NOTES, json.dumps({"shapes": list(rig.names), "mesh": notes}).encode())
+    write_json(folder / NOTES, {"shapes": list(rig.names), "mesh": notes}, indent=None)
     if detail is not None:
         maps: list[tuple[str, Any]] = list(zip(detail.names, detail.maps, strict=True))
         maps += [] if detail.neutral is None else [(NEUTRAL, detail.neutral)]
@@ -129,10 +129,6 @@ def _read_notes(folder: Path) -> Document | None:
     path = folder / NOTES
     if not path.is_file():
         return None
-    try:
-        root = json.loads(read_file(path, _LARGEST_NOTES))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: found broken JSON ({str(error)[:100]}), expected a rig's notes") from error
-    if not isinstance(root, dict):
-        raise FileFormatError(f"{path}: found JSON that is no object, expected a rig's notes")
-    return Document(path, root)
+    root = read_json(path, max_bytes=_LARGEST_NOTES)
+    root.table(expected="a rig's notes")
+    return Document(path, root.found)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.files.documents import Value
 
 FAINTEST = 0.02
 """Spread of the grey values under which a face counts as having none, in [0,1]."""
@@ -89,9 +90,7 @@ class LandmarkTrees(nn.Module):
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Self:
-        if any(isinstance(size, bool) or not isinstance(size, int) for size in config.values()):
-            raise ValueRangeError(f"config: found {config}, expected whole numbers")
-        return cls(**config)
+        return cls(**{name: size.whole() for name, size in Value("config", "", config).table().items()})
 
     def check_state(self) -> None:
         """Raises a ``ValueRangeError`` where a stored index points outside of what there is."""

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, TopologyError
+from torchface.files.documents import Value
 from torchface.mesh import Annotations, Mesh, submesh
-from torchface.modeling.morphable.morphable_model import MorphableModel, size
+from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.rig import BlendshapeRig
 
 _LARGEST = 2**31
-_MOST_SHAPES = 1000
+_MAX_SHAPES = _MAX_REGIONS = 1000
 _TOPOLOGY = ("faces", "polygons", "uvs", "uv_faces", "landmarks", "mirror", "contacts")
 
 
@@ -218,15 +219,13 @@ class HeadModel(nn.Module):
         Raises:
             FileFormatError: a size is missing, no whole number, or too large.
         """
-        shape, color, sizes, names = (config.get(key) for key in ("shape", "color", "sizes", "regions"))
-        if not isinstance(shape, Mapping) or not isinstance(sizes, Mapping) or not isinstance(color, Mapping | None):
-            raise FileFormatError("head model: found a config without shape and sizes, expected both as tables")
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(names) > 1000:
-            raise FileFormatError(f"head model: found regions = {names!r:.80}, expected at most 1000 names")
-        tensors = {name: _zeros(name, found) for name, found in sizes.items() if name in _TOPOLOGY}
+        values = Value("config", "", config)
+        shape, color = values["shape"].plain_table(), values["color"].plain_table() if values["color"] else None
+        names = [name.text() for name in values["regions"].rows(0, _MAX_REGIONS)]
+        tensors = {name: _zeros(name, found) for name, found in values["sizes"].table().items() if name in _TOPOLOGY}
         if "faces" not in tensors:
             raise FileFormatError("head model: found no size of the faces in the config, expected one")
-        count = size(shape, "vertices")
+        count = values["shape"]["vertices"].whole(1)
         masks = torch.zeros(count, dtype=torch.bool)
         annotations = Annotations(
             tensors.get("landmarks"), dict.fromkeys(names, masks), tensors.get("mirror"), tensors.get("contacts")
@@ -241,27 +240,19 @@ class HeadModel(nn.Module):
             annotations=annotations,
         )
         if "rig" in config:
-            shapes, colored = _rig_of(config["rig"], count)
+            shapes, colored = _rig_of(values["rig"], count)
             rest = torch.zeros(count, 3)
             model._carry(shapes, rest, torch.zeros(len(shapes), count, 3), rest.clone() if colored else None)
         return model
 
 
-def _rig_of(found: Any, vertices: int) -> tuple[list[str], bool]:
+def _rig_of(found: Value, vertices: int) -> tuple[list[str], bool]:
     """A rig's shapes by name, and whether it has colours."""
-    names = found.get("shapes") if isinstance(found, Mapping) else None
-    if (
-        not isinstance(names, list)
-        or not all(isinstance(name, str) for name in names)
-        or not 1 <= len(names) <= _MOST_SHAPES
-        or 12 * vertices * len(names) > _LARGEST
-    ):
-        raise FileFormatError(f"head model: found a rig of shapes {names!r:.80}, expected 1 to {_MOST_SHAPES} names")
-    return names, found.get("colors") is True
+    most = min(_MAX_SHAPES, _LARGEST // (12 * vertices))
+    names = [name.text() for name in found["shapes"].rows(1, most, f"1 to {most} names")]
+    return names, found["colors"].found is True
 
 
-def _zeros(name: str, found: Any) -> Tensor:
-    whole = isinstance(found, list) and 1 <= len(found) <= 2
-    if not whole or not all(isinstance(n, int) and not isinstance(n, bool) and 0 <= n < 2**24 for n in found):
-        raise FileFormatError(f"head model: found size {found!r:.80} of {name}, expected one or two whole numbers")
-    return torch.zeros(found, dtype=torch.float32 if name == "uvs" else torch.int64)
+def _zeros(name: str, found: Value) -> Tensor:
+    sizes = [size.whole(0, 2**24 - 1) for size in found.rows(1, 2, "one or two whole numbers")]
+    return torch.zeros(sizes, dtype=torch.float32 if name == "uvs" else torch.int64)

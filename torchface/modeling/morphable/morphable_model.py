@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.files.documents import Value
 from torchface.modeling.morphable.principal_components import principal_components
 
 _LARGEST = 2**31
@@ -229,7 +230,9 @@ class MorphableModel(nn.Module):
         Raises:
             FileFormatError: a size is missing, no whole number, or too large.
         """
-        vertices, channels, components = (size(config, name) for name in ("vertices", "channels", "components"))
+        values = Value("config", "", config)
+        sizes = (values[name].whole(1, _LARGEST - 1) for name in ("vertices", "channels", "components"))
+        vertices, channels, components = sizes
         if 4 * vertices * channels * (components + 1) > _LARGEST:
             raise FileFormatError(f"morphable model: found sizes of more than {_LARGEST} bytes, expected fewer")
         return cls(
@@ -237,24 +240,12 @@ class MorphableModel(nn.Module):
             torch.zeros(components, vertices, channels),
             torch.zeros(components),
             0.0,
-            size(config, "samples", smallest=0),
+            values["samples"].whole(0, _LARGEST - 1),
         )
 
     def _check(self, coefficients: Tensor) -> None:
         if coefficients.ndim != 2 or coefficients.shape[1] != self.count:
             raise ShapeError(f"coefficients: found {tuple(coefficients.shape)}, expected (B,{self.count})")
-
-
-def size(config: Mapping[str, Any], name: str, smallest: int = 1) -> int:
-    """A whole number from a config.
-
-    Raises:
-        FileFormatError: it is missing, no whole number, or out of range.
-    """
-    found = config.get(name)
-    if not isinstance(found, int) or isinstance(found, bool) or not smallest <= found < _LARGEST:
-        raise FileFormatError(f"config: found {name} = {found!r}, expected a whole number from {smallest}")
-    return found
 
 
 def _span(ids: Tensor) -> str:

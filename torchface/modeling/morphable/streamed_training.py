@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +11,9 @@ import torch
 from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.errors import ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.morphable.principal_components import check_count, check_rank, gram_spectrum, signs
@@ -21,6 +22,7 @@ from torchface.progress import Progress, silent
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
 _MANY = 200
+_FORMAT = "torchface.gram-rows/1"
 
 
 def fit_sequence(
@@ -144,41 +146,29 @@ class _Rows:
         self._folder = folder
         if folder is None:
             return
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
-        key = f"{count} ".encode() + mean.numpy().tobytes()
-        path = folder / "mean.bin"
-        if not path.is_file() or read_file(path) != key:
-            self.remove()
-            folder.mkdir(exist_ok=True)
-            write_file(path, key)
+        make_folder(folder)
+        numbers = hashlib.sha256(f"{count} ".encode() + mean.numpy().tobytes()).hexdigest()
+        self._belongs_to = {"format": _FORMAT, "key": numbers}
 
     def read(self, number: int, rows: int, columns: int) -> Tensor | None:
         """The rows if they are there and whole."""
-        if self._folder is None or not (path := self._path(number)).is_file():
+        found = None if self._folder is None else read_checkpoint(self._path(number), self._belongs_to)
+        gram = None if found is None else found.get("rows")
+        if gram is None or gram.shape != (rows, columns) or gram.dtype != torch.float64:
             return None
-        try:
-            found = np.load(io.BytesIO(read_file(path)), allow_pickle=False)
-        except (ValueError, OSError, EOFError, FileFormatError):
-            return None  # what is damaged is computed again
-        right = found.shape == (rows, columns) and found.dtype == np.float64 and bool(np.isfinite(found).all())
-        return torch.from_numpy(found) if right else None
+        return gram if bool(torch.isfinite(gram).all()) else None
 
     def write(self, number: int, rows: Tensor) -> None:
         if self._folder is not None:
-            buffer = io.BytesIO()
-            np.save(buffer, rows.contiguous().numpy(), allow_pickle=False)
-            write_file(self._path(number), buffer.getbuffer())  # type: ignore[arg-type]
+            write_checkpoint(self._path(number), {"rows": rows}, self._belongs_to)
 
     def remove(self) -> None:
         if self._folder is not None and self._folder.is_dir():
-            for path in [*self._folder.glob("gram_*.npy"), self._folder / "mean.bin"]:
+            for path in self._folder.glob("gram_*"):
                 path.unlink(missing_ok=True)
             if not any(self._folder.iterdir()):
                 self._folder.rmdir()
 
     def _path(self, number: int) -> Path:
         assert self._folder is not None
-        return self._folder / f"gram_{number:05}.npy"
+        return self._folder / f"gram_{number:05}.safetensors"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +16,8 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.documents import Value, read_json, write_json
+from torchface.files.whole_files import write_file
 from torchface.registration.nonrigid.stage_record import RegistrationRecord
 
 _FORMAT = "torchface.registered-scan/1"
@@ -27,6 +27,10 @@ _COLUMNS = (
     "name", "status", "median_mm", "matched", "start", "start_mm", "landmarks", "seconds", "scan", "result", "remarks",
     "p95_mm", "shown", "covered", "stretch", "slid_mm",
 )  # fmt: skip
+_NUMBERS = {
+    "start_distance": "start_mm", "median_distance": "median_mm", "matched": "matched", "far_distance": "p95_mm",
+    "shown": "shown", "covered": "covered", "stretch": "stretch", "slid": "slid_mm",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -124,35 +128,24 @@ def write_record(
         "result_bytes": 0 if entry.result is None else entry.result.stat().st_size,
         "error": entry.error,
         "start": entry.start,
-        "start_mm": entry.start_distance,
-        "median_mm": entry.median_distance,
-        "matched": entry.matched,
-        "p95_mm": entry.far_distance,
-        "shown": entry.shown,
-        "covered": entry.covered,
-        "stretch": entry.stretch,
-        "slid_mm": entry.slid,
+        **{key: getattr(entry, name) for name, key in _NUMBERS.items()},
         "distances": "" if distances is None else _packed(distances),
         "landmarks": entry.landmarks,
         "notes": list(entry.notes),
         "seconds": entry.seconds,
         "stages": stages,
     }
-    write_file(record_path(folder, entry.name), json.dumps(_without_nan(document), indent=1).encode())
+    write_json(record_path(folder, entry.name), document)
 
 
 def finished_entry(task: CorpusTask, folder: Path) -> CorpusEntry | None:
     """What an earlier run made of the same scan; None where it made nothing, or anything has changed since."""
     path = record_path(folder, task.name)
-    if not path.is_file():
-        return None
     try:
-        document = json.loads(read_file(path, _LARGEST_RECORD))
-        entry = _entry(document, task, folder)
+        return _entry(read_json(path, _FORMAT, _LARGEST_RECORD), task, folder) if path.is_file() else None
     # A record that somebody has damaged is as good as none: the scan is registered again.
-    except (FileFormatError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OSError):
+    except (FileFormatError, OSError):
         return None
-    return entry
 
 
 def write_summary(entries: Sequence[CorpusEntry], path: Path) -> None:
@@ -185,9 +178,9 @@ def read_distances(folder: Path, name: str) -> Tensor | None:
     """The distance of each vertex of a result to its scan, (V,) millimetres, NaN where the scan does not show it; None
     where the record tells none."""
     try:
-        packed = json.loads(read_file(record_path(folder, name), _LARGEST_RECORD))["distances"]
+        packed = read_json(record_path(folder, name), max_bytes=_LARGEST_RECORD)["distances"].text()
         steps = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<u2")
-    except (FileFormatError, ValueError, TypeError, KeyError, RecursionError):
+    except (FileFormatError, ValueError):
         return None
     if not len(steps):
         return None
@@ -207,50 +200,25 @@ def _figures(entry: CorpusEntry) -> tuple[str, ...]:
     return tuple("" if math.isnan(x) or not entry.registered else f"{x:.4f}" for x in figures)
 
 
-def _entry(document: dict[str, Any], task: CorpusTask, folder: Path) -> CorpusEntry | None:
-    if document["format"] != _FORMAT or document["key"] != task.key or document["status"] != "registered":
-        return None if document["status"] != "skipped" or document["key"] != task.key else _skipped(document, task)
-    result = folder / f"{task.name}.glb"
-    if document["result"] != result.name or result.stat().st_size != document["result_bytes"]:
+def _entry(document: Value, task: CorpusTask, folder: Path) -> CorpusEntry | None:
+    if document["key"].found != task.key:
         return None
-    return replace(
-        _skipped(document, task),
-        result=result,
-        error="",
-        lasting=False,
-        start=str(document["start"]),
-        start_distance=_number(document["start_mm"]),
-        median_distance=_number(document["median_mm"]),
-        matched=_number(document["matched"]),
-        far_distance=_number(document["p95_mm"]),
-        shown=_number(document["shown"]),
-        covered=_number(document["covered"]),
-        stretch=_number(document["stretch"]),
-        slid=_number(document["slid_mm"]),
-        notes=tuple(map(str, document["notes"])),
-    )
-
-
-def _skipped(document: dict[str, Any], task: CorpusTask) -> CorpusEntry:
-    return CorpusEntry(
+    entry = CorpusEntry(
         task.name,
         task.scan,
-        error=str(document["error"]),
+        error=document["error"].text(),
         lasting=True,
-        landmarks=int(document["landmarks"]),
-        seconds=_number(document["seconds"]),
+        landmarks=document["landmarks"].whole(),
+        seconds=document["seconds"].number(),
         reused=True,
     )
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: null instead."""
-    if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if document["status"].found == "skipped":
+        return entry
+    result = folder / f"{task.name}.glb"
+    if document["result"].found != result.name or result.stat().st_size != document["result_bytes"].found:
+        return None
+    numbers: dict[str, Any] = {
+        name: document[key].number() if document[key] else math.nan for name, key in _NUMBERS.items()
+    }
+    start, notes = document["start"].text(), document["notes"].texts()
+    return replace(entry, result=result, error="", lasting=False, start=start, notes=notes, **numbers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.whole_files import write_file
+from torchface.files.documents import write_json
 from torchface.geometry.meshes.operators import components, corners
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.io.mesh_files import save_mesh
@@ -155,7 +154,7 @@ def write_scan(scan: RawScan, folder: str | Path, name: str) -> Path:
     groups = [{"label": label, "mask": list(rows)} for label, rows in _MENPO_GROUPS]
     landmarks = {"points": scan.ibug.tolist(), "connectivity": []}
     document = {"version": 2, "labels": groups, "landmarks": landmarks}
-    write_file(folder / f"{name}.ljson", json.dumps(document).encode())
+    write_json(folder / f"{name}.ljson", document, indent=None)
     save_mesh(scan.mesh, folder / f"{name}.obj")
     return folder / f"{name}.obj"
 

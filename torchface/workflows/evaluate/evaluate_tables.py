@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from torchface.files.whole_files import write_file
+from torchface.files.documents import write_json
 from torchface.io.tables.csv_table import write_table
 from torchface.workflows.evaluate.evaluation_result import Evaluation
 
@@ -45,7 +44,7 @@ def write_tables(evaluation: Evaluation, out: Path) -> None:
         write_table(out / "shapes.csv", ["shape", "mean", "largest", "correlation"], rows)
     else:
         (out / "shapes.csv").unlink(missing_ok=True)  # one of an earlier run would be of other files
-    write_file(out / "summary.json", json.dumps(summary(evaluation), indent=1).encode())
+    write_json(out / "summary.json", summary(evaluation))
 
 
 def summary(evaluation: Evaluation) -> dict[str, object]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.documents import read_json, write_json
+from torchface.files.whole_files import make_folder
 
 FOLDER = "state"
 """Where it lies in the folder of results."""
@@ -23,8 +22,7 @@ _RECORD = "track.json"
 _FORMAT = "torchface.track/1"
 _LANDMARKS = 68
 _BLOCK = 2**22
-_MAX_RECORD = 2**16
-_MAX_PIECE = 2**28
+_MAX_PIECE_BYTES = 2**28
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +95,10 @@ class TrackState:
         Raises:
             FileFormatError: the folder cannot be written to.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileFormatError(f"{self.folder}: cannot be made ({error.strerror})") from error
-        tensors = {"landmarks": piece.landmarks, "confidence": piece.confidence, "boxes": piece.boxes}
-        packed = {name: tensor.detach().cpu().float().contiguous() for name, tensor in tensors.items()}
-        metadata = {"format": _FORMAT, "key": self.key, "begin": str(self.done)}
-        write_file(self._path(len(self._pieces)), save(packed, metadata))
-        self._pieces.append(TrackedFrames(**packed))
+        make_folder(self.folder)
+        kept = TrackedFrames(*(tensor.float() for tensor in (piece.landmarks, piece.confidence, piece.boxes)))
+        write_checkpoint(self._path(len(self._pieces)), vars(kept), self._belongs_to())
+        self._pieces.append(kept)
 
     def is_current(self, product: Path, key: str) -> bool:
         """Whether a file is there and was made from what ``key`` says."""
@@ -114,7 +107,7 @@ class TrackState:
     def made(self, product: Path, key: str) -> None:
         """Notes that a complete file was made from what ``key`` says."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_file(self.folder / _RECORD, json.dumps({**self._record(), product.name: key}, indent=1).encode())
+        write_json(self.folder / _RECORD, {**self._record(), product.name: key})
 
     def clear(self) -> None:
         """Deletes everything; folders that are empty then go too."""
@@ -136,16 +129,16 @@ class TrackState:
 
     def _read(self, path: Path) -> TrackedFrames | None:
         """A piece, if it is one of this run and whole."""
-        data = read_file(path, _MAX_PIECE)
+        if path.stat().st_size > _MAX_PIECE_BYTES:
+            raise FileFormatError(f"{path}: found {path.stat().st_size} bytes, expected at most {_MAX_PIECE_BYTES}")
+        found = read_checkpoint(path, self._belongs_to())
         try:
-            length = int.from_bytes(data[:8], "little")
-            header = json.loads(data[8 : 8 + length])["__metadata__"]
-            expected = {"format": _FORMAT, "key": self.key, "begin": str(self.done)}
-            if header != expected:
-                return None
-            return TrackedFrames(**load(data))
-        except (SafetensorError, ShapeError, ValueError, KeyError, TypeError, RecursionError):
+            return None if found is None else TrackedFrames(**found)
+        except (ShapeError, TypeError):
             return None
+
+    def _belongs_to(self) -> dict[str, str]:
+        return {"format": _FORMAT, "key": self.key, "begin": str(self.done)}
 
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("landmarks_*.safetensors"))
@@ -155,10 +148,9 @@ class TrackState:
 
     def _record(self) -> dict[str, str]:
         try:
-            found = json.loads(read_file(self.folder / _RECORD, _MAX_RECORD))
-        except (FileFormatError, ValueError, RecursionError):
+            return {name: key.text() for name, key in read_json(self.folder / _RECORD).table().items()}
+        except FileFormatError:
             return {}  # what is not known is made anew
-        return found if isinstance(found, dict) else {}
 
 
 def digest(*parts: str) -> str:

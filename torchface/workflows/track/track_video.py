@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from torchface.capture.video.head_pose import HeadPoses, measure_poses, smooth_p
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
-from torchface.files.whole_files import write_file
+from torchface.files.documents import write_json
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io import load_rig
@@ -152,7 +151,7 @@ def track_video(
             write_overlay(tracked, out / OVERLAY, settings.texture, progress)
             seconds["overlay"] = time.perf_counter() - begin
             state.made(out / OVERLAY, overlay_key)
-    write_file(out / SUMMARY, json.dumps(summary(tracked), indent=1).encode())
+    write_json(out / SUMMARY, summary(tracked))
     return tracked
 
 
