@@ -27,7 +27,7 @@ def classifier() -> ActionUnitClassifier:
     groups: list[RegionGroup] = [GROUPS[0], GROUPS[3]]
     model = ActionUnitClassifier(groups, [GroupSize(5, 7), GroupSize(3, 2)], 24)
     for name, buffer in model.named_buffers():
-        if not any(part in name for part in ("gabor", "for_", "deviations", "intensities")):
+        if not any(part in name for part in ("gabor", "_class", "deviations", "intensities")):
             buffer.copy_(torch.randn(buffer.shape, generator=generator))
         elif "intensities" in name:
             buffer.copy_(torch.rand(buffer.shape, generator=generator))
