@@ -26,7 +26,7 @@ class Attachment:
         barycentric: weights of each triangle's corners, (M,3), rows sum to 1.
         labels: marker labels, no label twice; ``marker000``, ... if absent.
         residual: what was left between marker and surface, (M,3), millimetres.
-        fingerprint: ``Mesh.fingerprint()`` of the mesh it was made for, checked where known.
+        fingerprint: ``Mesh.fingerprint()`` of the mesh it was made for, checked where there is one.
 
     Raises:
         ShapeError, NameMismatchError, ValueRangeError: the parts do not fit each other.

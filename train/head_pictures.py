@@ -14,13 +14,13 @@ from torchface.modeling.morphable.model_quality import ModelQuality
 from torchface.progress import Progress
 from torchface.rendering.compositing import save_picture
 from torchface.viz.figures.model_figures import (
-    color_modes_picture,
-    far_picture,
-    modes_picture,
-    morph_picture,
-    quality_picture,
-    random_picture,
-    scatter_picture,
+    color_modes_figure,
+    extrapolation_figure,
+    modes_figure,
+    morph_figure,
+    quality_figure,
+    random_figure,
+    scatter_figure,
 )
 
 
@@ -51,17 +51,17 @@ def draw(
         for part in (learn, test)
     )
     pictures: dict[str, Callable[[], Tensor]] = {
-        "modes": lambda: modes_picture(model),
-        "random": lambda: random_picture(model, seed=seed),
-        "morph": lambda: morph_picture(model, seed=seed),
-        "far": lambda: far_picture(model, seed=seed),
+        "modes": lambda: modes_figure(model),
+        "random": lambda: random_figure(model, seed=seed),
+        "morph": lambda: morph_figure(model, seed=seed),
+        "far": lambda: extrapolation_figure(model, seed=seed),
     }
     if known is not None:
-        pictures["components"] = lambda: scatter_picture(model.shape, known, others)
+        pictures["components"] = lambda: scatter_figure(model.shape, known, others)
     if model.color is not None:
-        pictures["color_modes"] = lambda: color_modes_picture(model)
+        pictures["color_modes"] = lambda: color_modes_figure(model)
     if quality is not None:
-        pictures["quality"] = lambda: quality_picture(quality)
+        pictures["quality"] = lambda: quality_figure(quality)
     for number, (name, picture) in enumerate(pictures.items()):
         progress("drawing pictures", number, len(pictures))
         save_picture(picture(), folder / f"{name}.png")

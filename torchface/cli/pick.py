@@ -48,7 +48,7 @@ def pick(
     from torchface.mesh import Mesh, submesh
     from torchface.rig import BlendshapeRig
     from torchface.viz.browser.browser_page import import_viser
-    from torchface.viz.browser.landmark_sets import IBUG_68, TWELVE, free_set
+    from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
     from torchface.viz.browser.picker import Picker
 
     def read() -> Mesh | BlendshapeRig:
@@ -67,7 +67,7 @@ def pick(
         progress("reading")
         head = read()
         target = None if scan is None else load_mesh(scan, scan_unit)
-        wanted = free_set(names) if names else IBUG_68 if landmarks == "68" else TWELVE
+        wanted = custom_set(names) if names else IBUG_68 if landmarks == "68" else THESIS_12
         progress("opening the page")
         picker = Picker(head, target, out, wanted, mode, mesh.stem, port)
     console.print("Open this page; Ctrl+C ends.")

@@ -1,1 +1,1 @@
-"""What people look at: figures, reports that open from disk, pages in a browser."""
+"""Figures, reports that open from disk, pages in a browser."""

@@ -22,7 +22,7 @@ from torchface.registration.corpus.scan_record import CorpusEntry, read_distance
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_picture, sheet
 from torchface.viz.figures.face_views import frame_face
-from torchface.viz.figures.registration_views import distance_colors
+from torchface.viz.figures.heat_maps import error_colors
 from torchface.viz.figures.wireframe import lines_on_clay
 
 CONTACT_SHEET = "contact_sheet.png"
@@ -140,7 +140,7 @@ def _cell(entry: CorpusEntry, template: Mesh, folder: Path) -> Tensor:
             pictures = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
             distances = read_distances(folder, entry.name)
             if distances is not None and len(distances) == len(upright.vertices):
-                pictures.append(render(upright, camera, distance_colors(distances, _MOST), samples=1))
+                pictures.append(render(upright, camera, error_colors(distances, _MOST, "turbo"), samples=1))
             told = f"{entry.median_distance:.2f} mm on {entry.shown:.0%}"
             return caption(caption(sheet(pictures, 1), name, _TEXT), told, _TEXT)
         except FileFormatError:  # somebody has taken it away meanwhile

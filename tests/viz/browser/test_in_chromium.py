@@ -16,7 +16,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.browser.browser_page import SCALE
-from torchface.viz.browser.landmark_sets import free_set
+from torchface.viz.browser.landmark_sets import custom_set
 from torchface.viz.browser.picker import Picker
 from torchface.viz.browser.rig_viewer import RigViewer
 
@@ -174,7 +174,7 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
 @pytest.fixture
 def picker(chromium: Any, two_balls: Mesh, tmp_path) -> Iterator[Picker]:
     scan = two_balls.with_vertices(two_balls.vertices * 1.1 + torch.tensor([400.0, 30.0, -50.0]))
-    marks = free_set(["left ear", "right ear", "chin"])
+    marks = custom_set(["left ear", "right ear", "chin"])
     opened = Picker(two_balls, scan, tmp_path / "picks", marks, "landmarks", "picking", port=0)
     chromium.get(opened.url)
     shown(chromium, "/head/part0")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from torchface.rig import BlendshapeRig
-from torchface.viz.browser.origin_check import only_this_page, welcome
+from torchface.viz.browser.origin_check import is_allowed, only_this_page
 from torchface.viz.browser.rig_viewer import RigViewer
 
 
@@ -34,7 +34,7 @@ from torchface.viz.browser.rig_viewer import RigViewer
     ],
 )
 def test_who_is_welcome(host: str | None, origin: str | None, expected: bool) -> None:
-    assert welcome(host, origin, 8080) is expected
+    assert is_allowed(host, origin, 8080) is expected
 
 
 @pytest.fixture(scope="module")

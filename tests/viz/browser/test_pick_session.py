@@ -9,11 +9,11 @@ from torchface.io import load_mesh, load_rig
 from torchface.io.landmarks.picks import load_correspondences, load_landmarks
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
-from torchface.viz.browser.landmark_sets import IBUG_68, TWELVE, free_set
+from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
 from torchface.viz.browser.pick_saving import save_picks
 from torchface.viz.browser.pick_session import PickSession, SurfacePoint
 
-EARS = free_set(["chin", "left ear", "right ear"])
+EARS = custom_set(["chin", "left ear", "right ear"])
 
 
 def rays_at(mesh: Mesh, ids: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -33,7 +33,7 @@ def surface(session: PickSession, vertex: int) -> SurfacePoint:
 
 
 def test_landmark_sets_mirror_like_the_face_does() -> None:
-    for known in (IBUG_68, TWELVE):
+    for known in (IBUG_68, THESIS_12):
         mirror = torch.tensor(known.mirror)
         assert torch.equal(mirror[mirror], torch.arange(len(known.names)))
         for name, twin in zip(known.names, known.mirror, strict=True):

@@ -1,4 +1,4 @@
-"""The two ways a glTF file comes: one binary, or JSON with its buffers beside it or inside it."""
+"""The two forms of a glTF file: one binary, or JSON with its buffers beside it or inside it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchface.files.whole_files import read_file
 from torchface.io.gltf.buffers import BufferWriter
 
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
-_LARGEST_JSON = 2**26
-_LARGEST_JSON_WITH_BUFFERS = 2**28
+_MAX_JSON = 2**26
+_MAX_JSON_WITH_BUFFERS = 2**28
 _UNPACKED_ALWAYS = 2**26
 _UNPACKED_PER_BYTE = 64
 _SHORT = reprlib.Repr()
@@ -132,12 +132,12 @@ class Document:
         return memoryview(read_file(file))
 
     def reserve(self, size: int, where: str) -> None:
-        """Counts memory about to be taken; refuses what no honest file of this size unpacks to."""
+        """Counts memory about to be taken; refuses more than a file of this size can reasonably unpack to."""
         self._unpacked += size
         packed = sum(map(len, self._buffers.values()))
-        most = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * packed)
-        if self._unpacked > most:
-            raise self.error(where, f"data that unpacks to {self._unpacked} bytes", f"at most {most}")
+        limit = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * packed)
+        if self._unpacked > limit:
+            raise self.error(where, f"data that unpacks to {self._unpacked} bytes", f"at most {limit}")
 
     def _buffer(self, index: int) -> memoryview:
         if index not in self._buffers:
@@ -157,7 +157,7 @@ class Document:
 
 
 def read_document(path: str | Path) -> Document:
-    """Opens a ``.glb`` or ``.gltf``, whichever the bytes say it is.
+    """Opens a ``.glb`` or ``.gltf``, by its first bytes.
 
     Raises:
         FileFormatError: missing, empty, truncated, not glTF 2, or an extension it requires is not known.
@@ -170,7 +170,7 @@ def read_document(path: str | Path) -> Document:
         text, binary = data, None
         if not data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
             raise FileFormatError(f"{path}: found neither 'glTF' nor JSON at its start, expected a glTF 2.0 file")
-    largest = _LARGEST_JSON_WITH_BUFFERS if binary is None else _LARGEST_JSON
+    largest = _MAX_JSON_WITH_BUFFERS if binary is None else _MAX_JSON
     if len(text) > largest:
         raise FileFormatError(f"{path}: found {len(text)} bytes of JSON, expected at most {largest}")
     try:
@@ -196,7 +196,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
     if version != 2:
         raise FileFormatError(f"{path}: found glTF container version {version}, expected 2")
     if length > len(data):
-        raise FileFormatError(f"{path}: found {len(data)} bytes (truncated), expected the {length} its header tells")
+        raise FileFormatError(f"{path}: found {len(data)} bytes (truncated), expected the {length} its header names")
     at, text, binary = 12, None, None
     while at + 8 <= length:
         size, kind = struct.unpack_from("<II", data, at)

@@ -86,7 +86,7 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
     whole = rejoined(document, found)
     pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
-    picture = next((part.picture for _, part in found if part.picture is not None), None)
+    texture = next((part.texture for _, part in found if part.texture is not None), None)
     names = tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
     total = sum(len(piece.vertices) for piece in pieces)
     document.reserve((12 * len(names) + len(pieces)) * total, "the scene's morph targets")
@@ -96,14 +96,14 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     for piece in pieces:
         deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
         first += len(piece.vertices)
-    return _join(pieces, None if picture is None else read_texture(document, picture)), deltas, names
+    return _join(pieces, None if texture is None else read_texture(document, texture)), deltas, names
 
 
 def _piece(document: Document, instance: Instance, part: Part, scale: float) -> _Piece:
     place = f"meshes[{instance.mesh}].extras.torchface"
     joined = weld(part)
-    linear, shift = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
-    vertices = _moved(part.positions[joined.row_of], linear, shift)
+    linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
+    vertices = _moved(part.positions[joined.row_of], linear, translation)
     deltas = np.stack([_moved(delta[joined.row_of], linear) for delta in part.deltas]) if len(part.deltas) else None
     if not np.isfinite(vertices).all() or (deltas is not None and not np.isfinite(deltas).all()):
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
@@ -142,10 +142,10 @@ def _texture_coordinates(
 
 
 def _moved(
-    points: NDArray[np.float32], linear: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
+    points: NDArray[np.float32], linear: NDArray[np.float64], translation: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float32]:
     with np.errstate(over="ignore", invalid="ignore"):
-        return (points @ linear.T + shift).astype(np.float32)
+        return (points @ linear.T + translation).astype(np.float32)
 
 
 def _join(pieces: list[_Piece], texture: Tensor | None) -> Mesh:
@@ -176,7 +176,7 @@ def _starts(counts: list[int]) -> list[int]:
 
 
 def read_texture(document: Document, index: int) -> Tensor | None:
-    """The picture of a texture; none where only an extension has it."""
+    """The image of a texture; none where only an extension has it."""
     place = f"textures[{index}]"
     texture = document.item("textures", index, place)
     if texture.get("source") is None:

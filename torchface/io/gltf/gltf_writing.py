@@ -46,11 +46,11 @@ class ShapeMatch:
 def write_gltf_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
     """Writes a rig as ``.glb`` in metres.
 
-    Each part that a region's name tells (``region_materials``) is a primitive of its own material; an eyeball is a
+    Each part that is named by a region (``region_materials``) is a primitive of its own material; an eyeball is a
     mesh of its own under a node at its centre. Vertices are split at the borders of primitives and where texture
     coordinates differ, as glTF wants it; the attribute ``_VERTEX_ID`` and ``mesh.extras.torchface`` bring vertices,
     polygons and annotations back in their order. Morph targets carry positions and normals, sparse where that is
-    smaller; what moves less than 0.1 micrometre or turns less than a light of 8 bits shows is left out.
+    smaller; what moves less than 0.1 micrometre or rotates a normal less than 8 bits of shading show is left out.
 
     Args:
         rig: the rig.

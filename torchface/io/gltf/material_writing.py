@@ -31,27 +31,27 @@ class MaterialWriter:
 
     def add(self, surface: Surface) -> int:
         """The index of the material of a primitive."""
-        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": surface.material.roughness}
+        shading: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": surface.material.roughness}
         material: dict[str, Any] = {"name": surface.material.name, "doubleSided": True}
         if surface.color_source == "texture":
             assert self.mesh.texture is not None
-            look["baseColorTexture"] = {"index": self._texture(self.mesh.texture, "skin")}
+            shading["baseColorTexture"] = {"index": self._texture(self.mesh.texture, "skin")}
         elif surface.paint is not None and surface.paint.image is not None:
             name = f"{surface.part}_{surface.material.name}" if surface.part else surface.material.name
-            look["baseColorTexture"] = {"index": self._texture(surface.paint.image, name)}
+            shading["baseColorTexture"] = {"index": self._texture(surface.paint.image, name)}
         elif surface.color_source == "material" and surface.paint is None:
-            look["baseColorFactor"] = [*self._plain(surface), surface.material.opacity]
+            shading["baseColorFactor"] = [*self._plain(surface), surface.material.opacity]
         if surface.material.alpha != "OPAQUE":
             material["alphaMode"] = surface.material.alpha
-        material["pbrMetallicRoughness"] = look
+        material["pbrMetallicRoughness"] = shading
         materials = self.fields["materials"]
-        if material in materials and surface.material is not SKIN:  # normal maps lie on the first skin alone
+        if material in materials and surface.material is not SKIN:  # normal maps are on the first skin material alone
             return materials.index(material)
         materials.append(material)
         return len(materials) - 1
 
     def _plain(self, surface: Surface) -> list[float]:
-        """One colour in light; skin without its texels wears the mean of those that have some."""
+        """One colour in light; skin without texels takes the mean of the texture."""
         color = torch.tensor(surface.material.color)
         if surface.material is SKIN and self.mesh.texture is not None:
             color = self.mesh.texture.float().mean((1, 2))

@@ -23,11 +23,11 @@ def write_extras(mesh: Mesh) -> dict[str, Any]:
         sizes, _, _ = corners_of_polygons(mesh)
         start = np.flatnonzero(np.diff(sizes, prepend=-1))
         found["polygons"] = np.stack([sizes[start], np.diff(start, append=len(sizes))], axis=1).tolist()
-    notes = mesh.annotations
-    if notes is not None:
-        lists = {"landmarks": notes.landmarks, "mirror": notes.mirror, "contacts": notes.contacts}
+    annotations = mesh.annotations
+    if annotations is not None:
+        lists = {"landmarks": annotations.landmarks, "mirror": annotations.mirror, "contacts": annotations.contacts}
         found.update({name: tensor.tolist() for name, tensor in lists.items() if tensor is not None})
-        found["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in notes.regions.items()}
+        found["regions"] = {name: _runs(mask.cpu().numpy()) for name, mask in annotations.regions.items()}
     return found
 
 

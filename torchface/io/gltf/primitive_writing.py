@@ -17,11 +17,11 @@ from torchface.io.gltf.part_colors.surfaces import Surface
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Mesh
 
-STILL = 1e-4
-"""Millimetres; a vertex that a shape moves less than this is written as still."""
-STEADY = 1 / 256
-"""A normal that a shape turns less than this, in radians, is written as unturned: no light of 8 bits shows it."""
-_LARGEST_EXACT_ID = 2**24
+MIN_MOVE = 1e-4
+"""Millimetres; a vertex that a shape moves less than this is written as not moved."""
+MIN_ROTATION = 1 / 256
+"""Radians; a normal that a shape rotates less than this is written as unchanged, since 8 bits do not show it."""
+_MAX_EXACT_ID = 2**24
 
 
 class PrimitiveWriter:
@@ -65,23 +65,23 @@ class PrimitiveWriter:
             "indices": self.buffers.triangles(local),
             "material": material,
         }
-        if surface.paint is not None:  # what readers of meshes must not take for the mesh's own
+        if surface.paint is not None:  # so that readers do not take it for a texture of the mesh
             primitive["extras"] = {"torchface": {"painted": True}}
         self._written.append((primitive, vertices))
         return primitive
 
     def add_targets(self, deltas: Tensor) -> None:
-        """Morph targets (N,V,3), millimetres, for all primitives: what moves and how it turns."""
-        still = self.mesh.vertices.detach().double()
-        for delta in deltas.detach().cpu().double():  # a shape a turn: all normals at once would fill the memory
-            turned = (_normals(still + delta, self.mesh.faces) - self.normals).float().numpy()
-            turned *= np.einsum("ij,ij->i", turned, turned)[:, None] >= STEADY * STEADY
+        """Morph targets (N,V,3), millimetres, for all primitives: positions and normals."""
+        rest = self.mesh.vertices.detach().double()
+        for delta in deltas.detach().cpu().double():  # one shape at a time: all normals at once would fill the memory
+            rotated = (_normals(rest + delta, self.mesh.faces) - self.normals).float().numpy()
+            rotated *= np.einsum("ij,ij->i", rotated, rotated)[:, None] >= MIN_ROTATION * MIN_ROTATION
             moved = delta.float().numpy()
-            moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= STILL * STILL)
+            moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= MIN_MOVE * MIN_MOVE)
             for primitive, vertices in self._written:
                 target = {
                     "POSITION": self.buffers.deltas(metres(moved[vertices])),
-                    "NORMAL": self.buffers.deltas(turned[vertices]),
+                    "NORMAL": self.buffers.deltas(rotated[vertices]),
                 }
                 primitive.setdefault("targets", []).append(target)
 
@@ -105,7 +105,7 @@ class PrimitiveWriter:
             painted = surface.paint.colors[vertices]
             light = torch.cat([to_linear(painted[:, :3]), painted[:, 3:]], dim=1).numpy()
             attributes["COLOR_0"] = buffers.vertices(light)
-        if len(mesh.vertices) <= _LARGEST_EXACT_ID:
+        if len(mesh.vertices) <= _MAX_EXACT_ID:
             attributes["_VERTEX_ID"] = buffers.vertices(vertices.astype(np.float32))
         return attributes
 

@@ -16,7 +16,7 @@ from torchface.io.gltf.accessors import read_floats, read_indices
 from torchface.io.gltf.container import Document, shown
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_LARGEST_EXACT_ID = 2**24
+_MAX_EXACT_ID = 2**24
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Part:
         names: of the morph targets.
         triangles: (F,3) into the C vertices.
         uvs: (C,2), origin at the lower left.
-        colors: (C,3) in [0,1], encoded as pictures are.
+        colors: (C,3) in [0,1], encoded as images are.
         vertex_ids: (C,), which vertex of the mesh as authored each was split from.
-        picture: index of the texture of most triangles.
+        texture: index of the texture of most triangles.
         extras: the mesh's ``extras``.
     """
 
@@ -42,7 +42,7 @@ class Part:
     uvs: NDArray[np.float32] | None
     colors: NDArray[np.float32] | None
     vertex_ids: NDArray[np.int64] | None
-    picture: int | None
+    texture: int | None
     extras: dict[str, Any]
 
 
@@ -55,7 +55,7 @@ def read_part(document: Document, index: int) -> Part | None:
     place = f"meshes[{index}]"
     mesh = document.item("meshes", index, place)
     blocks: dict[str, _Block] = {}
-    triangles, pictures, first = [], [], 0
+    triangles, textures, first = [], [], 0
     for i, row in enumerate(document.array(mesh, "primitives", place)):
         primitive = document.record(row, f"{place}.primitives[{i}]")
         if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
@@ -67,16 +67,16 @@ def read_part(document: Document, index: int) -> Part | None:
             first += len(blocks[key].positions)
         corners = _read_triangles(document, primitive, f"{place}.primitives[{i}]", len(blocks[key].positions))
         triangles.append(corners + blocks[key].first)
-        painted = _painted(primitive)  # the picture is not the mesh's
-        picture = None if painted else _texture(document, primitive, f"{place}.primitives[{i}]")[0]
-        pictures.append((len(corners), picture))
+        painted = _painted(primitive)  # that texture is not of the mesh
+        texture = None if painted else _texture(document, primitive, f"{place}.primitives[{i}]")[0]
+        textures.append((len(corners), texture))
     if not blocks:
         return None
     rows = list(blocks.values())
     if len({len(block.deltas) for block in rows}) > 1:
         counts = [len(block.deltas) for block in rows]
         raise document.error(place, f"primitives of {counts} morph targets", "the same number in each")
-    has = [count for count, picture in pictures if picture is not None]
+    has = [count for count, texture in textures if texture is not None]
     return Part(
         np.concatenate([block.positions for block in rows]),
         np.concatenate([block.deltas for block in rows], axis=1),
@@ -85,7 +85,7 @@ def read_part(document: Document, index: int) -> Part | None:
         filled([block.uvs for block in rows], [len(block.positions) for block in rows], 0.0),
         filled([block.colors for block in rows], [len(block.positions) for block in rows], 1.0),
         None if any(block.vertex_ids is None for block in rows) else np.concatenate([b.vertex_ids for b in rows]),
-        next((picture for count, picture in pictures if has and count == max(has) and picture is not None), None),
+        next((texture for count, texture in textures if has and count == max(has) and texture is not None), None),
         document.record(mesh.get("extras"), f"{place}.extras") if isinstance(mesh.get("extras"), dict) else {},
     )
 
@@ -129,7 +129,7 @@ def _read_block(document: Document, primitive: dict[str, Any], place: str, first
     if "_VERTEX_ID" in attributes:
         numbers = read_floats(document, attributes["_VERTEX_ID"], f"{place}._VERTEX_ID", ("SCALAR",), count)[:, 0]
         whole = numbers == np.floor(numbers)
-        ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < _LARGEST_EXACT_ID))) else None
+        ids = numbers.astype(np.int64) if bool(np.all(whole & (numbers >= 0) & (numbers < _MAX_EXACT_ID))) else None
     return _Block(first, positions, deltas, uvs, colors, ids)
 
 

@@ -32,9 +32,9 @@ def rejoined(document: Document, found: Sequence[tuple[Instance, Part]]) -> tupl
     document.reserve(sum(part.deltas.nbytes + part.positions.nbytes for part in parts), "nodes")
     positions, deltas = [], []
     for instance, part in found:
-        linear, shift = instance.transform[:3, :3], instance.transform[:3, 3]
+        linear, translation = instance.transform[:3, :3], instance.transform[:3, 3]
         with np.errstate(over="ignore", invalid="ignore"):
-            positions.append((part.positions @ linear.T + shift).astype(np.float32))
+            positions.append((part.positions @ linear.T + translation).astype(np.float32))
             deltas.append((part.deltas @ linear.T).astype(np.float32))
     starts = [0, *accumulate(count[:-1])]
     whole = Part(
@@ -45,7 +45,7 @@ def rejoined(document: Document, found: Sequence[tuple[Instance, Part]]) -> tupl
         filled([part.uvs for part in parts], count, 0.0),
         filled([part.colors for part in parts], count, 1.0),
         np.concatenate([part.vertex_ids for part in parts if part.vertex_ids is not None]),
-        next((part.picture for part in parts if part.picture is not None), None),
+        next((part.texture for part in parts if part.texture is not None), None),
         first[1].extras,
     )
     return replace(first[0], transform=np.eye(4)), whole

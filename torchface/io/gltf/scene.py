@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchface.io.gltf.container import Document
 
-_MOST_INSTANCES = 4096
+_MAX_INSTANCES = 4096
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def instances(document: Document) -> list[Instance]:
     meshes = document.objects("meshes")
     nodes = document.objects("nodes")
     if not nodes:
-        return [Instance(i, _name(mesh, {}, i), np.eye(4)) for i, mesh in enumerate(meshes[:_MOST_INSTANCES])]
+        return [Instance(i, _name(mesh, {}, i), np.eye(4)) for i, mesh in enumerate(meshes[:_MAX_INSTANCES])]
     found = []
     for index, transform in _walk(document, nodes):
         node, place = nodes[index], f"nodes[{index}]"
@@ -49,8 +49,8 @@ def instances(document: Document) -> list[Instance]:
         mesh = document.item("meshes", node["mesh"], f"{place}.mesh")
         skinned = node.get("skin") is not None
         found.append(Instance(node["mesh"], _name(node, mesh, node["mesh"]), np.eye(4) if skinned else transform))
-        if len(found) > _MOST_INSTANCES:
-            raise document.error("nodes", f"more than {_MOST_INSTANCES} meshes in the scene", "a rig")
+        if len(found) > _MAX_INSTANCES:
+            raise document.error("nodes", f"more than {_MAX_INSTANCES} meshes in the scene", "a rig")
     return found
 
 

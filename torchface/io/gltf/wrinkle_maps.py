@@ -78,7 +78,7 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
     """The wrinkle maps of a ``.glb``; none where it has neither such maps nor a normal texture.
 
     Raises:
-        FileFormatError: not glTF 2, a broken list, pictures of different sizes, or more of them than the file can hold.
+        FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
     """
     document = read_document(path)
     listed, mesh = _listed(document)
@@ -89,15 +89,13 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
     found: list[Tensor] = []
     neutral = _normal_texture(document, mesh)
     for index in ([] if neutral is None else [neutral]) + [entry.get("texture") for entry in listed]:
-        picture = _picture(document, index)
-        unpacked += picture.numel() * 4
+        image = _image(document, index)
+        unpacked += image.numel() * 4
         if unpacked > allowed:
             raise document.error(_LIST, f"maps that unpack to {unpacked} bytes", f"at most {allowed}")
-        if found and picture.shape != found[0].shape:
-            raise document.error(
-                _LIST, f"maps of {tuple(picture.shape[1:])} and {tuple(found[0].shape[1:])}", "one size"
-            )
-        found.append(decode_normals(picture))
+        if found and image.shape != found[0].shape:
+            raise document.error(_LIST, f"maps of {tuple(image.shape[1:])} and {tuple(found[0].shape[1:])}", "one size")
+        found.append(decode_normals(image))
     if not found:
         return None
     shapes = found if neutral is None else found[1:]
@@ -136,10 +134,10 @@ def _normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
     return None
 
 
-def _picture(document: Document, index: object) -> Tensor:
+def _image(document: Document, index: object) -> Tensor:
     document.item("textures", index, f"{_LIST}.texture")
     assert isinstance(index, int)
-    picture = read_texture(document, index)
-    if picture is None:
+    image = read_texture(document, index)
+    if image is None:
         raise document.error(f"textures[{index}]", "no source", "a PNG or JPEG")
-    return picture
+    return image

@@ -15,7 +15,7 @@ from torchface.errors import FileFormatError, ShapeError, TopologyError
 from torchface.files.documents import read_json, write_json
 
 FORMAT = "torchface.mesh-sequence/1"
-_LARGEST_COUNT = 2**31
+_MAX_COUNT = 2**31
 
 
 class MeshSequence:
@@ -94,7 +94,7 @@ class MeshSequenceWriter:
     def __init__(
         self, path: str | Path, count: int, vertices: int, faces: Tensor, channels: int = 3, key: str = ""
     ) -> None:
-        if not (0 < count < _LARGEST_COUNT and vertices > 0 and channels > 0):
+        if not (0 < count < _MAX_COUNT and vertices > 0 and channels > 0):
             raise ShapeError(f"mesh sequence: found {count} meshes of ({vertices},{channels}), expected at least one")
         self.path, self.count, self.mesh_shape = Path(path), count, (vertices, channels)
         self._part = self.path.with_name(f"{self.path.name}.part")

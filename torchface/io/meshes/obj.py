@@ -18,18 +18,18 @@ from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh
 
-_LARGEST_MATERIAL_FILE = 2**20
+_MAX_MATERIAL_FILE = 2**20
 
 
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
-    """The mesh in an OBJ file: polygons, texture coordinates with seams, vertex colours, the material's picture.
+    """The mesh in an OBJ file: polygons, texture coordinates with seams, vertex colours, the material's image.
 
     Args:
-        path: the file; its material library and picture are looked for beside it, never outside its folder.
+        path: the file; its material library and image are looked for beside it, never outside its folder.
         unit: the file's unit, ``"mm"``, ``"cm"`` or ``"m"``.
 
     Raises:
-        FileFormatError: not an OBJ, no face, a number that is none, NaN, or a picture that cannot be read.
+        FileFormatError: not an OBJ, no face, a number that is none, NaN, or an image that cannot be read.
         TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
@@ -50,7 +50,7 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
 
 
 def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, unit: str = "mm") -> Tensor:
-    """The vertices (V,3) of a shape whose faces are those of ``neutral``; the fast way through many files.
+    """The vertices (V,3) of a shape whose faces are those of ``neutral``; fast for many files.
 
     Args:
         path: the shape's file.
@@ -274,24 +274,24 @@ def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
 
 
 def _texture(path: Path, lines: dict[str, list[bytes]]) -> Tensor | None:
-    """The picture of the first material in use that has one."""
-    pictures: dict[str, str] = {}
+    """The image of the first material in use that has one."""
+    images: dict[str, str] = {}
     for library in lines["mtllib"]:
         file = _beside(path, library)
         if file is None or not file.is_file():
             continue  # exporters name libraries that nobody passes on; the mesh is whole without
         material = ""
-        for line in read_file(file, _LARGEST_MATERIAL_FILE).decode("utf-8", "replace").splitlines():
+        for line in read_file(file, _MAX_MATERIAL_FILE).decode("utf-8", "replace").splitlines():
             words = line.split()
             if len(words) >= 2 and words[0] == "newmtl":
                 material = " ".join(words[1:])
             elif len(words) >= 2 and words[0] == "map_Kd":
-                pictures.setdefault(material, words[-1])
+                images.setdefault(material, words[-1])
     used = [name.decode("utf-8", "replace").strip() for name in dict.fromkeys(lines["usemtl"])]
-    for name in used or list(pictures):
-        picture = _beside(path, pictures[name].encode()) if name in pictures else None
-        if picture is not None and picture.is_file():
-            return load_image(picture)
+    for name in used or list(images):
+        image = _beside(path, images[name].encode()) if name in images else None
+        if image is not None and image.is_file():
+            return load_image(image)
     return None
 
 

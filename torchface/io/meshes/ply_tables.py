@@ -22,7 +22,7 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-_LARGEST_HEADER = 2**16
+_MAX_HEADER = 2**16
 
 
 @dataclass
@@ -59,7 +59,7 @@ def read_tables(path: Path, data: bytes) -> tuple[dict[str, dict[str, Any]], lis
 
 
 def _header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
-    end = data.find(b"end_header", 0, _LARGEST_HEADER)
+    end = data.find(b"end_header", 0, _MAX_HEADER)
     if data[:3] != b"ply" or end < 0:
         raise FileFormatError(f"{path}: found no PLY header, expected 'ply' ... 'end_header'")
     newline = data.find(b"\n", end)
@@ -135,13 +135,14 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
         raise _truncated(path, element, len(body) - at, f"at least {element.count}")
     plan = [(_width(order, kind), count, _width(order, count or kind)) for _, kind, count in element.properties]
     if any(count is not None and order and np.dtype(count).kind == "f" for _, count, _ in plan):
-        raise _truncated(path, element, len(body) - at, "an integer that tells a list's length")
+        raise _truncated(path, element, len(body) - at, "an integer that gives a list's length")
+    units = body if rows == 1 else body.tobytes() if order else body.tolist()  # quicker one by one
     found: list[tuple[int, int]] = []
     for _ in range(rows):  # where a row begins is known only after the one before
         for width, count, before in plan:
             length = 1
             if count is not None:
-                length = _length(body[at : at + before], order, count)
+                length = _length(units[at : at + before], order, count)
                 at += before
             found.append((at, length * width))
             at += length * width
@@ -150,10 +151,10 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
     return np.array(found, np.int64).reshape(rows, -1, 2)
 
 
-def _length(units: NDArray[Any], order: str, kind: str) -> int:
+def _length(units: Any, order: str, kind: str) -> int:
     """The length of a list; -1 for none that can be."""
     if order:
-        return int.from_bytes(units.tobytes(), "big" if order == ">" else "little", signed=kind[0] == "i")
+        return int.from_bytes(bytes(units), "big" if order == ">" else "little", signed=kind[0] == "i")
     value = float(units[0]) if len(units) else -1.0
     return int(value) if value.is_integer() else -1
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.mesh import Mesh
 
-_LARGEST_TABLE = 10_000_000
+_MAX_TABLE = 10_000_000
 
 
 def pad_polygons(source: str, sizes: NDArray[np.int64], corners: NDArray[np.int64]) -> Tensor:
@@ -20,10 +20,10 @@ def pad_polygons(source: str, sizes: NDArray[np.int64], corners: NDArray[np.int6
         FileFormatError: one polygon has so many corners that the padded table would fill the memory.
     """
     widest = int(sizes.max())
-    if len(sizes) * widest > max(_LARGEST_TABLE, 16 * len(corners)):
+    if len(sizes) * widest > max(_MAX_TABLE, 16 * len(corners)):
         raise FileFormatError(
             f"{source}: found a polygon of {widest} corners among {len(sizes)} faces, "
-            f"expected at most {max(_LARGEST_TABLE, 16 * len(corners)) // len(sizes)} corners; triangulate it"
+            f"expected at most {max(_MAX_TABLE, 16 * len(corners)) // len(sizes)} corners; triangulate it"
         )
     padded = np.full((len(sizes), widest), -1, dtype=np.int64)
     padded[np.arange(widest) < sizes[:, None]] = corners

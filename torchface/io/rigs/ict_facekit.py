@@ -23,7 +23,7 @@ from torchface.rig import BlendshapeRig
 
 NEUTRAL = "generic_neutral_mesh"
 _INDICES = "vertex_indices.json"
-_LARGEST_INDICES = 2**24
+_MAX_INDICES = 2**24
 _UNIT = "cm"
 _VERTICES = 26_719
 _LAST_VERTEX = {
@@ -180,7 +180,7 @@ def _parts(count: int) -> dict[str, Tensor]:
 def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: bytes | None, unit: str) -> Tensor:
     deltas = torch.empty(len(names), *neutral.vertices.shape)
     at_rest = neutral.vertices.numpy()
-    for row, name in zip(deltas.numpy(), names, strict=True):  # a file a turn
+    for row, name in zip(deltas.numpy(), names, strict=True):  # one file each
         path = folder / f"{name}.obj"
         if Path(name).name != name or not path.is_file():
             have = sorted(file.stem for file in folder.glob("*.obj"))
@@ -190,7 +190,7 @@ def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: by
 
 
 def _read_indices(folder: Path) -> dict[str, list]:
-    document = read_json(folder / _INDICES, max_bytes=_LARGEST_INDICES)
+    document = read_json(folder / _INDICES, max_bytes=_MAX_INDICES)
     document["expressions"].texts()
     document["idx_to_landmark_verts"].tensor(None, dtype=torch.int64, expected="a list of vertex ids")
     return document.found

@@ -10,15 +10,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-_FARTHEST = 1.0
-_MOST_UNCERTAIN = 1000
+_MAX_DISTANCE = 1.0
+_MAX_UNMATCHED = 1000
 
 
 def mirror_by_parts(vertices: Tensor, parts: dict[str, Tensor]) -> Tensor | None:
     """The mirror map (V,) of a head whose parts lie apart, left ones named ``..._left`` and right ones ``..._right``.
 
     Left and right parts go by the order of their vertices where that fits, else, as parts on the midline, by nearest
-    place; vertices that lie on each other are shared out so that the map is its own inverse.
+    place; vertices that lie on each other are matched one to one so that the map is its own inverse.
 
     Args:
         vertices: (V,3), millimetres, mirrored in x.
@@ -40,7 +40,7 @@ def mirror_by_parts(vertices: Tensor, parts: dict[str, Tensor]) -> Tensor | None
             return None
         twin[a], twin[b[image]] = b[image], a
     whole = bool((twin >= 0).all()) and np.array_equal(twin[twin], np.arange(len(twin)))
-    if not whole or np.linalg.norm(flipped - points[twin], axis=1).max() > _FARTHEST:
+    if not whole or np.linalg.norm(flipped - points[twin], axis=1).max() > _MAX_DISTANCE:
         return None
     return torch.from_numpy(twin)
 
@@ -49,13 +49,13 @@ def _images(flipped: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
     """For each flipped point its place among ``points``, each taken once."""
     if len(flipped) != len(points):
         return None
-    if np.linalg.norm(flipped - points, axis=1).max() <= _FARTHEST:
+    if np.linalg.norm(flipped - points, axis=1).max() <= _MAX_DISTANCE:
         return np.arange(len(points))
-    there, back = cKDTree(points).query(flipped)[1], cKDTree(flipped).query(points)[1]
-    sure = back[there] == np.arange(len(points))
-    left, right = np.flatnonzero(~sure), np.setdiff1d(np.arange(len(points)), there[sure])
-    if len(left) > _MOST_UNCERTAIN:
+    forward, backward = cKDTree(points).query(flipped)[1], cKDTree(flipped).query(points)[1]
+    mutual = backward[forward] == np.arange(len(points))
+    left, right = np.flatnonzero(~mutual), np.setdiff1d(np.arange(len(points)), forward[mutual])
+    if len(left) > _MAX_UNMATCHED:
         return None
     rows, columns = linear_sum_assignment(cdist(flipped[left], points[right]))
-    there[left[rows]] = right[columns]
-    return there
+    forward[left[rows]] = right[columns]
+    return forward

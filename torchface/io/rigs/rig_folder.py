@@ -21,7 +21,7 @@ from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices, wri
 from torchface.rig import BlendshapeRig
 
 NEUTRAL, NOTES = "neutral", "rig.json"
-_LARGEST_NOTES = 2**26
+_MAX_NOTES = 2**26
 
 
 def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = None) -> BlendshapeRig:
@@ -89,7 +89,7 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
         part.mkdir()
         _write(rig, part, detail)
         folder.mkdir(exist_ok=True)
-        for path in sorted(part.iterdir()):  # a file a turn
+        for path in sorted(part.iterdir()):  # one file each
             os.replace(path, folder / path.name)
     except OSError as error:
         raise FileFormatError(f"{folder}: cannot be written ({error.strerror})") from error
@@ -118,10 +118,10 @@ def _check_names(rig: BlendshapeRig, folder: Path) -> None:
         if not name or Path(name).name != name or name.startswith(".") or "\0" in name or name.lower() == NEUTRAL:
             raise NameMismatchError(f"{folder}: found a shape {name!r}, expected file names; write a .glb instead")
     there = [path.name for path in folder.glob("*.obj")] if folder.is_dir() else []
-    strange = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *rig.names)]
-    if strange:
+    others = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *rig.names)]
+    if others:
         raise FileFormatError(
-            f"{folder}: found OBJ files of another rig ({', '.join(strange[:3])}), expected an empty or a new folder"
+            f"{folder}: found OBJ files of another rig ({', '.join(others[:3])}), expected an empty or a new folder"
         )
 
 
@@ -129,6 +129,6 @@ def _read_notes(folder: Path) -> Document | None:
     path = folder / NOTES
     if not path.is_file():
         return None
-    root = read_json(path, max_bytes=_LARGEST_NOTES)
+    root = read_json(path, max_bytes=_MAX_NOTES)
     root.table(expected="a rig's notes")
     return Document(path, root.found)

@@ -16,7 +16,7 @@ class AnnotationSession:
     """Frames whose landmarks a user corrects one after another.
 
     Args:
-        frames: pictures with the landmarks to start from.
+        frames: images with the landmarks to start from.
         folder: where :meth:`save` writes to.
         saved: names of frames whose landmarks are the user's own already.
 
@@ -30,7 +30,7 @@ class AnnotationSession:
         self.frames, self.folder = list(frames), Path(folder)
         self.saved = {frame.name for frame in frames} & set(saved)
         self._history = [[frame.landmarks.double().clone()] for frame in frames]
-        self._held: tuple[int, Tensor] | None = None
+        self._grabbed: tuple[int, Tensor] | None = None
         self.number = self._next_unsaved(-1) or 0
 
     @property
@@ -50,56 +50,56 @@ class AnnotationSession:
 
     @property
     def extent(self) -> float:
-        """How large the face is in the picture: root mean square distance of the landmarks from their centre."""
+        """How large the face is in the image: root mean square distance of the landmarks from their centre."""
         points = self.frame.landmarks
         return float((points - points.mean(0)).square().sum(1).mean().sqrt())
 
     def show(self, number: int) -> None:
-        """Turns to another frame.
+        """Switches to another frame.
 
         Raises:
             ValueRangeError: there is no such frame.
         """
         if not 0 <= number < len(self.frames):
             raise ValueRangeError(f"frame: found {number}, expected 0 to {len(self.frames) - 1}")
-        self.number, self._held = number, None
+        self.number, self._grabbed = number, None
 
     def grab(self, row: int) -> None:
         """Takes hold of a landmark: what follows until it is let go is one step of undo."""
         self._check(row)
-        self._held = (row, self.landmarks.clone())
+        self._grabbed = (row, self.landmarks.clone())
         self._history[self.number].append(self.landmarks.clone())
 
     def drag(self, place: Tensor, reach: float = 0.0) -> None:
-        r"""Moves the landmark that is held; others follow with :math:`e^{-d^2 / 2r^2}` of its way.
+        r"""Moves the landmark that is grabbed; others follow with :math:`e^{-d^2 / 2r^2}` of its motion.
 
         Args:
-            place: where to, (2,) pixels; kept inside the picture.
+            place: where to, (2,) pixels; kept inside the image.
             reach: r, pixels, d being the distance at which another one was when this one was grabbed; 0 moves this one
                 alone.
 
         Raises:
-            ValueRangeError: none is held, or the place is no place.
+            ValueRangeError: none is grabbed, or the place is not finite.
         """
-        if self._held is None:
-            raise ValueRangeError("drag: found no landmark held, expected grab() first")
+        if self._grabbed is None:
+            raise ValueRangeError("drag: found no landmark grabbed, expected grab() first")
         if not bool(torch.isfinite(place).all()):
             raise ValueRangeError(f"drag: found the place {place.tolist()}, expected finite pixels")
-        row, before = self._held
+        row, before = self._grabbed
         height, width = self.frame.image.shape[-2:]
-        way = torch.minimum(place.double().clamp(min=0), torch.tensor([width - 1.0, height - 1.0]).double())
+        target = torch.minimum(place.double().clamp(min=0), torch.tensor([width - 1.0, height - 1.0]).double())
         apart = (before - before[row]).square().sum(1)
-        share = torch.exp(-apart / (2 * reach**2)) if reach > 0 else torch.zeros(len(before), dtype=torch.float64)
-        share[row] = 1.0
-        self._history[self.number][-1] = before + share[:, None] * (way - before[row])
+        weight = torch.exp(-apart / (2 * reach**2)) if reach > 0 else torch.zeros(len(before), dtype=torch.float64)
+        weight[row] = 1.0
+        self._history[self.number][-1] = before + weight[:, None] * (target - before[row])
 
     def let_go(self) -> None:
         """Ends a drag."""
-        self._held = None
+        self._grabbed = None
 
     def undo(self) -> bool:
         """Takes this frame's last step back; false where there is none."""
-        self._held = None
+        self._grabbed = None
         if self.steps:
             self._history[self.number].pop()
             return True
@@ -107,11 +107,11 @@ class AnnotationSession:
 
     def reset(self) -> None:
         """Brings the landmarks back that the frame came with; can be undone."""
-        self._held = None
+        self._grabbed = None
         self._history[self.number].append(self._history[self.number][0].clone())
 
     def save(self) -> Path:
-        """Writes the frame's picture and landmarks.
+        """Writes the frame's image and landmarks.
 
         Raises:
             FileFormatError: the folder cannot be written to.
@@ -122,7 +122,7 @@ class AnnotationSession:
         return path
 
     def advance(self) -> bool:
-        """Turns to the next frame that is not saved yet; false, and stays, where all are."""
+        """Switches to the next frame that is not saved yet; false, and stays, where all are."""
         following = self._next_unsaved(self.number)
         if following is not None:
             self.show(following)

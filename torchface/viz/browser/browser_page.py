@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from torchface.errors import TorchfaceError
 from torchface.files.extra_packages import import_extra
 from torchface.mesh import Mesh
 from torchface.viz.browser.origin_check import only_this_page
@@ -60,10 +62,48 @@ def start_server(label: str, port: int = 8080) -> viser.ViserServer:
     return server
 
 
-def stop_server(server: viser.ViserServer) -> None:
-    """Closes the page and its port."""
-    with _quiet():
-        server.stop()
+class BrowserPage:
+    """A page and its server, until it is closed.
+
+    Args:
+        label: heads the panel.
+        port: the first to try, 0 for any.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+    """
+
+    def __init__(self, label: str, port: int) -> None:
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self.server = start_server(label, port)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Closes the page."""
+        self._stopped.set()
+        with _quiet():
+            self.server.stop()
+
+    def wait(self) -> None:
+        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
+        self._stopped.wait()
+
+    def _add_save_button(self, label: str, hint: str, save: Callable[[], str]) -> None:
+        """A button that saves and notifies whoever clicked it of the files, or of what went wrong."""
+
+        def clicked(event: viser.GuiEvent) -> None:
+            assert event.client is not None
+            try:
+                event.client.add_notification("Saved", save(), auto_close_seconds=6.0, color="teal")
+            except (TorchfaceError, OSError) as error:
+                event.client.add_notification("Not saved", str(error), color="red")
+
+        self.server.gui.add_button(label, icon=icon("DEVICE_FLOPPY"), hint=hint).on_click(clicked)
 
 
 def icon(name: str) -> Any:

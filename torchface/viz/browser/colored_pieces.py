@@ -7,18 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.cluster.vq import kmeans2
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from torchface.geometry.meshes.operators import components
 from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY
 
-_MOST_COMPONENTS = 16
-_MOST_COLORS = 6
-_SAME_COLOR = 0.12
-_SMALLEST_SHARE = 0.004
+_MAX_COMPONENTS = 16
+_MAX_COLORS = 6
+_MIN_COLOR_DISTANCE = 0.12
+_MIN_FRACTION = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +46,13 @@ def split_parts(mesh: Mesh) -> list[Part]:
     component = _components(mesh)
     classes, palette = _color_classes(colors)
     piece = torch.where(shown, component * len(palette) + classes, -1)
-    # A handful of triangles of a stray colour would cost a part of their own: they take their component's main one.
+    # A few triangles of a stray colour do not deserve a part of their own: they take their component's main one.
     for number in component.unique().tolist():
         members = (component == number) & shown
         if not members.any():
             continue
         counts = torch.bincount(classes[members], minlength=len(palette))
-        stray = counts < _SMALLEST_SHARE * len(mesh.faces)
+        stray = counts < _MIN_FRACTION * len(mesh.faces)
         piece[members & stray[classes]] = number * len(palette) + int(counts.argmax())
     parts = []
     for label in piece.unique().tolist():
@@ -98,23 +97,20 @@ def _triangle_colors(mesh: Mesh) -> tuple[Tensor, Tensor]:
 
 def _components(mesh: Mesh) -> Tensor:
     """A number a triangle; the smaller components share the last."""
-    faces = mesh.faces.numpy()
-    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    links = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
-    label = torch.from_numpy(connected_components(links, directed=False)[1].astype(np.int64))[mesh.faces[:, 0]]
+    label = components(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
     size = torch.bincount(label)
     rank = torch.empty_like(size)
     rank[size.argsort(descending=True, stable=True)] = torch.arange(len(size))
-    return rank[label].clamp(max=_MOST_COMPONENTS - 1)
+    return rank[label].clamp(max=_MAX_COMPONENTS - 1)
 
 
 def _color_classes(colors: Tensor) -> tuple[Tensor, Tensor]:
     """A class (F,) and the palette (K,3): k-means from colours that lie far from each other."""
     points = colors.double().numpy()
     centres = [points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]]
-    while len(centres) < _MOST_COLORS:
+    while len(centres) < _MAX_COLORS:
         distance = np.min([np.linalg.norm(points - centre, axis=1) for centre in centres], axis=0)
-        if distance.max(initial=0.0) < _SAME_COLOR:
+        if distance.max(initial=0.0) < _MIN_COLOR_DISTANCE:
             break
         centres.append(points[distance.argmax()])
     palette, label = kmeans2(points, np.stack(centres), minit="matrix", missing="warn")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-_MOST_SHAPES = 8
+_MAX_SHAPES = 8
 
 
 def shape_list(active: Sequence[tuple[str, float]]) -> str:
@@ -17,12 +17,12 @@ def shape_list(active: Sequence[tuple[str, float]]) -> str:
         f'<span style="display:block;height:100%;border-radius:2px;background:#2e5c8a;'
         f'width:{100 * min(abs(weight), 1.0):.0f}%"></span></span>'
         f'<span style="flex:0 0 3em;text-align:right">{weight:.2f}</span></div>'
-        for name, weight in active[:_MOST_SHAPES]
+        for name, weight in active[:_MAX_SHAPES]
     ]
-    more = f"and {len(active) - _MOST_SHAPES} more" if len(active) > _MOST_SHAPES else ""
+    more = f"and {len(active) - _MAX_SHAPES} more" if len(active) > _MAX_SHAPES else ""
     rest = more if active else "No shape is active."
     # Without a fixed height the sliders below would jump while a take plays.
-    height = f"height:{1.35 * (_MOST_SHAPES + 1):.2f}em"
+    height = f"height:{1.35 * (_MAX_SHAPES + 1):.2f}em"
     return f'<div style="padding:0.2em 0.75em;font-size:0.8em;{height}">{"".join(rows)}{_grey(rest)}</div>'
 
 

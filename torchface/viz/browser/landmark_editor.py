@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from torchface.errors import TorchfaceError
 from torchface.viz.browser.annotation_session import AnnotationSession
-from torchface.viz.browser.browser_page import HOST, icon, start_server, stop_server
+from torchface.viz.browser.browser_page import BrowserPage, icon
 from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 _VIEW = math.radians(30.0)
 _FACE = 1.0  # units of the page that a face's size is shown at
 _DOT = 0.024
-_LIFT = 0.01  # dots lie this much before the picture, lines half of it
+_LIFT = 0.01  # dots lie this much before the image, lines half of it
 _PARTS = (
     (slice(0, 17), (80, 200, 255)),
     (slice(17, 27), (255, 170, 60)),
@@ -45,11 +44,11 @@ _LINES = (
 )
 
 
-class LandmarkEditor:
+class LandmarkEditor(BrowserPage):
     """Frames in the browser, their landmarks to be dragged.
 
-    A dot is dragged, or chosen by a click; a click on the picture brings the chosen one there. *Save* writes the
-    frame's files and turns to the next.
+    A dot is dragged, or chosen by a click; a click on the image brings the chosen one there. *Save* writes the
+    frame's files and switches to the next.
 
     Args:
         session: the frames.
@@ -61,13 +60,11 @@ class LandmarkEditor:
     """
 
     def __init__(self, session: AnnotationSession, label: str = "torchface annotate", port: int = 8080) -> None:
+        super().__init__(label, port)
         self.session = session
         self.chosen: int | None = None
         self._offset = torch.zeros(2, dtype=torch.float64)
-        self._lock = threading.RLock()
-        self._stopped = threading.Event()
         self._showing = False
-        self.server = start_server(label, port)
         self.server.scene.remove_by_name("/light")  # it models form; dots have a colour each
         self.server.scene.add_light_ambient("/light/even", intensity=2.0)
         self._dots: Any = None
@@ -77,31 +74,17 @@ class LandmarkEditor:
         self.server.scene.on_click()(self._clicked)
         self.server.on_client_connect(self._straighten)
 
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f"http://{HOST}:{self.server.get_port()}"
-
-    def stop(self) -> None:
-        """Closes the page."""
-        self._stopped.set()
-        stop_server(self.server)
-
-    def wait(self) -> None:
-        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
-        self._stopped.wait()
-
     def to_page(self, pixels: Tensor) -> Tensor:
-        """Where pixels (...,2) of the picture lie in the page's scene, (...,2) along x and y."""
+        """Where pixels (...,2) of the image lie in the page's scene, (...,2) along x and y."""
         return (pixels.double() - self._middle) * torch.tensor([self._unit, -self._unit], dtype=torch.float64)
 
-    def to_pixels(self, origin: Tensor, way: Tensor) -> Tensor:
-        """Where a ray of the scene, origin (3,) and direction (3,), meets the picture, (2,) pixels."""
-        reached = origin - way * (origin[2] / way[2])
+    def to_pixels(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """Where a ray of the scene, origin (3,) and direction (3,), meets the image, (2,) pixels."""
+        reached = origin - direction * (origin[2] / direction[2])
         return reached[:2] / torch.tensor([self._unit, -self._unit], dtype=torch.float64) + self._middle
 
     def save(self) -> str:
-        """Writes the frame, turns to the next that is not saved, and says so."""
+        """Writes the frame, switches to the next that is not saved, and returns where to."""
         with self._lock:
             path = self.session.save()
             more = self.session.advance()
@@ -123,7 +106,7 @@ class LandmarkEditor:
         with gui.add_folder("Frame"):
             self._status = gui.add_html("")
             self._frame: Any = gui.add_dropdown("Frame", [frame.name for frame in session.frames])
-            save = gui.add_button("Save and next", icon=icon("DEVICE_FLOPPY"), hint=f"Writes to {session.folder}")
+            self._add_save_button("Save and next", f"Writes to {session.folder}", self.save)
             undo = gui.add_button("Undo", icon=icon("ARROW_BACK_UP"))
             reset = gui.add_button("As proposed", icon=icon("REFRESH"))
             straight = gui.add_button("Straight view", icon=icon("FOCUS_CENTERED"))
@@ -133,7 +116,6 @@ class LandmarkEditor:
                 "Others follow", 0.0, 1.0, 0.02, 0.0, hint="How far around a dragged landmark the others go along"
             )
         self._frame.on_update(lambda _: self._frame_chosen())
-        save.on_click(self._save_clicked)
         undo.on_click(lambda _: self._change(self.session.undo))
         reset.on_click(lambda _: self._change(self.session.reset))
         straight.on_click(lambda event: self._straighten(event.client))
@@ -157,9 +139,9 @@ class LandmarkEditor:
         height, width = image.shape[:2]
         scene = self.server.scene
         with self.server.atomic():
-            # Turned about x: an image's rows run along y, which the page shows upward.
+            # Rotated about x: an image's rows run along y, which the page shows upward.
             scene.add_image(
-                "/picture", image, width * self._unit, height * self._unit,
+                "/image", image, width * self._unit, height * self._unit,
                 wxyz=(0.0, 1.0, 0.0, 0.0), cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             for handle in (self._dots, self._lines):
@@ -232,7 +214,7 @@ class LandmarkEditor:
                 self.session.drag(
                     self._under(eye, event.end_position) + self._offset, self._reach.value * self.session.extent
                 )
-            except TorchfaceError:  # an undo in between has let it go, or the pointer left the picture's plane
+            except TorchfaceError:  # an undo in between has let it go, or the pointer left the image's plane
                 return
             if event.phase == "end":
                 self.session.let_go()
@@ -247,11 +229,11 @@ class LandmarkEditor:
             self._refresh()
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """Brings the chosen landmark to a click on the picture; a click on a dot has just chosen it."""
+        """Brings the chosen landmark to a click on the image; a click on a dot has just chosen it."""
         origin = torch.tensor(event.ray_origin, dtype=torch.float64)
-        way = torch.tensor(event.ray_direction, dtype=torch.float64)
+        direction = torch.tensor(event.ray_direction, dtype=torch.float64)
         with self._lock:
-            place = self.to_pixels(origin, way)
+            place = self.to_pixels(origin, direction)
             near = (self.session.landmarks - place).norm(dim=1)
             if self.chosen is None or float(near.min()) * self._unit < _DOT:
                 return
@@ -263,15 +245,8 @@ class LandmarkEditor:
             self.session.let_go()
             self._refresh()
 
-    def _save_clicked(self, event: viser.GuiEvent) -> None:
-        assert event.client is not None
-        try:
-            event.client.add_notification("Saved", self.save(), auto_close_seconds=6.0, color="teal")
-        except (TorchfaceError, OSError) as error:
-            event.client.add_notification("Not saved", str(error), color="red")
-
     def _straighten(self, client: viser.ClientHandle | None) -> None:
-        """Puts a visitor's camera straight before the face."""
+        """Puts a client's camera straight before the face."""
         if client is None:
             return
         centre = self.to_page(self.session.landmarks).mean(0)
@@ -286,8 +261,8 @@ class LandmarkEditor:
 
 def _disc(radius: float, corners: int = 20) -> tuple[np.ndarray, np.ndarray]:
     """A round plate in the plane of x and y: vertices and triangles."""
-    turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    rim = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(corners)], axis=1)
+    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
     vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
     following = np.roll(np.arange(corners), -1)
     faces = np.stack([np.zeros(corners, dtype=int), 1 + np.arange(corners), 1 + following], axis=1)

@@ -53,7 +53,7 @@ IBUG_68 = LandmarkSet(
 )
 """iBUG's 68 in their order, which begins at the performer's right ear."""
 
-TWELVE = LandmarkSet(
+THESIS_12 = LandmarkSet(
     (
         *("nose tip", "between the eyes", "right eye outer corner", "right eye inner corner"),
         *("left eye inner corner", "left eye outer corner", "right cheek", "left cheek"),
@@ -64,11 +64,11 @@ TWELVE = LandmarkSet(
 """The twelve of the thesis, section 3.2.2."""
 
 
-def free_set(names: Sequence[str]) -> LandmarkSet:
-    """A set of one's own; a name with ``left`` in it mirrors the one with ``right`` there instead.
+def custom_set(names: Sequence[str]) -> LandmarkSet:
+    """A set of the user's own names; a name with ``left`` in it mirrors the one with ``right`` there instead.
 
     Example:
-        >>> free_set(["chin", "left ear", "right ear"]).mirror
+        >>> custom_set(["chin", "left ear", "right ear"]).mirror
         (0, 2, 1)
     """
     row = {name: i for i, name in enumerate(names)}

@@ -1,4 +1,4 @@
-"""Who may speak to the page: the page itself, and no other that is open in the same browser."""
+"""Requests that a page answers: its own, and none of another page in the same browser."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 _HOSTS = ("127.0.0.1", "localhost")
 _TITLE = b"<title>Viser</title>"
-_ALONE = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
+_NO_FRAMING = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
 _starting = threading.Lock()
 
 Serve = Callable[["ServerConnection", "Request"], "Response | None"]
 
 
-def welcome(host: str | None, origin: str | None, port: int) -> bool:
+def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
     """Whether a request may be answered.
 
-    A browser says in ``Origin`` which page opens a connection, and in ``Host`` by which name it found this machine: a
+    A browser sends in ``Origin`` which page opens a connection, and in ``Host`` by which name it found this machine: a
     foreign page has another origin, and one whose name was made to point at 127.0.0.1 has another host. Programs that
     are no browsers send no origin; they could do as they like anyway.
 
@@ -65,7 +65,7 @@ def _guarded(answer: Serve, title: str) -> Serve:
         # Twice the same header is nothing that a browser sends, and get() would raise.
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         port = connection.local_address[1]
-        if len(hosts) != 1 or len(origins) > 1 or not welcome(hosts[0], origins[0] if origins else None, port):
+        if len(hosts) != 1 or len(origins) > 1 or not is_allowed(hosts[0], origins[0] if origins else None, port):
             return connection.respond(HTTPStatus.FORBIDDEN, "This page is for this machine's own browser alone.\n")
         document = request.path.partition("?")[0] in ("/", "/index.html")
         if document and "Accept-Encoding" in request.headers:
@@ -73,7 +73,7 @@ def _guarded(answer: Serve, title: str) -> Serve:
             del request.headers["Accept-Encoding"]
         response = answer(connection, request)
         if response is not None:
-            for name, value in _ALONE.items():
+            for name, value in _NO_FRAMING.items():
                 response.headers[name] = value
             if document and response.body is not None:
                 response.body = response.body.replace(_TITLE, named, 1)

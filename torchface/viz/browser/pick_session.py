@@ -54,17 +54,17 @@ class PickSession:
     Args:
         mesh: what landmarks and markers go on; the template of the pairs.
         scan: what the pairs lead to.
-        landmark_set: names and order; landmarks that the mesh brings, if as many, are there from the start.
+        landmark_set: names and order; landmarks that the mesh brings, if as many, are picked already.
 
     Every change can be undone, one step a click.
     """
 
     def __init__(self, mesh: Mesh, scan: Mesh | None = None, landmark_set: LandmarkSet = IBUG_68) -> None:
         self.mesh, self.scan, self.landmark_set = mesh.to("cpu"), None if scan is None else scan.to("cpu"), landmark_set
-        known = None if mesh.annotations is None else mesh.annotations.landmarks
+        given = None if mesh.annotations is None else mesh.annotations.landmarks
         count = len(landmark_set.names)
-        start = (None,) * count if known is None or len(known) != count else tuple(known.tolist())
-        self._history = [Picks(landmarks=start)]
+        initial = (None,) * count if given is None or len(given) != count else tuple(given.tolist())
+        self._history = [Picks(landmarks=initial)]
 
     @property
     def picks(self) -> Picks:

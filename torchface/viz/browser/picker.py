@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from torchface.errors import TorchfaceError
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-from torchface.viz.browser.browser_page import HOST, SCALE, frame_camera, icon, start_server, stop_server
+from torchface.viz.browser.browser_page import SCALE, BrowserPage, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
 from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68, LandmarkSet
@@ -31,7 +30,7 @@ _GAP = 1.15
 _DOT = 0.012
 
 
-class Picker:
+class Picker(BrowserPage):
     """Landmark vertices, marker sites and scan correspondences by clicking.
 
     Args:
@@ -61,12 +60,10 @@ class Picker:
         neutral = mesh.neutral if isinstance(mesh, BlendshapeRig) else mesh
         self.session = PickSession(neutral, scan, landmark_set)
         self.out = Path(out)
-        self._lock = threading.RLock()
-        self._stopped = threading.Event()
         vertices = self.session.mesh.vertices
         self._normals = vertex_normals(vertices, self.session.mesh.faces).double()
         self._dot = _DOT * float(vertices.amax(0)[1] - vertices.amin(0)[1])
-        self.server = start_server(label, port)
+        super().__init__(label, port)
         self.head = HeadOnPage(self.server, self.session.mesh, "head")
         self.scan_offset = torch.zeros(3, dtype=torch.float64)
         if self.session.scan is not None:
@@ -78,20 +75,6 @@ class Picker:
         self._refresh("Click on the head.")
         self.server.scene.on_click()(self._clicked)
 
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f"http://{HOST}:{self.server.get_port()}"
-
-    def stop(self) -> None:
-        """Closes the page."""
-        self._stopped.set()
-        stop_server(self.server)
-
-    def wait(self) -> None:
-        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
-        self._stopped.wait()
-
     def click(self, origin: Tensor, direction: Tensor) -> str:
         """Picks what a ray, millimetres, meets in the page's scene; returns what it did, in words.
 
@@ -100,9 +83,9 @@ class Picker:
         """
         with self._lock:
             point, on_scan = self._nearest(origin, direction)
-            said = "Nothing there." if point is None else self._pick(point, on_scan)
-            self._refresh(said)
-            return said
+            message = "Nothing there." if point is None else self._pick(point, on_scan)
+            self._refresh(message)
+            return message
 
     def undo(self) -> None:
         """Takes the last pick back."""
@@ -120,9 +103,9 @@ class Picker:
         beyond = self.session.on_scan(origin - self.scan_offset, direction)
         if found is None or beyond is None:
             return (beyond, True) if found is None else (found, False)
-        start = origin.double()
-        near = (torch.tensor(found.position, dtype=torch.float64) - start).norm()
-        far = (torch.tensor(beyond.position, dtype=torch.float64) + self.scan_offset - start).norm()
+        eye = origin.double()
+        near = (torch.tensor(found.position, dtype=torch.float64) - eye).norm()
+        far = (torch.tensor(beyond.position, dtype=torch.float64) + self.scan_offset - eye).norm()
         return (found, False) if near <= far else (beyond, True)
 
     def _pick(self, point: SurfacePoint, on_scan: bool) -> str:
@@ -152,14 +135,13 @@ class Picker:
             self._landmark: Any = gui.add_dropdown("Landmark", (_NEXT, *self.session.landmark_set.names))
             self._marker_label: Any = gui.add_text("Marker label", "", hint="Empty: marker000 and on")
             self._mirrored = gui.add_checkbox("Mirrored", False, hint="Picks the other side too")
-            self._said = gui.add_html("")
+            self._message = gui.add_html("")
             undo = gui.add_button("Undo", icon=icon("ARROW_BACK_UP"))
-            save = gui.add_button("Save picks", icon=icon("DEVICE_FLOPPY"), hint=f"Writes to {self.out}")
+            self._add_save_button("Save picks", f"Writes to {self.out}", lambda: ", ".join(map(str, self.save())))
         with gui.add_folder("Picked"):
             self._list = gui.add_html("")
         self._mode.on_update(lambda _: self._mode_changed())
         undo.on_click(lambda _: self.undo())
-        save.on_click(self._save_clicked)
         self._mode_changed()
 
     def _mode_changed(self) -> None:
@@ -175,15 +157,7 @@ class Picker:
         except TorchfaceError as error:
             self._refresh(str(error))
 
-    def _save_clicked(self, event: viser.GuiEvent) -> None:
-        assert event.client is not None
-        try:
-            files = ", ".join(str(path) for path in self.save())
-            event.client.add_notification("Saved", files, auto_close_seconds=6.0, color="teal")
-        except (TorchfaceError, OSError) as error:
-            event.client.add_notification("Not saved", str(error), color="red")
-
-    def _refresh(self, said: str) -> None:
+    def _refresh(self, message: str) -> None:
         picks, session = self.session.picks, self.session
         missing = session.next_landmark
         ahead = "" if missing is None or self._mode.value != "landmarks" else session.landmark_set.names[missing]
@@ -192,7 +166,7 @@ class Picker:
         waiting = [] if picks.waiting is None else [picks.waiting]
         on_scan = [torch.tensor(point, dtype=torch.float64) + self.scan_offset for _, _, point in picks.pairs]
         with self.server.atomic():
-            self._said.content = caption(said) + (caption(f"Next: {ahead}") if ahead else "")
+            self._message.content = caption(message) + (caption(f"Next: {ahead}") if ahead else "")
             counts = {"landmarks": f"{len(landmarks)} of {len(picks.landmarks)}"}
             counts |= {"markers": str(len(picks.markers)), "pairs": str(len(pairs))}
             last = [
@@ -208,7 +182,7 @@ class Picker:
             self._draw("waiting", self._raised(waiting))
 
     def _raised(self, vertices: list[int]) -> list[Tensor]:
-        """Places of vertices lifted off the skin, so that a flat dot does not sink into it."""
+        """Places of vertices lifted above the surface, so that a flat dot does not sink into it."""
         lifted = self.session.mesh.vertices.double() + 0.4 * self._dot * self._normals
         return list(lifted[vertices])
 

@@ -39,7 +39,7 @@ class Playback:
         """
         if self.started is None:
             return self.origin
-        # A hair of slack: (now - started) * fps of a whole frame may come out a rounding below it.
+        # A small tolerance: (now - started) * fps of a whole frame may come out a rounding below it.
         elapsed = self.origin + int((now - self.started) * self.fps * self.speed + 1e-6)
         return elapsed % self.frames if self.loop else min(elapsed, self.frames - 1)
 

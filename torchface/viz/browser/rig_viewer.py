@@ -7,26 +7,23 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
-from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
-from torchface.viz.browser.browser_page import HOST, frame_camera, icon, start_server, stop_server
+from torchface.viz.browser.browser_page import BrowserPage, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
 from torchface.viz.browser.html_lists import caption, shape_list
 from torchface.viz.browser.playback import Playback
 from torchface.viz.browser.shape_groups import grouped, label_of
 from torchface.viz.browser.shared_input import SharedInput
 from torchface.viz.browser.weight_editor import WeightEditor
-
-if TYPE_CHECKING:
-    import viser
 
 _TICK = 1 / 120
 _REST = 0.25
@@ -36,7 +33,7 @@ _OPEN_GROUPS = ("brows", "eyes", "jaw", "mouth")
 _SPREAD = 6
 
 
-class RigViewer:
+class RigViewer(BrowserPage):
     """A rig in the browser.
 
     Args:
@@ -68,11 +65,9 @@ class RigViewer:
         self.rig, self.take, self.out = rig, take, Path(out)
         self.editor = WeightEditor(rig.names, weights, spread=0 if weights is None else _SPREAD, symmetric=True)
         self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps)
-        self._lock = threading.RLock()
-        self._stopped = threading.Event()
         self._moved_at = self._panel_at = float("-inf")
         self._panel_due = False
-        self.server = start_server(label, port)
+        super().__init__(label, port)
         self._detail, self._wrinkled = detail, detail is not None
         self.head = HeadOnPage(self.server, self._posed(), "head", normal_map=self._normal_map if detail else None)
         frame_camera(self.server, rig.neutral)
@@ -86,20 +81,11 @@ class RigViewer:
         self._thread = threading.Thread(target=self._run, name="torchface-viewer", daemon=True)
         self._thread.start()
 
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return f"http://{HOST}:{self.server.get_port()}"
-
     def stop(self) -> None:
         """Closes the page."""
         self._stopped.set()
         self._thread.join(timeout=5)
-        stop_server(self.server)
-
-    def wait(self) -> None:
-        """Returns when the page is closed by :meth:`stop`, or at an interrupt."""
-        self._stopped.wait()
+        super().stop()
 
     def show_frame(self, frame: int) -> int:
         """Brings a frame into view; returns how many pieces of the head were sent."""
@@ -203,8 +189,7 @@ class RigViewer:
                 actions["Reset all"] = self.editor.reset
             buttons: Any = gui.add_button_group("Pose", tuple(actions))
             buttons.on_click(lambda event: self._edit(actions[event.target.value]))
-            save = gui.add_button("Save weights", icon=icon("DEVICE_FLOPPY"), hint=f"Writes {self.out}")
-            save.on_click(self._save_clicked)
+            self._add_save_button("Save weights", f"Writes {self.out}", lambda: str(self.save()))
 
     def _add_sliders(self) -> dict[str, SharedInput]:
         gui, editor = self.server.gui, self.editor
@@ -252,14 +237,6 @@ class RigViewer:
                 self._pause()
             action()
             self._show()
-
-    def _save_clicked(self, event: viser.GuiEvent) -> None:
-        assert event.client is not None
-        try:
-            path = self.save()
-            event.client.add_notification("Saved", str(path), auto_close_seconds=5.0, color="teal")
-        except (TorchfaceError, OSError) as error:
-            event.client.add_notification("Not saved", str(error), color="red")
 
 
 def _time_line(frame: int, frames: int, take: Take) -> str:

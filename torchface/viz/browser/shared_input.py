@@ -10,7 +10,7 @@ _SAME = 5e-4
 
 
 class SharedInput:
-    """A slider, dropdown or checkbox of the page, told apart: what the user set, and what the program put there.
+    """A slider, dropdown or checkbox of the page, which tells changes by the user from those by the program.
 
     Args:
         handle: viser's.
@@ -22,22 +22,22 @@ class SharedInput:
         self.handle = handle
         self._lock = lock
         self._act = act
-        self._known = handle.value
+        self._value = handle.value
         handle.on_update(self._changed)
 
     def push(self, value: Any) -> None:
         """Shows a value, unless the user has just set another that is still to be acted on."""
-        if self.handle.value != self._known:
+        if self.handle.value != self._value:
             return
-        if isinstance(value, float | int) and abs(value - self._known) < _SAME:
+        if isinstance(value, float | int) and abs(value - self._value) < _SAME:
             return
-        self._known = value
+        self._value = value
         self.handle.value = value
-        self._known = self.handle.value
+        self._value = self.handle.value
 
     def _changed(self, event: Any) -> None:
         if event.client is None:  # the program's own doing
             return
         with self._lock:
-            self._known = event.target.value
-            self._act(self._known)
+            self._value = event.target.value
+            self._act(self._value)

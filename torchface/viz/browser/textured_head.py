@@ -54,17 +54,17 @@ class TexturedHead:
         buffers = BufferWriter()
         mesh = self._mesh.with_vertices(vertices.detach().cpu().float())
         primitive = PrimitiveWriter(mesh, self._split, buffers).add(self._surface, 0, torch.zeros(3))
-        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": _ROUGHNESS}
-        material: dict[str, Any] = {"pbrMetallicRoughness": look, "doubleSided": True}
+        shading: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": _ROUGHNESS}
+        material: dict[str, Any] = {"pbrMetallicRoughness": shading, "doubleSided": True}
         root: dict[str, Any] = {
             "nodes": [{"mesh": 0}],
             "meshes": [{"primitives": [primitive]}],
             "materials": [material],
         }
         if self._image is not None:
-            look["baseColorTexture"] = {"index": buffers.texture(root, self._image, "image/jpeg")}
+            shading["baseColorTexture"] = {"index": buffers.texture(root, self._image, "image/jpeg")}
         elif self._color is not None:
-            look["baseColorFactor"] = self._color
+            shading["baseColorFactor"] = self._color
         if normal_map is not None and mesh.uvs is not None:
             image = _encoded(encode_normals(normal_map.cpu().float()), "PNG", _MAX_NORMALS_SIDE)
             material["normalTexture"] = {"index": buffers.texture(root, image)}

@@ -14,7 +14,7 @@ SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
-    """An error a frame (T,) over time, with its median; a picture (3,H,W)."""
+    """An error a frame (T,) over time, with its median; an image (3,H,W)."""
     figure = Figure(figsize=(10, 2.6), dpi=100, layout="constrained")
     axes = figure.subplots()
     seconds = torch.arange(len(error)) / fps
@@ -26,9 +26,9 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
     return from_figure(figure)
 
 
-def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps: float, most: int = 6) -> Tensor:
+def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps: float, max_shapes: int = 6) -> Tensor:
     """The sum of weights over time and the curves of the shapes that move most, solved (T,N) over true; (3,H,W)."""
-    order = (solved if true is None else true).std(0).argsort(descending=True)[:most].tolist()
+    order = (solved if true is None else true).std(0).argsort(descending=True)[:max_shapes].tolist()
     figure = Figure(figsize=(10, 1.5 * (len(order) + 1)), dpi=100, layout="constrained")
     rows = figure.subplots(len(order) + 1, 1, sharex=True)
     seconds = torch.arange(len(solved)) / fps

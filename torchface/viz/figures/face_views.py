@@ -20,19 +20,19 @@ FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 
 
 def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
-    """What to look at, (3,), and how many millimetres a picture of ``aspect`` (width over height) is to be high.
+    """What to look at, (3,), and how many millimetres an image of ``aspect`` (width over height) is to be high.
 
     Round the landmarks or the ``face`` region where annotated, else the whole mesh.
     """
-    points, room, shift = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
+    points, margin, offset = mesh.vertices, 1.15, (0.0, 0.0, 0.0)
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
-        # Landmarks end at the brows: leave room for the forehead, and turn about a point inside the head.
-        points, room, shift = mesh.vertices[mesh.annotations.landmarks], 1.9, (0.0, 0.12, -0.35)
+        # Landmarks end at the brows: leave margin for the forehead, and rotate about a point inside the head.
+        points, margin, offset = mesh.vertices[mesh.annotations.landmarks], 1.9, (0.0, 0.12, -0.35)
     elif mesh.annotations is not None and "face" in mesh.annotations.regions:
-        points, room = mesh.vertices[mesh.annotations.regions["face"]], 1.2
+        points, margin = mesh.vertices[mesh.annotations.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
-    centre = (low + high) / 2 + torch.tensor(shift).to(low) * float(high[1] - low[1])
-    return centre, room * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
+    centre = (low + high) / 2 + torch.tensor(offset).to(low) * float(high[1] - low[1])
+    return centre, margin * float(torch.maximum(high[1] - low[1], (high[0] - low[0]) / aspect))
 
 
 def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
@@ -62,11 +62,22 @@ def face_views(
 def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int = 400, height: int = 500) -> Tensor:
     """Per-vertex values (V,) painted on three views, with a colour bar from 0 to ``maximum``; (3,H,W)."""
     row = face_views(mesh, colors=heat_colors(values, maximum), width=width, height=height)
-    figure = Figure(figsize=(1.1, row.shape[1] / 100), dpi=100)
-    axes = figure.add_axes((0.12, 0.08, 0.2, 0.84))
-    mappable = ScalarMappable(Normalize(0, maximum), "turbo")
-    figure.colorbar(mappable, cax=axes, label=label)
-    return sheet([row, from_figure(figure)], 2)
+    return sheet([row, color_bar(maximum, label, row.shape[1])], 2)
+
+
+def color_bar(
+    maximum: float,
+    label: str,
+    height: int,
+    bar: tuple[float, float, float, float] = (0.12, 0.08, 0.2, 0.84),
+    colormap: str = "turbo",
+    extend: str = "neither",
+) -> Tensor:
+    """The scale of a heat map from 0 to ``maximum``, (3,H,110); ``bar`` is left, bottom, width, height in [0,1]."""
+    figure = Figure(figsize=(1.1, height / 100), dpi=100)
+    mappable = ScalarMappable(Normalize(0, maximum), colormap)
+    figure.colorbar(mappable, cax=figure.add_axes(bar), label=label, extend=extend)
+    return from_figure(figure)
 
 
 def clay_colors(mesh: Mesh) -> Tensor:

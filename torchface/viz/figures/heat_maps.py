@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import torch
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.rendering.compositing import caption, from_figure, headed, heat_colors, sheet
-from torchface.viz.figures.face_views import clay_colors, face_views
+from torchface.rendering.compositing import caption, headed, heat_colors, sheet
+from torchface.viz.figures.face_views import clay_colors, color_bar, face_views
 
 GREEN_TO_RED = "RdYlGn_r"
 """The colour map, as matplotlib calls it."""
@@ -21,9 +18,10 @@ NOT_COMPARED = (0.75, 0.75, 0.75)
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
-def error_colors(errors: Tensor, maximum: float) -> Tensor:
-    """Colours (V,3): green at 0 to red at ``maximum`` and beyond; grey where the error (V,) is NaN."""
-    colors = heat_colors(errors.nan_to_num(0.0).float(), maximum, GREEN_TO_RED)
+def error_colors(errors: Tensor, maximum: float, colormap: str = GREEN_TO_RED) -> Tensor:
+    """Colours (V,3) of errors (V,), the colour map's ends at 0 and ``maximum``; grey where the error is NaN."""
+    errors = errors.cpu().float()
+    colors = heat_colors(errors.nan_to_num(0.0), maximum, colormap)
     colors[errors.isnan()] = torch.tensor(NOT_COMPARED)
     return colors
 
@@ -55,7 +53,7 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
         errors: (V,), millimetres; NaN is grey.
         maximum: of the scale, millimetres.
         title: over it all.
-        height: of each picture, pixels.
+        height: of each image, pixels.
 
     Source: thesis, figures 81 to 94.
     """
@@ -73,9 +71,6 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
 
 
 def _scale(maximum: float, height: int) -> Tensor:
-    figure = Figure(figsize=(1.1, height / 100), dpi=100)
-    share = min(0.84, 3.4 / (height / 100))
-    axes = figure.add_axes((0.12, 0.5 - share / 2, 0.2, share))
-    mappable = ScalarMappable(Normalize(0, maximum), GREEN_TO_RED)
-    figure.colorbar(mappable, cax=axes, label=f"mm ({GREEN_TO_RED})", extend="max")
-    return from_figure(figure)
+    part = min(0.84, 3.4 / (height / 100))
+    bar = (0.12, 0.5 - part / 2, 0.2, part)
+    return color_bar(maximum, f"mm ({GREEN_TO_RED})", height, bar, GREEN_TO_RED, "max")

@@ -1,4 +1,4 @@
-"""A helmet's motion over a take, as the thesis's figures 61 and 62 show it: three translations and three turns."""
+"""A helmet's motion over a take, as the thesis's figures 61 and 62 show it: three translations and three rotations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchface.viz.figures.curves import SOLVED, TRUE
 def motion_curves(
     translation: Tensor, degrees: Tensor, fps: float, true: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Translations (T,3), millimetres, and turns (T,3), degrees, over time and the true ones where given; (3,H,W)."""
+    """Translations (T,3), millimetres, and rotations (T,3), degrees, over time, with the true ones if any; (3,H,W)."""
     figure = Figure(figsize=(10, 6), dpi=100, layout="constrained")
     rows = figure.subplots(3, 2, sharex=True)
     seconds = torch.arange(len(translation)) / fps

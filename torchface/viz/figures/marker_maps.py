@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rendering.compositing import from_figure, heat_colors, sheet
-from torchface.viz.figures.face_views import FRONT, clay_colors, frame_face
+from torchface.viz.figures.face_views import FRONT, clay_colors, color_bar, frame_face
 from torchface.viz.figures.region_colors import as_seen
 from torchface.viz.figures.site_views import facing
 
@@ -37,12 +35,8 @@ def marker_map(
     worst = set(errors.nan_to_num(-1.0).argsort(descending=True)[:named].tolist())
     shown = ["" if i not in worst or errors.isnan()[i] else label for i, label in enumerate(labels)]
     views = _views(mesh, points, colors, shown)
-    figure = Figure(figsize=(1.1, _HEIGHT / 100), dpi=100)
-    axes = figure.add_axes((0.12, 0.2, 0.2, 0.6))
-    figure.colorbar(
-        ScalarMappable(Normalize(0, maximum), "turbo"), cax=axes, label="mm, root mean square", extend="max"
-    )
-    return sheet([*views, from_figure(figure)], len(views) + 1)
+    scale = color_bar(maximum, "mm, root mean square", _HEIGHT, (0.12, 0.2, 0.2, 0.6), extend="max")
+    return sheet([*views, scale], len(views) + 1)
 
 
 def marker_regions(mesh: Mesh, points: Tensor, regions: Sequence[str]) -> Tensor:

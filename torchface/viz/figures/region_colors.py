@@ -36,7 +36,7 @@ def region_colors(mesh: Mesh) -> Tensor:
 
 
 def as_seen(mesh: Mesh) -> Mesh:
-    """A mesh whose parts without a picture of their own have the colours of their regions; others as they are.
+    """A mesh whose parts without an image of their own have the colours of their regions; others as they are.
 
     That is all of it where the mesh has neither texture nor colours, and beside a texture the eyes, teeth and gums that
     have no texels of their own in it: what colours a scan or a photograph gave them are those of the skin before them.

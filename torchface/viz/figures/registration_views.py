@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.registration.scan_registration import Registration
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import from_figure, headed, heat_colors, sheet
-from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, frame_face
+from torchface.rendering.compositing import headed, sheet
+from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, color_bar, frame_face
+from torchface.viz.figures.heat_maps import error_colors
 from torchface.viz.figures.wireframe import lines_on_clay
-
-_NOT_MATCHED = (0.75, 0.75, 0.75)
 
 
 def registration_sheet(
@@ -38,35 +34,30 @@ def registration_sheet(
         scan: as it was registered.
         registration: to it.
         maximum: of the heat map, millimetres.
-        width, height: of each picture, pixels.
+        width, height: of each image, pixels.
         clay: without colours, which shows form.
         yaws: of the views, degrees.
     """
     upright = registration.pose.inverse()
-    pictures = []
-    own = _moved(registration.mesh, upright)
-    there = _moved(scan, upright)
+    images = []
+    registered = _moved(registration.mesh, upright)
+    scanned = _moved(scan, upright)
     if clay:
-        own, there = (replace(mesh, colors=None, texture=None) for mesh in (own, there))
-    heat = distance_colors(registration.distance.masked_fill(~registration.matched, torch.nan), maximum)
+        registered, scanned = (replace(mesh, colors=None, texture=None) for mesh in (registered, scanned))
+    heat = error_colors(registration.distance.masked_fill(~registration.matched, torch.nan), maximum, "turbo")
     for yaw in yaws:
-        camera = frame_face(own, yaw, width=width, height=height)
-        pictures += [render(there, camera), render(own, camera), render(own, camera, heat), lines_on_clay(own, camera)]
+        camera = frame_face(registered, yaw, width=width, height=height)
+        images += [
+            render(scanned, camera),
+            render(registered, camera),
+            render(registered, camera, heat),
+            lines_on_clay(registered, camera),
+        ]
     titles = ("scan", "registered", "distance", "mesh")
-    columns = [pictures[i :: len(titles)] for i in range(len(titles))]
+    columns = [images[i :: len(titles)] for i in range(len(titles))]
     made = [headed(sheet(column, 1), title) for column, title in zip(columns, titles, strict=True)]
-    figure = Figure(figsize=(0.9, made[0].shape[1] / 100), dpi=100)
-    mappable = ScalarMappable(Normalize(0, maximum), "turbo")
-    figure.colorbar(mappable, cax=figure.add_axes((0.12, 0.2, 0.2, 0.6)), label="mm")
-    return sheet([*made, from_figure(figure)], len(made) + 1)
-
-
-def distance_colors(distances: Tensor, maximum: float) -> Tensor:
-    """Colours (V,3) of distances (V,), millimetres, 0 to ``maximum``; grey where they are NaN."""
-    distances = distances.float().cpu()
-    heat = heat_colors(distances.nan_to_num(0.0), maximum)
-    heat[distances.isnan()] = torch.tensor(_NOT_MATCHED)
-    return heat
+    scale = color_bar(maximum, "mm", made[0].shape[1], (0.12, 0.2, 0.2, 0.6))
+    return sheet([*made, scale], len(made) + 1)
 
 
 def _moved(mesh: Mesh, pose: Similarity) -> Mesh:

@@ -25,7 +25,7 @@ _LIFT = 0.5
 
 def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] = (FRONT, THREE_QUARTER)) -> Tensor:
     """Sites before and after (M,3) on views of a face, joined by lines, those that face the viewer; (3,H,W)."""
-    pictures = []
+    images = []
     for yaw in yaws:
         camera = frame_face(mesh, yaw, width=560, height=700)
         shown = facing(mesh, after, yaw)
@@ -41,8 +41,8 @@ def site_views(mesh: Mesh, before: Tensor, after: Tensor, yaws: Sequence[float] 
         axes.set(xlim=(0, image.shape[2]), ylim=(image.shape[1], 0))
         axes.axis("off")
         axes.legend(loc="upper right", frameon=False)
-        pictures.append(from_figure(figure))
-    return sheet(pictures, len(pictures))
+        images.append(from_figure(figure))
+    return sheet(images, len(images))
 
 
 def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
@@ -50,21 +50,21 @@ def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
     faces, vertices = mesh.faces[drawn_triangles(mesh)], mesh.vertices.double()
     a, b, c = corners(vertices, faces[SurfaceIndex(vertices, faces).nearest(points).triangle])
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    turn = math.radians(yaw)
-    toward = torch.tensor([math.sin(turn), 0.0, math.cos(turn)], dtype=torch.float64)
+    angle = math.radians(yaw)
+    toward = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64)
     lifted = points.double() + _LIFT * normals
     hidden = RayCaster(vertices, faces).occluded(lifted, toward.expand_as(lifted))
     return (normals @ toward > 0) & ~hidden
 
 
 def error_rounds(errors: Tensor) -> Tensor:
-    """Each marker's error after each round (R,M), millimetres, with mean and worst; (3,H,W)."""
+    """Each marker's error after each iteration (R,M), millimetres, with mean and worst; (3,H,W)."""
     figure = Figure(figsize=(10, 3), dpi=100, layout="constrained")
     axes = figure.subplots()
-    rounds = range(1, len(errors) + 1)
-    axes.plot(rounds, errors, color="grey", linewidth=0.4, alpha=0.5)
-    axes.plot(rounds, errors.amax(1), color=TRUE, linewidth=1.2, label=f"worst, {float(errors[-1].max()):.2f} mm")
-    axes.plot(rounds, errors.mean(1), color=SOLVED, linewidth=1.6, label=f"mean, {float(errors[-1].mean()):.2f} mm")
-    axes.set(xlabel="round", ylabel="marker error (mm)", yscale="log", xlim=(1, len(errors)))
+    iterations = range(1, len(errors) + 1)
+    axes.plot(iterations, errors, color="grey", linewidth=0.4, alpha=0.5)
+    axes.plot(iterations, errors.amax(1), color=TRUE, linewidth=1.2, label=f"worst, {float(errors[-1].max()):.2f} mm")
+    axes.plot(iterations, errors.mean(1), color=SOLVED, linewidth=1.6, label=f"mean, {float(errors[-1].mean()):.2f} mm")
+    axes.set(xlabel="iteration", ylabel="marker error (mm)", yscale="log", xlim=(1, len(errors)))
     axes.legend(loc="upper right", frameon=False)
     return from_figure(figure)

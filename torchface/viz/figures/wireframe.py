@@ -1,4 +1,4 @@
-"""A mesh with its lines, which show how a template's vertices have spread over a face."""
+"""A mesh with its lines, which show how a template's vertices are spread over a face."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import render
 from torchface.rendering.raycast import RayCaster
 
-_WIDTH = 0.12  # of a line, as a share of the mesh's median edge
+_WIDTH = 0.12  # of a line, as a fraction of the mesh's median edge
 _DARK = 0.75
 _SAMPLES = 3
 
@@ -35,12 +35,12 @@ def lines_on_clay(mesh: Mesh, camera: Camera) -> Tensor:
     gap = (hits.barycentric[seen].double().clamp(min=1e-12) * heights[triangle]).amin(-1)
     dark = torch.zeros(len(seen), dtype=torch.float64)
     dark[seen] = (gap < _WIDTH / 2 * float(lengths.median())).double()
-    share = dark.view(height // _SAMPLES, _SAMPLES, width // _SAMPLES, _SAMPLES).mean((1, 3)).float()
-    return image * (1 - _DARK * share)
+    coverage = dark.view(height // _SAMPLES, _SAMPLES, width // _SAMPLES, _SAMPLES).mean((1, 3)).float()
+    return image * (1 - _DARK * coverage)
 
 
 def _drawn(mesh: Mesh) -> Tensor:
-    """Which edges opposite each corner (F,3) are a polygon's own, and not its diagonals."""
+    """Which edges opposite each corner (F,3) are edges of a polygon, and not its diagonals."""
     faces = mesh.faces.cpu()
     if mesh.polygons is None:
         return torch.ones_like(faces, dtype=torch.bool)
@@ -52,9 +52,9 @@ def _drawn(mesh: Mesh) -> Tensor:
     following[rows, last] = polygons[:, 0]
     count = len(mesh.vertices)
     inside = polygons >= 0
-    own = _keys(polygons[inside], following[inside], count)
+    authored = _keys(polygons[inside], following[inside], count)
     opposite = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1)
-    return torch.isin(_keys(opposite[..., 0], opposite[..., 1], count), own)
+    return torch.isin(_keys(opposite[..., 0], opposite[..., 1], count), authored)
 
 
 def _keys(first: Tensor, second: Tensor, count: int) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.files.whole_files import write_file
+from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
 from torchface.rendering.compositing import heat_colors, to_pillow
@@ -25,12 +26,12 @@ from torchface.rig import BlendshapeRig
 from torchface.viz.figures.face_views import clay_colors, framing
 from torchface.viz.figures.region_colors import as_seen
 
-_MOST_FRAMES, _FASTEST = 6000, 60.0
+_MAX_FRAMES, _MAX_RATE = 6000, 60.0
 # A hundredth of a millimetre: markers as 16-bit numbers, and the shortest move that is worth a number.
-_MARKER_UNIT, _SHORTEST = 0.01, 0.01
+_MARKER_UNIT, _MIN_MOVE = 0.01, 0.01
 _NOT_SEEN = -32768
 # What lies behind lips and lids at rest would stay black when they open.
-_LEAST_OPEN = 0.3
+_MIN_OPENNESS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
                 f"{tuple(first.weights.shape)} and {tuple(first.rig.deltas.shape)} as in the first take"
             )
     frames = len(first.weights)
-    step = max(1, round(player.fps / _FASTEST), math.ceil(frames / _MOST_FRAMES))
+    step = max(1, round(player.fps / _MAX_RATE), math.ceil(frames / _MAX_FRAMES))
     rigs = list({id(take.rig): take.rig for take in player.takes}.values())
     kept = [take.weights[::step] for take in player.takes]
     data: dict[str, Any] = {
@@ -142,7 +143,7 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
         "error_maximum": player.maximum,
         "heat": _packed(255 * heat_colors(torch.arange(256) / 255, 1.0), np.uint8),
         "markers": None if player.markers is None else _markers(player.markers, step),
-        **_looks(first.rig.neutral),
+        **_appearance(first.rig.neutral),
     }
     script = files("torchface.viz.reports").joinpath("player.js").read_bytes()
     write_file(folder / "player.js", script)
@@ -154,7 +155,7 @@ def _rig(rig: BlendshapeRig) -> dict[str, Any]:
     """Rest and moves; of a shape only the vertices that it moves."""
     deltas = rig.deltas.detach().cpu().float()
     scale = max(float(deltas.abs().max()), 1e-6) / 32767
-    moved = deltas.norm(dim=-1) > _SHORTEST
+    moved = deltas.norm(dim=-1) > _MIN_MOVE
     shape, vertex = moved.nonzero().unbind(1)
     return {
         "vertices": _packed(rig.vertices.detach().cpu(), np.float32),
@@ -177,17 +178,15 @@ def _markers(markers: Markers, step: int) -> dict[str, Any]:
     }
 
 
-def _looks(mesh: Mesh) -> dict[str, Any]:
+def _appearance(mesh: Mesh) -> dict[str, Any]:
     """The framing, and what covers the mesh: texture with a corner a pair of vertex and texture point, or colours."""
     mesh = as_seen(mesh)
     faces = mesh.faces.cpu()
-    vertex, corners, uvs, texture = torch.arange(len(mesh.vertices)), faces, None, None
-    if mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None:
-        pairs, inverse = torch.stack([faces.flatten(), mesh.uv_faces.cpu().flatten()], 1).unique(
-            dim=0, return_inverse=True
-        )
-        vertex, corners = pairs[:, 0], inverse.reshape(-1, 3)
-        uvs = _packed(mesh.uvs.cpu()[pairs[:, 1]], np.float32)
+    uvs = texture = None
+    uv_faces = None if mesh.texture is None or mesh.uv_faces is None else mesh.uv_faces.cpu().numpy()
+    split = split_at_seams(len(mesh.vertices), faces.numpy(), uv_faces)
+    if mesh.texture is not None and mesh.uvs is not None and split.uv_of is not None:
+        uvs = _packed(mesh.uvs.cpu()[split.uv_of], np.float32)
         content = BytesIO()
         to_pillow(mesh.texture).save(content, "JPEG", quality=88)
         texture = "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
@@ -196,12 +195,12 @@ def _looks(mesh: Mesh) -> dict[str, Any]:
     centre, span = framing(mesh)
     return {
         "faces": _packed(faces, np.uint32),
-        "corner_vertex": _packed(vertex, np.uint32),
-        "corner_faces": _packed(corners, np.uint32),
+        "corner_vertex": _packed(torch.from_numpy(split.vertex_of), np.uint32),
+        "corner_faces": _packed(torch.from_numpy(split.triangles), np.uint32),
         "uvs": uvs,
         "texture": texture,
         "colors": _packed((255 * colors.clamp(0, 1)).round(), np.uint8),
-        "openness": _packed((255 * openness.clamp(min=_LEAST_OPEN)).round(), np.uint8),
+        "openness": _packed((255 * openness.clamp(min=_MIN_OPENNESS)).round(), np.uint8),
         "centre": centre.tolist(),
         "span": span,
     }

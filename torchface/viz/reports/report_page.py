@@ -1,4 +1,4 @@
-"""A report as one HTML page with pictures beside it; opens in any browser, from disk, without a network."""
+"""A report as one HTML page with images beside it; opens in any browser, from disk, without a network."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Eyeballs as engines want them: where they turn, and an iris painted on those that bring no picture.
+"""Eyeballs as engines want them: where they rotate, and an iris painted on those that bring no image.
 
-An eyeball of one shell wears sclera, iris and pupil. Of two, as in ICT-FaceKit, the outer one is sclera with a hole
+An eyeball of one shell has sclera, iris and pupil. Of two, as in ICT-FaceKit, the outer one is sclera with a hole
 under a clear cornea, and the inner one, which the hole shows, the iris round the pupil.
 """
 
@@ -16,21 +16,21 @@ from torchface.mesh import Mesh
 
 _IRIS, _PUPIL, _LIMBUS = 5.9, 1.9, 0.5
 """Millimetres: radii of iris and pupil in daylight, half the width of the limbus, where sclera turns into cornea."""
-_LARGEST_SHARE = 0.6  # of an eyeball's radius; one that is no person's has no larger iris
+_MAX_IRIS_FRACTION = 0.6  # of an eyeball's radius; a cartoon eye has no larger iris
 _FRONT, _DEPTH = 0.6, 1.5  # millimetres behind the inner shell's front: round the pupil; where the iris ends
 _RIM, _DARK, _VEINS = (0.07, 0.05, 0.04), (0.012, 0.010, 0.010), (0.80, 0.60, 0.56)
-_OUTLIER, _ROUNDS = 2.5, 6
+_OUTLIER, _MAX_ITERATIONS = 2.5, 6
 _INNER = (0.50, 0.36, 0.20)  # round the pupil of a brown iris
-_AS_MADE = 0.02
+_MAX_COLOR_DIFFERENCE = 0.02
 
 
 def stands_alone(faces: Tensor, inside: Tensor) -> bool:
-    """Whether triangles (F,) bool share no vertex with the others, so that they can turn by themselves."""
+    """Whether triangles (F,) bool share no vertex with the others, so that they can rotate by themselves."""
     return not bool(torch.isin(faces[inside], faces[~inside]).any())
 
 
 def eye_centre(mesh: Mesh, triangles: Tensor) -> Tensor:
-    """The point (3,) about which an eyeball turns: the centre of the sphere that most of its outer shell lies on.
+    """The point (3,) about which an eyeball rotates: the centre of the sphere that most of its outer shell lies on.
 
     Args:
         mesh: the head.
@@ -52,17 +52,17 @@ def painted_eye(mesh: Mesh, triangles: Tensor) -> list[tuple[Tensor, PartMateria
     if len(inner):  # its front lies round the pupil, which need not be straight ahead
         ahead = points[inner.unique()]
         points = _looking_along(ahead[ahead[:, 2] > ahead[:, 2].max() - _FRONT].mean(0), points)
-    iris = min(_IRIS, _LARGEST_SHARE * float(radius))
-    worn = _worn_iris(mesh, triangles, points, iris)
+    iris = min(_IRIS, _MAX_IRIS_FRACTION * float(radius))
+    iris_color = _given_iris_color(mesh, triangles, points, iris)
     is_outer = torch.isin(mesh.faces[triangles, 0], outer)
     if len(inner) == 0:
-        return [(triangles, EYEBALL, painted(mesh, triangles, points, lambda at: _one_shell(at, iris, worn)))]
+        return [(triangles, EYEBALL, painted(mesh, triangles, points, lambda at: _one_shell(at, iris, iris_color)))]
     rows, behind = triangles[is_outer], triangles[~is_outer]
-    inside = (_off_axis(points) < iris) & (points[:, 2] > 0)
+    inside = (_axis_distance(points) < iris) & (points[:, 2] > 0)
     clear = inside[mesh.faces[rows]].all(1)
     shell = painted(mesh, rows[~clear], points, lambda at: _outer_shell(at, iris))
     depth = float(points[inner.unique(), 2].max()) - _DEPTH
-    seen = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth, worn))
+    seen = painted(mesh, behind, points, lambda at: _inner_shell(at, iris, depth, iris_color))
     return [(rows[~clear], SCLERA, shell), (behind, IRIS, seen), (rows[clear], CORNEA, None)]
 
 
@@ -80,18 +80,18 @@ def _shells(mesh: Mesh, triangles: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sphere(ids: Tensor, mesh: Mesh) -> tuple[Tensor, Tensor]:
-    """Centre (3,) and radius of the sphere most of the vertices lie on; a cornea that bulges has no say."""
+    """Centre (3,) and radius of the sphere most of the vertices lie on; a cornea that bulges is an outlier."""
     points = mesh.vertices[ids].double()
     middle = points.mean(0)
     kept = torch.ones(len(points), dtype=torch.bool)
     centre, radius = middle, (points - middle).norm(dim=1).mean()
-    for _ in range(_ROUNDS):  # the fit decides what lies off it, and the other way round
-        here = points[kept] - middle
-        system = torch.cat([2 * here, torch.ones(len(here), 1, dtype=here.dtype)], dim=1)
-        found = torch.linalg.lstsq(system, here.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
+    for _ in range(_MAX_ITERATIONS):  # fit and outliers in turn
+        centred = points[kept] - middle
+        system = torch.cat([2 * centred, torch.ones(len(centred), 1, dtype=centred.dtype)], dim=1)
+        found = torch.linalg.lstsq(system, centred.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
         centre, radius = found[:3] + middle, (found[3] + found[:3].square().sum()).clamp(min=0).sqrt()
-        off = ((points - centre).norm(dim=1) - radius).abs()
-        kept = off <= max(float(_OUTLIER * off.median()), 1e-9)
+        residual = ((points - centre).norm(dim=1) - radius).abs()
+        kept = residual <= max(float(_OUTLIER * residual.median()), 1e-9)
     return centre, radius
 
 
@@ -102,67 +102,69 @@ def _looking_along(axis: Tensor, points: Tensor) -> Tensor:
     return points @ torch.stack([x, torch.linalg.cross(z, x), z]).T
 
 
-def _one_shell(at: Tensor, iris: float, worn: Tensor | None) -> Tensor:
-    sclera, colored = _sclera(at), _iris(at, iris, worn)
-    inside = (1 - _ramp(_off_axis(at), iris - _LIMBUS, iris + _LIMBUS)) * (at[:, 2] > 0)
+def _one_shell(at: Tensor, iris: float, iris_color: Tensor | None) -> Tensor:
+    sclera, colored = _sclera(at), _iris(at, iris, iris_color)
+    inside = (1 - _ramp(_axis_distance(at), iris - _LIMBUS, iris + _LIMBUS)) * (at[:, 2] > 0)
     color = torch.lerp(sclera, colored, inside[:, None])
-    color = _mix(color, _DARK, (1 - _ramp(_off_axis(at), _PUPIL - 0.1, _PUPIL + 0.1)) * (at[:, 2] > 0))
+    color = _mix(color, _DARK, (1 - _ramp(_axis_distance(at), _PUPIL - 0.1, _PUPIL + 0.1)) * (at[:, 2] > 0))
     return torch.cat([color, torch.ones(len(at), 1, dtype=at.dtype)], dim=1)
 
 
 def _outer_shell(at: Tensor, iris: float) -> Tensor:
     """Sclera that darkens toward a hole in front of the iris."""
-    front, off = at[:, 2] > 0, _off_axis(at)
-    color = _mix(_sclera(at), _RIM, (1 - _ramp(off, iris, iris + _LIMBUS)) * front)
-    return torch.cat([color, torch.where(front, _ramp(off, iris - 0.1, iris + 0.1), 1.0)[:, None]], dim=1)
+    front, distance = at[:, 2] > 0, _axis_distance(at)
+    color = _mix(_sclera(at), _RIM, (1 - _ramp(distance, iris, iris + _LIMBUS)) * front)
+    return torch.cat([color, torch.where(front, _ramp(distance, iris - 0.1, iris + 0.1), 1.0)[:, None]], dim=1)
 
 
-def _inner_shell(at: Tensor, iris: float, depth: float, worn: Tensor | None) -> Tensor:
-    seen = torch.where(at[:, 2] > depth, _ramp(_off_axis(at), _PUPIL - 0.1, _PUPIL + 0.1), 0.0)
-    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), seen) * _iris(at, iris, worn)
+def _inner_shell(at: Tensor, iris: float, depth: float, iris_color: Tensor | None) -> Tensor:
+    seen = torch.where(at[:, 2] > depth, _ramp(_axis_distance(at), _PUPIL - 0.1, _PUPIL + 0.1), 0.0)
+    color = _mix(torch.tensor(_DARK, dtype=at.dtype).expand(len(at), 3), (1.0, 1.0, 1.0), seen) * _iris(
+        at, iris, iris_color
+    )
     return torch.cat([color, torch.ones(len(at), 1, dtype=at.dtype)], dim=1)
 
 
 def _sclera(at: Tensor) -> Tensor:
-    """White that reddens away from the iris."""
+    """White that reddens with the angle from the iris."""
     white = torch.tensor(EYEBALL.color, dtype=at.dtype).expand(len(at), 3)
-    turned = torch.atan2(_off_axis(at), at[:, 2])
-    return _mix(white, _VEINS, 0.8 * _ramp(turned, 0.6, 1.4))
+    angle = torch.atan2(_axis_distance(at), at[:, 2])
+    return _mix(white, _VEINS, 0.8 * _ramp(angle, 0.6, 1.4))
 
 
-def _worn_iris(mesh: Mesh, triangles: Tensor, points: Tensor, iris: float) -> Tensor | None:
-    """The colour (3,) that an eyeball's front wears where its back wears the white that nobody has painted."""
+def _given_iris_color(mesh: Mesh, triangles: Tensor, points: Tensor, iris: float) -> Tensor | None:
+    """The mean colour (3,) of an eyeball's front, where its back has the default white."""
     if mesh.colors is None:
         return None
     ids = mesh.faces[triangles].unique()
     colors, at = mesh.colors[ids].detach().cpu().double(), points[ids]
-    front, back = (_off_axis(at) < 0.9 * iris) & (at[:, 2] > 0), at[:, 2] < 0
+    front, back = (_axis_distance(at) < 0.9 * iris) & (at[:, 2] > 0), at[:, 2] < 0
     white = torch.tensor(EYEBALL.color, dtype=torch.float64)
-    if not front.any() or not back.any() or float((colors[back] - white).abs().max()) > _AS_MADE:
+    if not front.any() or not back.any() or float((colors[back] - white).abs().max()) > _MAX_COLOR_DIFFERENCE:
         return None
     return colors[front].median(0).values
 
 
-def _iris(at: Tensor, iris: float, worn: Tensor | None) -> Tensor:
+def _iris(at: Tensor, iris: float, iris_color: Tensor | None) -> Tensor:
     """Fibres that run out from the pupil, lighter inside, with a dark border."""
-    off, turn = _off_axis(at), torch.atan2(at[:, 1], at[:, 0])
-    fibres = sum(torch.cos(turn * waves + phase) for waves, phase in ((29, 0.3), (43, 1.9), (61, 4.0), (17, 2.2))) / 4
-    mean = torch.tensor(IRIS.color) if worn is None else worn
+    distance, angle = _axis_distance(at), torch.atan2(at[:, 1], at[:, 0])
+    fibres = sum(torch.cos(angle * waves + phase) for waves, phase in ((29, 0.3), (43, 1.9), (61, 4.0), (17, 2.2))) / 4
+    mean = torch.tensor(IRIS.color) if iris_color is None else iris_color
     color = mean.to(at.dtype) * (1 + 0.5 * torch.as_tensor(fibres))[:, None]
-    inner = _INNER if worn is None else tuple((1.4 * worn).clamp(max=1).tolist())
-    color = _mix(color, inner, 0.6 * (1 - _ramp(off, 0.3 * iris, 0.62 * iris)))
-    return _mix(color, _RIM, _ramp(off, 0.80 * iris, iris)).clamp(0, 1)
+    inner = _INNER if iris_color is None else tuple((1.4 * iris_color).clamp(max=1).tolist())
+    color = _mix(color, inner, 0.6 * (1 - _ramp(distance, 0.3 * iris, 0.62 * iris)))
+    return _mix(color, _RIM, _ramp(distance, 0.80 * iris, iris)).clamp(0, 1)
 
 
-def _off_axis(at: Tensor) -> Tensor:
+def _axis_distance(at: Tensor) -> Tensor:
     return at[:, :2].norm(dim=1)
 
 
-def _mix(color: Tensor, other: tuple[float, float, float], share: Tensor) -> Tensor:
-    return torch.lerp(color, torch.tensor(other, dtype=color.dtype).expand_as(color), share[:, None].to(color))
+def _mix(color: Tensor, other: tuple[float, float, float], weight: Tensor) -> Tensor:
+    return torch.lerp(color, torch.tensor(other, dtype=color.dtype).expand_as(color), weight[:, None].to(color))
 
 
 def _ramp(value: Tensor, low: float, high: float) -> Tensor:
     """0 below ``low``, 1 above ``high``, smooth between."""
-    share = ((value - low) / (high - low)).clamp(0, 1)
-    return share * share * (3 - 2 * share)
+    weight = ((value - low) / (high - low)).clamp(0, 1)
+    return weight * weight * (3 - 2 * weight)

@@ -12,7 +12,8 @@ from torchface.io.gltf.region_materials import PartMaterial
 from torchface.mesh import Mesh
 
 _SPACING = 1.1  # millimetres between the hairs of one card
-_ROOT, _SHORTEST, _LEAN = 0.34, 0.55, 0.9  # share of the spacing that a root takes; of the card's length; of a spacing
+# Fractions: of the spacing, the width of a root; of the card, the shortest hair; of the spacing, how far tips lean.
+_ROOT, _MIN_LENGTH, _LEAN = 0.34, 0.55, 0.9
 _SIDE, _DENSE = 1024, 0.6
 
 
@@ -30,12 +31,12 @@ def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Pai
     points = mesh.vertices.detach()[ids].double()
     rest = torch.ones(len(mesh.vertices), dtype=torch.bool)
     rest[ids] = False
-    away = torch.from_numpy(cKDTree(mesh.vertices.detach()[rest].numpy()).query(points.numpy())[0])
-    cards = torch.zeros(int(card.max()) + 1, dtype=away.dtype)
-    nearest = cards.scatter_reduce(0, card, away, "amin", include_self=False)
-    longest = cards.scatter_reduce(0, card, away, "amax", include_self=False) - nearest
+    distance = torch.from_numpy(cKDTree(mesh.vertices.detach()[rest].numpy()).query(points.numpy())[0])
+    cards = torch.zeros(int(card.max()) + 1, dtype=distance.dtype)
+    nearest = cards.scatter_reduce(0, card, distance, "amin", include_self=False)
+    longest = cards.scatter_reduce(0, card, distance, "amax", include_self=False) - nearest
     values = torch.zeros(len(mesh.vertices), 3, dtype=torch.float64)
-    values[ids, 0] = (away - nearest[card]) / longest[card].clamp(min=1e-9)
+    values[ids, 0] = (distance - nearest[card]) / longest[card].clamp(min=1e-9)
     values[ids, 1] = _along(points, card)
     values[ids, 2] = card.double()
     color = torch.tensor(material.color, dtype=torch.float64)
@@ -53,10 +54,10 @@ def painted_lashes(mesh: Mesh, triangles: Tensor, material: PartMaterial) -> Pai
 def _along(points: Tensor, card: Tensor) -> Tensor:
     """Where on its card each point lies along the lid, millimetres, (K,)."""
     along = torch.zeros(len(points), dtype=points.dtype)
-    for number in range(int(card.max()) + 1):  # a card a turn
-        here = points[card == number]
-        here = here - here.mean(0)
-        along[card == number] = here @ torch.linalg.svd(here, full_matrices=False).Vh[0]
+    for number in range(int(card.max()) + 1):  # one card each
+        centred = points[card == number]
+        centred = centred - centred.mean(0)
+        along[card == number] = centred @ torch.linalg.svd(centred, full_matrices=False).Vh[0]
     return along
 
 
@@ -65,8 +66,8 @@ def _opacity(at: Tensor) -> Tensor:
     tip, along, card = at.unbind(1)
     place = along / _SPACING + _LEAN * (tip * (0.7 + 0.3 * torch.sin(1.7 * along))) + 0.37 * card.round()
     hair = place.floor()
-    luck = torch.frac(torch.sin(hair * 12.9898 + card.round() * 78.233) * 43758.5453).abs()
-    length = _SHORTEST + (1 - _SHORTEST) * luck
+    random = torch.frac(torch.sin(hair * 12.9898 + card.round() * 78.233) * 43758.5453).abs()
+    length = _MIN_LENGTH + (1 - _MIN_LENGTH) * random
     width = 0.5 * _ROOT * (1 - tip / length).clamp(0, 1).sqrt()
-    off = (place - hair - 0.5 + 0.2 * (luck - 0.5)).abs()
-    return ((width - off) / 0.06 + 0.5).clamp(0, 1) * (tip < length)
+    offset = (place - hair - 0.5 + 0.2 * (random - 0.5)).abs()
+    return ((width - offset) / 0.06 + 0.5).clamp(0, 1) * (tip < length)

@@ -1,4 +1,4 @@
-"""Colours made for parts that bring none: decided at points of the part, laid out as its texture coordinates say."""
+"""Colours made for parts that bring none: computed at points of the part, laid out by its texture coordinates."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Paint:
 
 
 def painted(mesh: Mesh, rows: Tensor, values: Tensor, color: Callable[[Tensor], Tensor], side: int = _SIDE) -> Paint:
-    """Colours by what is known of the vertices, as a picture where one tile holds the part's texture coordinates.
+    """Colours by values at the vertices, as an image where one tile holds the part's texture coordinates.
 
     Args:
         mesh: V vertices.
         rows: the part's triangles, (K,).
         values: of the vertices, (V,C).
         color: sRGB and opacity (N,4) of values (N,C).
-        side: texels a side of the picture.
+        side: texels a side of the image.
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         return Paint(None, color(values).float())

@@ -16,7 +16,7 @@ from torchface.io.gltf.region_materials import EYEBALL, EYELASHES, PARTS, SKIN, 
 from torchface.mesh import Mesh
 
 _RASTER = 512
-_OWNED = 0.5
+_MIN_OWN_FRACTION = 0.5
 
 ColorSource = Literal["texture", "colors", "material"]
 
@@ -29,7 +29,7 @@ class Surface:
         triangles: rows of the mesh's faces, ascending, (K,).
         material: what they are made of.
         color_source: where their colour is: in the mesh's texture, in its vertex colours, or in the material.
-        part: the region of an eyeball that turns about a node of its own.
+        part: the region of an eyeball that rotates about a node of its own.
         paint: of an eyeball or lashes whose colour is in the material.
     """
 
@@ -40,31 +40,31 @@ class Surface:
     paint: Paint | None = None
 
 
-def surfaces(mesh: Mesh, pictured: bool) -> list[Surface]:
+def surfaces(mesh: Mesh, has_image: bool) -> list[Surface]:
     """The primitives of a mesh, skin first; one where no region names a part.
 
-    A part wears the mesh's texture where texels are its own. Texture coordinates beyond the unit square name other
-    pictures (UDIM), which a mesh does not have, and charts that lie on those of another part's have lost theirs.
+    A part has the mesh's texture where texels are its own. Texture coordinates beyond the unit square name other
+    images (UDIM), which a mesh does not have, and charts that lie on those of another part's have lost theirs.
 
     Args:
         mesh: V vertices.
-        pictured: there is a picture in its layout: a texture, or normal maps.
+        has_image: there is an image in its layout: a texture, or normal maps.
     """
     groups = _groups(mesh)
     if len(groups) == 1 and groups[0][0] is SKIN:
         everything = torch.arange(len(mesh.faces))
         return [Surface(everything, SKIN, _color_source(mesh, mesh.texture is not None and mesh.uvs is not None))]
-    own = _own_texels(mesh, groups) if pictured else torch.zeros(len(mesh.faces), dtype=torch.bool)
+    textured = _with_own_texels(mesh, groups) if has_image else torch.zeros(len(mesh.faces), dtype=torch.bool)
     found: list[Surface] = []
     for material, part, triangles in groups:
         if material is SKIN:
-            pieces = [(triangles[own[triangles]], True), (triangles[~own[triangles]], False)]
+            pieces = [(triangles[textured[triangles]], True), (triangles[~textured[triangles]], False)]
             found += [
                 Surface(rows, SKIN, _color_source(mesh, owns and mesh.texture is not None))
                 for rows, owns in pieces
                 if len(rows)
             ]
-        elif mesh.texture is not None and bool(own[triangles].all()):
+        elif mesh.texture is not None and bool(textured[triangles].all()):
             found.append(Surface(triangles, material, "texture", part))
         elif material is EYEBALL:
             layers = painted_eye(mesh, triangles)
@@ -78,10 +78,10 @@ def surfaces(mesh: Mesh, pictured: bool) -> list[Surface]:
 def parts_without_texels(mesh: Mesh) -> Tensor:
     """Triangles (F,) of parts other than skin that a texture in the mesh's layout does not show; see `surfaces`."""
     groups = _groups(mesh)
-    own = _own_texels(mesh, groups)
+    textured = _with_own_texels(mesh, groups)
     bare = torch.zeros(len(mesh.faces), dtype=torch.bool)
     for material, _, triangles in groups:
-        if material is not SKIN and not bool(own[triangles].all()):
+        if material is not SKIN and not bool(textured[triangles].all()):
             bare[triangles] = True
     return bare
 
@@ -114,7 +114,7 @@ def _groups(mesh: Mesh) -> list[tuple[PartMaterial, str | None, Tensor]]:
     return [(SKIN, None, free.nonzero()[:, 0]), *parts] if free.any() else parts
 
 
-def _own_texels(mesh: Mesh, groups: list[tuple[PartMaterial, str | None, Tensor]]) -> Tensor:
+def _with_own_texels(mesh: Mesh, groups: list[tuple[PartMaterial, str | None, Tensor]]) -> Tensor:
     """Triangles (F,) in the unit square whose part is the one that a texture baked in this layout shows there."""
     if mesh.uvs is None or mesh.uv_faces is None:
         return torch.zeros(len(mesh.faces), dtype=torch.bool)
@@ -129,9 +129,9 @@ def _own_texels(mesh: Mesh, groups: list[tuple[PartMaterial, str | None, Tensor]
     group = torch.full((len(mesh.faces) + 1,), -1)  # the last answers for texels that no triangle covers
     for number, (_, _, triangles) in enumerate(groups):
         group[triangles] = number
-    own = torch.zeros(len(mesh.faces), dtype=torch.bool)
+    textured = torch.zeros(len(mesh.faces), dtype=torch.bool)
     for number, (_, _, triangles) in enumerate(groups):
         here = triangles[inside[triangles] & (above[triangles] >= 0)]
-        if len(here) and float((group[above[here]] == number).double().mean()) > _OWNED:
-            own[triangles] = inside[triangles]
-    return own
+        if len(here) and float((group[above[here]] == number).double().mean()) > _MIN_OWN_FRACTION:
+            textured[triangles] = inside[triangles]
+    return textured
