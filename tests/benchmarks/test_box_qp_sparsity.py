@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -11,11 +12,34 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
-from torchface.capture.markers import observability, sparsity_by_rule, sparsity_experiment
+from torchface.capture.markers import observability, sparsity_by_rule
 from torchface.capture.markers.marker_solver import SPARSITY
+from torchface.capture.markers.sparsity import with_sparsity
 
 matplotlib.use("Agg")
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A solve at one sparsity, means over the frames; errors are root mean squares."""
+
+    sparsity: float
+    active: float
+    weight_sum: float
+    marker_error: float
+    weight_error: float
+
+    @staticmethod
+    def of(solver: MarkerSolver, markers: Tensor, truth: Tensor) -> Trial:
+        weights = solver(markers)
+        return Trial(
+            float(solver.sparsity),
+            float((weights > 0.01).sum(-1).double().mean()),
+            float(weights.sum(-1).mean()),
+            float(solver.squared_distance(markers, weights).mean()) ** 0.5,
+            float((weights - truth).square().mean().sqrt()),
+        )
 
 
 @pytest.mark.real
@@ -29,7 +53,7 @@ def test_sparsity_on_real_takes(real_capture: tuple[BlendshapeRig, Attachment, l
     points = points + 0.3 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
     by_rule = [sparsity_by_rule(solver, take) for take in points.split([len(take) for take in takes])]
     sparsities = [0.0, 0.003, SPARSITY, 0.03, 0.1, 0.3, 1.0]
-    trials = sparsity_experiment(solver, points, sparsities, truth)
+    trials = [Trial.of(with_sparsity(solver, sparsity), points, truth) for sparsity in sparsities]
 
     print(f"\n{observability(solver)}")
     print(f"{count} markers, {len(truth)} real frames, 0.3 mm noise; by the rule: "

@@ -10,7 +10,7 @@ from torchface.capture.markers.hybrid_solver import HybridSolver, gamma_curves
 from torchface.capture.markers.marker_labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.markers.observability import Observability, observability
-from torchface.capture.markers.sparsity import SparsityTrial, sparsity_by_rule, sparsity_experiment
+from torchface.capture.markers.sparsity import sparsity_by_rule
 from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
 
@@ -26,7 +26,6 @@ __all__ = [
     "MarkerSolver",
     "Observability",
     "SiteUncertainty",
-    "SparsityTrial",
     "WholeTakeSolver",
     "align_take",
     "check_attachment",
@@ -40,5 +39,4 @@ __all__ = [
     "rest_residual",
     "sites_by_shape",
     "sparsity_by_rule",
-    "sparsity_experiment",
 ]

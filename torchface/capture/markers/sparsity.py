@@ -1,72 +1,12 @@
-"""How much sparsity a solve wants: the paper's rule, and the experiment behind it."""
+"""The weight of the L1 penalty by the paper's rule."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 from torch import Tensor
 
 from torchface.capture.markers.marker_solver import MarkerSolver
-from torchface.errors import ShapeError
-
-ACTIVE = 0.01
-
-
-@dataclass(frozen=True)
-class SparsityTrial:
-    """A solve at one sparsity, means over the frames.
-
-    Args:
-        sparsity: β, mm² a marker for a weight of 1.
-        active: shapes whose weight exceeds 0.01.
-        weight_sum: the sum of the weights.
-        marker_error: root mean square distance of the markers, millimetres.
-        weight_error: root mean square error of the weights, where the truth is known.
-    """
-
-    sparsity: float
-    active: float
-    weight_sum: float
-    marker_error: float
-    weight_error: float | None = None
-
-
-def sparsity_experiment(
-    solver: MarkerSolver, markers: Tensor, sparsities: Sequence[float], truth: Tensor | None = None
-) -> list[SparsityTrial]:
-    """Solves the same frames at several sparsities.
-
-    Args:
-        solver: everything but the sparsity.
-        markers: (T,M,3), millimetres, NaN for not seen.
-        sparsities: the values of β to try; 0 is the solve without.
-        truth: the true weights, (T,N), where they are known.
-
-    Returns:
-        One trial a value, in order.
-
-    Source: thesis 4.1.4 and figure 74.
-    """
-    if truth is not None and truth.shape != (len(markers), len(solver.names)):
-        raise ShapeError(f"truth: found {tuple(truth.shape)}, expected ({len(markers)},{len(solver.names)})")
-    trials = []
-    for sparsity in sparsities:
-        trial = with_sparsity(solver, sparsity)
-        weights = trial(markers)
-        squared = _squared_marker_error(trial, markers, weights)
-        error = None if truth is None else float((weights - truth.to(weights)).square().mean().sqrt())
-        trials.append(
-            SparsityTrial(
-                float(sparsity),
-                float((weights > ACTIVE).sum(-1).double().mean()),
-                float(weights.sum(-1).mean()),
-                squared**0.5,
-                error,
-            )
-        )
-    return trials
 
 
 def sparsity_by_rule(solver: MarkerSolver, markers: Tensor) -> float:
@@ -84,7 +24,8 @@ def sparsity_by_rule(solver: MarkerSolver, markers: Tensor) -> float:
     """
     free = with_sparsity(solver, 0.0)
     weights = free(markers)
-    return _squared_marker_error(free, markers, weights) / max(float(weights.sum(-1).mean()), 1e-9)
+    squared = float(free.squared_distance(markers, weights).mean())
+    return squared / max(float(weights.sum(-1).mean()), 1e-9)
 
 
 def with_sparsity(solver: MarkerSolver, sparsity: float) -> MarkerSolver:
@@ -96,8 +37,3 @@ def with_sparsity(solver: MarkerSolver, sparsity: float) -> MarkerSolver:
     other.sparsity = float(sparsity)
     other.regularization(solver.rest)
     return other
-
-
-def _squared_marker_error(solver: MarkerSolver, markers: Tensor, weights: Tensor) -> float:
-    """Mean over the frames of the mean squared distance of seen markers, mm²."""
-    return float(solver.squared_distance(markers, weights).mean())
