@@ -6,14 +6,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.errors import ValueRangeError
+from torchface.onnx import ExportReport, export_model
 from torchface.onnx import dynamics_prior_graph as exporting
-from torchface.onnx import export_model
 from torchface.synthetic.stages.weight_curves import perform
 
 
@@ -28,10 +29,16 @@ def prior(request: pytest.FixtureRequest) -> DynamicsPrior:
     return DynamicsPrior.fit(takes, track.names, request.param, input_noise=0.01, settings=settings)
 
 
-def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, tmp_path: Path) -> None:
-    report = export_model(prior, tmp_path / "prior.onnx", {"licence": "MIT"})
+@pytest.fixture(scope="module")
+def report(prior: DynamicsPrior, tmp_path_factory: pytest.TempPathFactory) -> ExportReport:
+    report = export_model(prior, tmp_path_factory.mktemp("graph") / "prior.onnx", {"licence": "MIT"})
+    assert isinstance(report, ExportReport)
+    return report
+
+
+def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, report: ExportReport) -> None:
     assert "ONNX Runtime against PyTorch" in str(report)
-    session = onnxruntime.InferenceSession(tmp_path / "prior.onnx", providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(report.path, providers=["CPUExecutionProvider"])
     track = perform(300, torch.Generator().manual_seed(9)).weights
     assert track is not None
     windows = track.values[..., 0].unfold(0, prior.window, 1).transpose(1, 2).contiguous()
@@ -47,8 +54,9 @@ def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, tmp_path: Path) 
 
 
 def test_a_graph_that_differs_is_not_written(
-    prior: DynamicsPrior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    prior: DynamicsPrior, report: ExportReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(exporting, "exported_model", lambda *_: onnx.load(report.path))
     monkeypatch.setattr(exporting, "_PARITY", {"mean": -1.0, "deviation": 1.0})
     with pytest.raises(ValueRangeError, match="mean differ"):
         export_model(prior, tmp_path / "prior.onnx")

@@ -10,7 +10,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
@@ -22,7 +22,8 @@ from torchface.io import save_rig
 from torchface.io.camera_files import save_calibration
 from torchface.onnx import VideoGraph, VideoReport, export_video_solver
 from torchface.onnx import video_graph_export as video_export
-from torchface.onnx.symmetric_inverse import swept_inverse
+from torchface.onnx.exported_model import exported_model
+from torchface.onnx.unrolled_operators import TRANSLATIONS, symmetric_inverse
 from torchface.onnx.video_graph_export import filmed
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
@@ -67,11 +68,20 @@ def played(graph: VideoGraph, landmarks: Tensor) -> list[dict[str, Tensor]]:
     return found
 
 
-def test_sweeps_invert() -> None:
+class Inverse(nn.Module):
+    def forward(self, matrix: Tensor) -> Tensor:
+        return symmetric_inverse(matrix)
+
+
+def test_the_operator_of_the_graph_inverts(tmp_path: Path) -> None:
     rows = torch.randn(9, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rows = rows * torch.logspace(-2, 2, 6, dtype=torch.float64)
     matrix = rows.T @ rows
-    torch.testing.assert_close(swept_inverse(matrix), torch.linalg.inv(matrix), rtol=1e-9, atol=0)
+    model = exported_model(Inverse(), {"matrix": matrix}, ["inverse"], {}, translations=TRANSLATIONS)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    (found,) = session.run(None, {"matrix": matrix.numpy()})
+    torch.testing.assert_close(torch.from_numpy(found), torch.linalg.inv(matrix), rtol=1e-9, atol=0)
+    torch.testing.assert_close(symmetric_inverse(matrix), torch.linalg.inv(matrix), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("remembers", [False, True])
@@ -161,12 +171,17 @@ def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig)
 
 
 def test_a_graph_that_differs_is_not_written(
-    rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    written: VideoReport,
+    rig: BlendshapeRig,
+    dynamics: DynamicsPrior,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(video_export, "_PARITY", -1.0)
+    """The file of a solver with a prior is no solver without one."""
+    monkeypatch.setattr(video_export, "exported_model", lambda *_, **__: onnx.load(written.path))
     monkeypatch.setattr(video_export, "FRAMES", 3)
     with pytest.raises(ValueRangeError, match="differ from PyTorch's"):
-        export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", settings=VideoSettings(steps=1))
+        export_video_solver(rig, CAMERA, tmp_path / "solver.onnx", dynamics=dynamics)
     assert not list(tmp_path.iterdir())
 
 

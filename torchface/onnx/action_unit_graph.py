@@ -10,14 +10,14 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface import __version__
-from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupClassifier
+from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.action_units.local_warps import local_warps
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
-from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.exported_model import exported_model
 
 _TEST_FRAMES = 64
 # The share of frames in which rounding may turn a vote that hangs in the balance.
@@ -88,74 +88,58 @@ def export_action_units(
 
 
 def action_unit_model(classifier: ActionUnitClassifier) -> onnx.ModelProto:
-    """The graph: one convolution for all regions, then three products and a vote a group."""
-    build = GraphBuilder()
-    op = build.op
-    parts = classifier.group_classifiers()
-    gabor, count, size = parts[0].gabor, len(classifier.regions), classifier.size
-    filters, places = len(gabor.even), gabor.places(size)
-    reach = gabor.even.shape[-1] // 2
-    build.constant("filters", torch.cat([gabor.even, gabor.odd]))
-    build.constant("margins", (0, 0, reach, reach, 0, 0, reach, reach))
-    build.constant("one_channel", (-1, 1, size, size))
-    build.constant("merged", (-1, count, filters * places * places))
-    build.constant("flat", (0, -1))
-    build.constant("floor", 1e-8)
-    build.constant("zero", 0.0)
-    build.constant("one", 1.0)
-    build.constant("three", 3.0)
-    for name, value in (("begin", 0), ("middle", filters), ("end", 2 * filters), ("axis", 1)):
-        build.constant(name, (value,))
-
-    def magnitudes(regions: str) -> str:
-        padded = op("Pad", op("Reshape", regions, "one_channel"), "margins", mode="edge")
-        waves = op("Conv", padded, "filters", strides=[gabor.stride] * 2)
-        even, odd = op("Slice", waves, "begin", "middle", "axis"), op("Slice", waves, "middle", "end", "axis")
-        energy = op("Add", op("Add", op("Mul", even, even), op("Mul", odd, odd)), "floor")
-        return op("Reshape", op("Sqrt", energy), "merged")
-
-    features = op("Sub", magnitudes("regions"), magnitudes("rest"))
-    intensities = []
-    for i, part in enumerate(parts):
-        rows = tuple(classifier.regions.index(name) for name in part.group.regions)
-        own = op("Gather", features, build.constant(f"regions_{i}", rows), axis=1)
-        intensities.append(_vote(build, part, i, op("Reshape", own, "flat")))
-    op("Concat", *intensities, axis=1, output="intensities")
-    return build.model(
-        "action_units",
-        {"regions": ("batch", count, size, size), "rest": (count, size, size)},
-        {"intensities": ("batch", len(classifier.units))},
+    """The graph of :class:`IntensityVotes`."""
+    rest = classifier.neutral
+    return exported_model(
+        IntensityVotes(classifier),
+        {"regions": rest.expand(2, -1, -1, -1).contiguous(), "rest": rest},
+        ["intensities"],
         {
             "task": "action_units",
             "regions": list(classifier.regions),
             "units": list(classifier.units),
             "version": __version__,
         },
+        {"regions": ("batch",)},
     )
 
 
-def _vote(build: GraphBuilder, part: GroupClassifier, number: int, features: str) -> str:
-    """The intensities of one group; mean and deviations go into the components."""
-    op = build.op
+class IntensityVotes(nn.Module):
+    """``ActionUnitClassifier`` with one convolution for all regions; mean and deviations go into the components.
 
-    def constant(name: str, value: Tensor) -> str:
-        return build.constant(f"{name}_{number}", value)
+    Args:
+        classifier: a trained one.
+    """
 
-    machine = part.machine
-    components = (part.components.double() / part.deviations.double()[:, None]).T
-    offset = -(part.mean.double() @ components)
-    reduced = op("Gemm", features, constant("components", components), constant("offset", offset))
-    distance = op("Gemm", reduced, constant("planes", machine.weight), constant("bias", machine.bias), transB=1)
-    first = op("Cast", op("Greater", distance, "zero"), to=onnx.TensorProto.FLOAT)
-    votes = op(
-        "Add",
-        op("MatMul", first, constant("for_first", machine.first_class)),
-        op("MatMul", op("Sub", "one", first), constant("for_second", machine.second_class)),
-    )
-    margin = op("MatMul", distance, constant("between", machine.first_class - machine.second_class))
-    bounded = op("Div", margin, op("Mul", "three", op("Add", op("Abs", margin), "one")))
-    best = op("ArgMax", op("Add", votes, bounded), axis=1, keepdims=0)
-    return op("Gather", constant("intensities", part.intensities), best, axis=0)
+    filters: Tensor
+
+    def __init__(self, classifier: ActionUnitClassifier) -> None:
+        super().__init__()
+        self.parts = classifier.group_classifiers()
+        self.gabor = self.parts[0].gabor
+        self.register_buffer("filters", torch.cat([self.gabor.even, self.gabor.odd]))
+        for i, part in enumerate(self.parts):
+            components = (part.components.double() / part.deviations.double()[:, None]).T
+            self.register_buffer(f"rows_{i}", torch.tensor([classifier.regions.index(n) for n in part.group.regions]))
+            self.register_buffer(f"offset_{i}", -(part.mean.double() @ components).float())
+            self.register_buffer(f"components_{i}", components.float())
+
+    def forward(self, regions: Tensor, rest: Tensor) -> Tensor:
+        """Intensities (B,A) of regions (B,R,h,w) and those at rest (R,h,w)."""
+        features = self._magnitudes(regions) - self._magnitudes(rest[None])
+        intensities = []
+        for i, part in enumerate(self.parts):
+            own = features.index_select(1, getattr(self, f"rows_{i}")).flatten(1)
+            reduced = torch.addmm(getattr(self, f"offset_{i}"), own, getattr(self, f"components_{i}"))
+            intensities.append(part.intensities.index_select(0, part.machine(reduced).argmax(1)))
+        return torch.cat(intensities, dim=1)
+
+    def _magnitudes(self, regions: Tensor) -> Tensor:
+        """Of the Gabor filters, (B,R,D)."""
+        margin = self.filters.shape[-1] // 2
+        padded = nn.functional.pad(regions.flatten(0, 1)[:, None], (margin,) * 4, mode="replicate")
+        even, odd = nn.functional.conv2d(padded, self.filters, stride=self.gabor.stride).chunk(2, dim=1)
+        return (even.square() + odd.square() + 1e-8).sqrt().reshape(-1, regions.shape[1], even[0].numel())
 
 
 def _test_frames(classifier: ActionUnitClassifier) -> Tensor:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import onnx
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.errors import ValueRangeError
 from torchface.modeling import ExpressionRegression
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.exported_model import exported_model
 
 _PARITY = 1e-3  # millimetres
 # Each squares the ratio of the largest eigenvalue to the next: heads are far from round, a few would do.
@@ -52,64 +52,11 @@ def export_expression_regression(
 
 
 def expression_model(model: ExpressionRegression, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    r"""The graph.
-
-    Its rotation onto the mean neutral is Horn's: the largest eigenvector q of a symmetric 4×4 matrix A that is linear
-    in the covariance. Squared again and again, A + I comes to :math:`q q^\top`, in which the rotation is linear.
-    """
-    build = GraphBuilder()
-    op = build.op
-    vertices, shapes = len(model.neutral_mean), len(model.names)
-    centre = model.neutral_mean.double().mean(0)
-    aim = (model.neutral_mean.double() - centre).float()
-    for name, value in {
-        "aim": aim,
-        "aim_region": aim[model.region],
-        "to_quaternion": _horn(),
-        "to_rotation": _rotation_of_products(),
-        "identity": torch.eye(4),
-        "inputs": model.neutral_components.flatten(1).T @ model.coefficients,
-        "offset_mean": model.offset_mean.flatten(),
-        "offset_components": model.offset_components.flatten(1),
-    }.items():
-        build.constant(name, value)
-    # A place that is not predicted takes the row of zeros that is put at the end.
-    rows = torch.full((shapes * vertices,), len(model.places), dtype=torch.int64)
-    rows[model.places] = torch.arange(len(model.places))
-    for name, ids in {
-        "region": model.region.tolist(),
-        "rows": rows.tolist(),
-        "nine": (-1, 9),
-        "sixteen": (-1, 16),
-        "four": (-1, 4, 4),
-        "three": (-1, 3, 3),
-        "wide": (-1, 3 * len(model.region)),
-        "points": (-1, len(model.places), 3),
-        "whole": (-1, shapes, vertices, 3),
-        "one_row": (0, 0, 0, 0, 1, 0),
-        "matrix_axes": (1, 2),
-    }.items():
-        build.constant(name, ids)
-
-    def unit(matrix: str) -> str:
-        return op("Div", matrix, op("Sqrt", op("ReduceSum", op("Mul", matrix, matrix), "matrix_axes", keepdims=1)))
-
-    laid = op("Sub", "neutrals", op("ReduceMean", "neutrals", axes=[1], keepdims=1))
-    covariance = op("MatMul", op("Transpose", laid, perm=[0, 2, 1]), "aim")
-    horn = op("Reshape", op("MatMul", op("Reshape", covariance, "nine"), "to_quaternion"), "four")
-    power = op("Add", unit(horn), "identity")
-    for _ in range(_SQUARINGS):
-        power = unit(op("MatMul", power, power))
-    rotation = op("Reshape", op("MatMul", op("Reshape", power, "sixteen"), "to_rotation"), "three")
-    seen = op("MatMul", op("Gather", laid, "region", axis=1), op("Transpose", rotation, perm=[0, 2, 1]))
-    form = op("Reshape", op("Sub", seen, "aim_region"), "wide")
-    told = op("Gemm", op("MatMul", form, "inputs"), "offset_components", "offset_mean")
-    placed = op("Gather", op("Pad", op("Reshape", told, "points"), "one_row"), "rows", axis=1)
-    op("Reshape", op("MatMul", placed, rotation), "whole", output="offsets")
-    return build.model(
-        "expression_regression",
-        {"neutrals": ("batch", vertices, 3)},
-        {"offsets": ("batch", shapes, vertices, 3)},
+    """The graph of :class:`OffsetRegression`."""
+    return exported_model(
+        OffsetRegression(model),
+        {"neutrals": model.neutral_mean.expand(2, -1, -1).contiguous()},
+        ["offsets"],
         {
             "task": "expression_regression",
             "shape_names": list(model.names),
@@ -118,7 +65,71 @@ def expression_model(model: ExpressionRegression, facts: Mapping[str, object] | 
             "version": __version__,
             **(facts or {}),
         },
+        {"neutrals": ("batch",)},
     )
+
+
+class OffsetRegression(nn.Module):
+    r"""``ExpressionRegression.offsets`` in operators that ONNX has.
+
+    Its rotation onto the mean neutral is Horn's: the largest eigenvector q of a symmetric 4×4 matrix A that is linear
+    in the covariance. Squared again and again, A + I comes to :math:`q q^\top`, in which the rotation is linear.
+
+    Args:
+        model: of the form "offsets".
+    """
+
+    target: Tensor
+    target_region: Tensor
+    to_quaternion: Tensor
+    to_rotation: Tensor
+    identity: Tensor
+    inputs: Tensor
+    offset_mean: Tensor
+    offset_components: Tensor
+    region: Tensor
+    rows: Tensor
+
+    def __init__(self, model: ExpressionRegression) -> None:
+        super().__init__()
+        vertices, shapes, places = len(model.neutral_mean), len(model.names), len(model.places)
+        target = (model.neutral_mean.double() - model.neutral_mean.double().mean(0)).float()
+        # A vertex that is not predicted takes the row of zeros that is put at the end.
+        rows = torch.full((shapes * vertices,), places)
+        rows[model.places] = torch.arange(places)
+        self.sizes = (-1, shapes, vertices, 3)
+        for name, value in {
+            "target": target,
+            "target_region": target[model.region],
+            "to_quaternion": _horn(),
+            "to_rotation": _rotation_of_products(),
+            "identity": torch.eye(4),
+            "inputs": model.neutral_components.flatten(1).T @ model.coefficients,
+            "offset_mean": model.offset_mean.flatten(),
+            "offset_components": model.offset_components.flatten(1),
+            "region": model.region,
+            "rows": rows,
+        }.items():
+            self.register_buffer(name, value)
+
+    def forward(self, neutrals: Tensor) -> Tensor:
+        """Offsets (B,N,V,3) of neutrals (B,V,3)."""
+        centred = neutrals - neutrals.mean(1, keepdim=True)
+        covariance = centred.mT @ self.target
+        power = _unit((covariance.reshape(-1, 9) @ self.to_quaternion).reshape(-1, 4, 4)) + self.identity
+        for _ in range(_SQUARINGS):
+            power = _unit(power @ power)
+        rotation = (power.reshape(-1, 16) @ self.to_rotation).reshape(-1, 3, 3)
+        aligned = centred.index_select(1, self.region) @ rotation.mT
+        coefficients = (aligned - self.target_region).flatten(1) @ self.inputs
+        predicted = torch.addmm(self.offset_mean, coefficients, self.offset_components).unflatten(1, (-1, 3))
+        offsets = nn.functional.pad(predicted, (0, 0, 0, 1)).index_select(1, self.rows)
+        return (offsets @ rotation).reshape(self.sizes)
+
+
+def _unit(matrix: Tensor) -> Tensor:
+    """Matrices (B,4,4) over their norm."""
+    return matrix / matrix.square().sum((1, 2), keepdim=True).sqrt()
 
 
 def _horn() -> Tensor:

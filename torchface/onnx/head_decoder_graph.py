@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx
 import torch
+from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.exported_model import exported_model
 
 _PARITY = {"vertices": 1e-3, "colors": 1e-4}
 _UNITS = {"vertices": "millimetres", "colors": "of the range"}
@@ -49,18 +50,7 @@ def export_head_decoder(model: HeadModel, path: str | Path, facts: Mapping[str, 
 
 def head_decoder_model(model: HeadModel, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph: a matrix product for shape, another for colour."""
-    build = GraphBuilder()
-    vertices = len(model.shape.mean)
-    build.constant("table", (-1, vertices, 3))
-    _decode(build, model.shape, "shape", "vertices")
-    inputs: dict[str, Sequence[int | str]] = {"shape": ("batch", model.shape.count)}
-    outputs: dict[str, Sequence[int | str]] = {"vertices": ("batch", vertices, 3)}
-    if model.color is not None:
-        build.constant("zero", 0.0)
-        build.constant("one", 1.0)
-        plain = _decode(build, model.color, "color", None)
-        build.op("Clip", plain, "zero", "one", output="colors")
-        inputs["color"], outputs["colors"] = ("batch", model.color.count), ("batch", vertices, 3)
+    parts = {"shape": model.shape} if model.color is None else {"shape": model.shape, "color": model.color}
     metadata = {
         "task": "head_decoder",
         "units": "millimetres",
@@ -71,10 +61,28 @@ def head_decoder_model(model: HeadModel, facts: Mapping[str, object] | None = No
     }
     if model.landmarks is not None:
         metadata["landmarks"] = model.landmarks.tolist()
-    return build.model("head_decoder", inputs, outputs, metadata)
+    return exported_model(
+        _Decoder(parts),
+        {name: torch.zeros(2, part.count) for name, part in parts.items()},
+        ["vertices", "colors"][: len(parts)],
+        metadata,
+        dict.fromkeys(parts, ("batch",)),
+    )
 
 
-def _decode(build: GraphBuilder, model: MorphableModel, given: str, output: str | None) -> str:
-    modes = build.constant(f"{given}_modes", model.modes.flatten(1))
-    mean = build.constant(f"{given}_mean", model.mean.flatten())
-    return build.op("Reshape", build.op("Gemm", given, modes, mean), "table", output=output)
+class _Decoder(nn.Module):
+    """Shape and colour of coefficients, with the mean in the same operation as the product."""
+
+    def __init__(self, parts: Mapping[str, MorphableModel]) -> None:
+        super().__init__()
+        for name, part in parts.items():
+            self.register_buffer(f"{name}_modes", part.modes.flatten(1))
+            self.register_buffer(f"{name}_mean", part.mean.flatten())
+
+    def forward(self, shape: Tensor, color: Tensor | None = None) -> tuple[Tensor, ...]:
+        vertices = self._decoded("shape", shape)
+        return (vertices,) if color is None else (vertices, self._decoded("color", color).clamp(0, 1))
+
+    def _decoded(self, name: str, coefficients: Tensor) -> Tensor:
+        mean, modes = getattr(self, f"{name}_mean"), getattr(self, f"{name}_modes")
+        return torch.addmm(mean, coefficients, modes).unflatten(1, (-1, 3))

@@ -22,7 +22,8 @@ from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.rotations import rotation_matrix
-from torchface.onnx.traced_model import traced_model
+from torchface.onnx.exported_model import exported_model
+from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph import LANDMARKS, VideoGraph
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
@@ -178,7 +179,7 @@ def write_video_solver(
         film = Film(landmarks, torch.ones(landmarks.shape[:2]), weights)
     landmarks = film.landmarks
     names = ["landmarks", "confidence", *(f"previous_{name}" for name in graph.state)]
-    model = traced_model(
+    model = exported_model(
         graph,
         dict(zip(names, (landmarks[0], torch.ones(LANDMARKS), *graph.start()), strict=True)),
         graph.outputs,
@@ -195,6 +196,7 @@ def write_video_solver(
             "settings": asdict(solver.settings),
             **(facts or {}),
         },
+        translations=TRANSLATIONS,
     )
     content = model.SerializeToString()
     options = onnxruntime.SessionOptions()

@@ -150,12 +150,13 @@ class DynamicsPrior(nn.Module):
             ShapeError: fewer frames than the window, or another number of shapes.
         """
         windows = newest_frames(windows, self.window, len(self.names))
-        motion = torch.einsum("bjn,jo->bon", windows - self.center, self.basis)
+        motion = self.basis.T @ (windows - self.center)
         process_mean, process_variance = self.processes((motion / self.feature_scale).flatten(1))
         steps = (windows * self.coefficients).sum(1)
         scale = self.target_scale * self.gain[self.group_index]
         mean = windows[:, -1] + steps + scale * process_mean
-        variance = scale.square() * process_variance[:, self.group_index] + self.noise(moving_parts(windows, motion))
+        variance = scale.square() * process_variance.index_select(1, self.group_index)
+        variance = variance + self.noise(moving_parts(windows, motion))
         return mean.clamp(self.limits[0], self.limits[1]), variance
 
     def energy(self, windows: Tensor) -> Quadratic:

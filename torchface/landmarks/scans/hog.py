@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize, one_hot, pad, unfold
+from torch.nn.functional import avg_pool2d, normalize, pad, unfold
 
 from torchface.errors import ShapeError, ValueRangeError
 
@@ -90,13 +90,11 @@ def cell_map(images: Tensor, layout: HogLayout) -> Tensor:
 def _votes(along_x: Tensor, along_y: Tensor, bins: int) -> Tensor:
     """Magnitudes (B,bins,H,W), each shared between the two bins next to its orientation."""
     magnitude = (along_x.square() + along_y.square()).sqrt()
-    place = torch.atan2(along_y, along_x).remainder(math.pi) * (bins / math.pi)
-    lower = place.floor()
-    share = place - lower
-    first = lower.long() % bins
-    votes = one_hot(first, bins) * (magnitude * (1 - share))[..., None]
-    votes = votes + one_hot((first + 1) % bins, bins) * (magnitude * share)[..., None]
-    return votes.permute(0, 3, 1, 2)
+    # Over half a turn no quadrant is needed.
+    place = torch.atan(along_y / torch.where(along_x == 0, 1e-30, along_x)) * (bins / math.pi)
+    place = torch.where(place < 0, place + bins, place)
+    distance = (place[:, None] - torch.arange(bins, device=place.device).view(1, -1, 1, 1)).abs()
+    return (1 - torch.minimum(distance, bins - distance)).clamp(min=0) * magnitude[:, None]
 
 
 def windows(cells: Tensor, layout: HogLayout, centres: Tensor) -> Tensor:

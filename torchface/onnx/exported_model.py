@@ -1,0 +1,82 @@
+"""A module as an ONNX model, by ``torch.export``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+
+import onnx
+import torch
+from onnx import helper
+from torch import Tensor, nn
+
+from torchface.onnx.graph_builder import IR_VERSION
+
+OPSET = 18
+"""The oldest that the exporter of PyTorch writes."""
+
+
+def exported_model(
+    module: nn.Module,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    metadata: Mapping[str, object],
+    sizes: Mapping[str, Sequence[str]] | None = None,
+    translations: Mapping[Callable[..., object], Callable[..., object]] | None = None,
+) -> onnx.ModelProto:
+    """The checked model of a module.
+
+    Args:
+        module: of the inputs in their order.
+        inputs: examples by name.
+        outputs: names of what the module returns.
+        metadata: values that are not text become JSON.
+        sizes: names of the first axes of inputs, which may then have any size; the example's is to be 2 or more.
+        translations: of operators that PyTorch does not know from ONNX, functions of the operator's arguments.
+    """
+    # Loaded here: it takes a second, and solvers that run graphs have no need of it.
+    from onnxscript import ir
+
+    shapes = tuple(dict(enumerate((sizes or {}).get(name, ()))) or None for name in inputs)
+    # It warns of missing torchvision, whose operators no graph here has.
+    log = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.filterwarnings(
+                "ignore", r"`isinstance\(treespec", FutureWarning
+            )  # PyTorch's copy of its own trees
+            program = torch.onnx.export(
+                module.eval(),
+                tuple(inputs.values()),
+                input_names=list(inputs),
+                output_names=list(outputs),
+                dynamic_shapes=shapes if any(shapes) else None,
+                opset_version=OPSET,
+                custom_translation_table=dict(translations or {}),
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        log.setLevel(level)
+    if program is None:
+        raise AssertionError("torch.onnx.export returned no program")
+    ir.passes.Sequential(
+        ir.passes.common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        ir.passes.common.LiftSubgraphInitializersToMainGraphPass(),
+        ir.passes.common.DeduplicateInitializersPass(size_limit=2**30),
+        ir.passes.common.ClearMetadataAndDocStringPass(),
+    )(program.model)
+    model = program.model_proto
+    del model.graph.value_info[:], model.metadata_props[:]
+    for value in (*model.graph.input, *model.graph.output):
+        del value.metadata_props[:]
+    model.producer_name, model.producer_version, model.ir_version = "torchface", "", IR_VERSION
+    helper.set_model_props(
+        model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
+    )
+    onnx.checker.check_model(model, full_check=True)
+    return model
