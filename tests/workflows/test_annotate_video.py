@@ -151,7 +151,7 @@ def test_a_drag_takes_neighbours_along_and_is_one_step(video: Path, tracker: Tra
     session.let_go()
     session.reset()
     assert torch.equal(session.landmarks, before)
-    with pytest.raises(ValueRangeError, match="no landmark held"):
+    with pytest.raises(ValueRangeError, match="no landmark grabbed"):
         session.drag(before[0])
     with pytest.raises(ValueRangeError, match="landmark: found 68"):
         session.grab(68)

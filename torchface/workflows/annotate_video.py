@@ -19,10 +19,10 @@ from torchface.landmarks.images.frame_choice import choose_frames
 
 PROPOSALS = "proposals.json"
 _FORMAT = "torchface proposals"
-_LARGEST_FILE = 16 * 2**20
-_MOST = 1000
+_MAX_BYTES = 16 * 2**20
+_MAX_FRAMES = 1000
 Tracker = Callable[[VideoFile], tuple[Tensor, Tensor | None]]
-"""Landmarks (T,68,2) of a video, NaN where lost, and how sure each is, (T,68) in [0,1]."""
+"""Landmarks (T,68,2) of a video, NaN where lost, and the confidence of each, (T,68) in [0,1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Annotation:
     """Frames to be annotated.
 
     Args:
-        frames: pictures, with the user's landmarks where there are some already, else those proposed.
+        frames: images, with the user's landmarks where there are some already, else those proposed.
         saved: names of those with the user's own.
         folder: where files go.
     """
@@ -41,9 +41,9 @@ class Annotation:
 
 
 def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 15) -> Annotation:
-    """Tracks a video, or remembers that it was, and gives the frames to annotate.
+    """Tracks a video, unless that is done already, and gives the frames to annotate.
 
-    What is proposed lies in the folder's ``proposals.json``; with the same video and count nothing is tracked anew.
+    Proposals are kept in the folder's ``proposals.json``; with the same video and count nothing is tracked anew.
     More frames asked for later hold the earlier ones.
 
     Args:
@@ -54,27 +54,27 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
 
     Raises:
         FileFormatError: the video cannot be decoded, or the folder holds proposals for another one.
-        ValueRangeError: the face was never found, or the count makes no sense.
+        ValueRangeError: the face was never found, or the count is out of range.
     """
-    if not 1 <= count <= _MOST:
-        raise ValueRangeError(f"count: found {count}, expected 1 to {_MOST}")
-    film = open_video(video)
-    known = _read(folder / PROPOSALS, film)
-    if known is None or known.asked < count:
-        landmarks, confidence = track(film)
+    if not 1 <= count <= _MAX_FRAMES:
+        raise ValueRangeError(f"count: found {count}, expected 1 to {_MAX_FRAMES}")
+    opened = open_video(video)
+    proposed = _read(folder / PROPOSALS, opened)
+    if proposed is None or proposed.asked < count:
+        landmarks, confidence = track(opened)
         chosen = choose_frames(landmarks, count, confidence)
-        known = _Proposals(count, {int(i): landmarks[i].double() for i in chosen})
-        _write(folder, film, known)
-    wanted = list(known.landmarks)[:count]
-    wanted += [number for number in known.landmarks if number not in wanted and _points(folder, film, number).is_file()]
-    pictures = _pictures(film, wanted)
+        proposed = _Proposals(count, {int(i): landmarks[i].double() for i in chosen})
+        _write(folder, opened, proposed)
+    wanted = list(proposed.landmarks)[:count]
+    wanted += [i for i in proposed.landmarks if i not in wanted and _points(folder, opened, i).is_file()]
+    images = _images(opened, wanted)
     frames, saved = [], []
     for number in wanted:
-        name, points = _name(film, number), known.landmarks[number]
-        if _points(folder, film, number).is_file():
-            points = load_landmark_points(_points(folder, film, number)).ibug()[:, :2]
+        name, points = _name(opened, number), proposed.landmarks[number]
+        if _points(folder, opened, number).is_file():
+            points = load_landmark_points(_points(folder, opened, number)).ibug()[:, :2]
             saved.append(name)
-        frames.append(AnnotatedFrame(name, pictures[number], points))
+        frames.append(AnnotatedFrame(name, images[number], points))
     return Annotation(frames, saved, folder)
 
 
@@ -102,36 +102,36 @@ class _Proposals:
     landmarks: dict[int, Tensor]
 
 
-def _name(film: VideoFile, number: int) -> str:
-    return f"{film.path.stem}_{number:06d}"
+def _name(video: VideoFile, number: int) -> str:
+    return f"{video.path.stem}_{number:06d}"
 
 
-def _points(folder: Path, film: VideoFile, number: int) -> Path:
-    return folder / f"{_name(film, number)}.pts"
+def _points(folder: Path, video: VideoFile, number: int) -> Path:
+    return folder / f"{_name(video, number)}.pts"
 
 
-def _pictures(film: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
+def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
     """Frames (3,H,W) in [0,1] by number, in one pass: codecs seek wrongly too often."""
     wanted, found = set(numbers), {}
-    for number, frame in enumerate(film.color_frames()):
+    for number, frame in enumerate(video.color_frames()):
         if number in wanted:
             found[number] = frame.float() / 255
             if len(found) == len(wanted):
                 break
     missing = wanted - set(found)
     if missing:
-        raise FileFormatError(f"{film.path}: found no frame {min(missing)}, expected the video that was tracked")
+        raise FileFormatError(f"{video.path}: found no frame {min(missing)}, expected the video that was tracked")
     return found
 
 
-def _identity(film: VideoFile) -> dict[str, Any]:
-    return {"video": film.path.name, "frames": film.count, "width": film.width, "height": film.height}
+def _identity(video: VideoFile) -> dict[str, Any]:
+    return {"video": video.path.name, "frames": video.count, "width": video.width, "height": video.height}
 
 
-def _write(folder: Path, film: VideoFile, proposals: _Proposals) -> None:
+def _write(folder: Path, video: VideoFile, proposals: _Proposals) -> None:
     document = {
         "format": _FORMAT,
-        **_identity(film),
+        **_identity(video),
         "asked": proposals.asked,
         "proposals": [
             {"frame": number, "landmarks": [[round(x, 3) for x in row] for row in points.tolist()]}
@@ -141,19 +141,19 @@ def _write(folder: Path, film: VideoFile, proposals: _Proposals) -> None:
     write_json(make_folder(folder) / PROPOSALS, document, indent=None)
 
 
-def _read(path: Path, film: VideoFile) -> _Proposals | None:
+def _read(path: Path, video: VideoFile) -> _Proposals | None:
     if not path.exists():
         return None
-    document = read_json(path, _FORMAT, _LARGEST_FILE)
-    found = {key: document[key].found for key in _identity(film)}
-    if found != _identity(film):
+    document = read_json(path, _FORMAT, _MAX_BYTES)
+    found = {key: document[key].found for key in _identity(video)}
+    if found != _identity(video):
         raise FileFormatError(
             f"{path}: found proposals for {found['video']!r} ({found['frames']} frames of {found['width']} x "
-            f"{found['height']}), expected {film.path.name!r} ({film.count} of {film.width} x {film.height}): name "
+            f"{found['height']}), expected {video.path.name!r} ({video.count} of {video.width} x {video.height}): name "
             "another folder, or remove this file"
         )
     landmarks = {
-        row["frame"].whole(0, film.count - 1): row["landmarks"].tensor(68, 2, expected="68 finite points")
-        for row in document["proposals"].rows(1, _MOST)
+        row["frame"].whole(0, video.count - 1): row["landmarks"].tensor(68, 2, expected="68 finite points")
+        for row in document["proposals"].rows(1, _MAX_FRAMES)
     }
     return _Proposals(document["asked"].whole(), landmarks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -122,7 +122,7 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
         paths: image files of one size, or one video.
         board: the checkerboard.
         out: the ``.toml`` to write; beside it an image of the corners found, and of views without distortion.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         FileFormatError: ``out`` is no ``.toml``, or a file is broken.
@@ -145,7 +145,7 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     overlay_path = out.with_suffix(".png")
     save_calibration(report.calibration, out)
     save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path)
-    return CalibrationReport(**{**vars(report), "overlay_path": overlay_path})
+    return replace(report, overlay_path=overlay_path)
 
 
 def find_boards(
@@ -156,7 +156,7 @@ def find_boards(
     Args:
         images: names and images, uint8 (H,W), of one size.
         board: the checkerboard.
-        progress: told how many images are done.
+        progress: called with the number of images done.
 
     Raises:
         ShapeError: the images differ in size.

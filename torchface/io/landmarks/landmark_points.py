@@ -14,8 +14,8 @@ from torchface.files.documents import read_json
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.landmarks.picks import load_correspondences
 
-_LARGEST_FILE = 16 * 2**20
-_MOST_POINTS = 1_000_000
+_MAX_BYTES = 16 * 2**20
+_MAX_POINTS = 1_000_000
 _IBUG_GROUPS = (
     ("jaw", "chin", 17),
     ("left_eyebrow", "leyebrow", 5),
@@ -36,7 +36,7 @@ class LandmarkPoints:
     Args:
         points: (L,3) in the file's unit, or (L,2) pixels, x right, y down, pixel centres at integers from 0;
             NaN where the file has none.
-        groups: rows by name, such as ``"nose"``, each (n,) int64; empty where the file tells none.
+        groups: rows by name, such as ``"nose"``, each (n,) int64; empty where the file has none.
         source: the file, for what is said of the points.
     """
 
@@ -47,8 +47,8 @@ class LandmarkPoints:
     def ibug(self) -> Tensor:
         """The points in iBUG's order of 68: jaw, brows, nose, eyes, mouth, each from the viewer's left.
 
-        A file that tells groups is read by them, whatever the order of its rows; groups beside those are left aside,
-        and menpo's ``all`` alone tells no order but the file's.
+        A file with groups is read by them, whatever the order of its rows; groups beside those are left aside,
+        and menpo's ``all`` alone means the file's order.
 
         Raises:
             NameMismatchError: the groups are not those of menpo's 68.
@@ -90,7 +90,7 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
             from 0.
 
     Raises:
-        FileFormatError: another ending, or not the content that the ending tells.
+        FileFormatError: another ending, or other content than the ending means.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -98,14 +98,14 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
         return _pts(path)
     if ending not in (".ljson", ".json"):
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected .ljson, .pts or .json")
-    document = read_json(path, max_bytes=_LARGEST_FILE).found
+    document = read_json(path, max_bytes=_MAX_BYTES).found
     if ending == ".json" and isinstance(document, dict) and "format" in document:
         return LandmarkPoints(load_correspondences(path).points, source=str(path))
     return _ljson(path, document)
 
 
 def save_pts(points: Tensor, path: str | Path) -> None:
-    """Writes landmarks in a picture as iBUG's PTS, which counts pixels from 1.
+    """Writes landmarks in an image as iBUG's PTS, which counts pixels from 1.
 
     Args:
         points: (L,2) pixels, x right, y down, pixel centres at integers from 0.
@@ -168,7 +168,7 @@ def _first_version(path: Path, document: dict[str, Any]) -> LandmarkPoints:
 def _points(path: Path, rows: Any) -> Tensor:
     """(L,3), or (L,2) turned from (y, x) to (x, y); null is NaN."""
     width = len(rows[0]) if isinstance(rows, list) and rows and isinstance(rows[0], list) else 0
-    if width not in (2, 3) or len(rows) > _MOST_POINTS:
+    if width not in (2, 3) or len(rows) > _MAX_POINTS:
         raise FileFormatError(f"{path}: found no list of two- or three-dimensional points, expected landmarks")
     numbers = [[float("nan") if x is None else x for x in row] if isinstance(row, list) else [] for row in rows]
     if any(len(row) != width or not all(type(x) in (int, float) for x in row) for row in numbers):
@@ -183,7 +183,7 @@ def _points(path: Path, rows: Any) -> Tensor:
 
 
 def _pts(path: Path) -> LandmarkPoints:
-    text = read_file(path, _LARGEST_FILE).decode("utf-8", "replace")
+    text = read_file(path, _MAX_BYTES).decode("utf-8", "replace")
     head, brace, rest = text.partition("{")
     body, end, _ = rest.partition("}")
     if not brace or not end:

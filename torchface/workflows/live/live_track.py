@@ -128,7 +128,7 @@ def track_live(
         out: a folder for the curves of what was sent; none are kept without.
         settings: models, calibration, face.
         seconds: after which it ends; until it is interrupted (Ctrl-C) or the video ends if absent.
-        progress: told how many frames are sent.
+        progress: called with the number of frames sent.
 
     Raises:
         ValueRangeError: the address is none, the rig lacks landmarks, or no frame came.
