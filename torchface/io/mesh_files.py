@@ -15,6 +15,8 @@ from torchface.mesh import Mesh
 _READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}
 _WRITERS = {".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".off": write_off, ".glb": save_gltf_mesh}
 _GLTF = (".glb", ".gltf")
+MESH_ENDINGS = tuple(_READERS)
+"""What :func:`load_mesh` reads beside glTF, which may hold a rig."""
 
 
 def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:

@@ -13,6 +13,7 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_mesh, load_rig, load_take
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -53,7 +54,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return rows
     if attachment is not None:
         raise FileFormatError(f"{path}: found no rig, expected one to say what the markers of {attachment} tell apart")
-    if suffix in {".obj", ".ply", ".stl", ".off"}:
+    if suffix in MESH_ENDINGS:
         return _mesh_rows(load_mesh(path))
     if suffix in {".c3d", ".trc", ".csv"}:
         return _take_rows(load_take(path))

@@ -11,11 +11,10 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_mesh, load_rig, load_take
+from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.shape_names import mapping
-
-_MESH_ONLY = {".obj", ".ply", ".stl", ".off"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ def load_posed(
         NameMismatchError: a mesh without shapes cannot be posed, or a name means no shape of the rig.
         ValueRangeError: the take holds no weights, or has no such frame.
     """
-    if path.suffix.lower() in _MESH_ONLY:
+    if path.suffix.lower() in MESH_ENDINGS:
         if weights or take is not None:
             raise NameMismatchError(f"{path}: found a mesh without shapes; a pose needs a rig (.glb or a folder)")
         return _at_rest(path, part)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+_MAX_SORTED_COLUMNS = 8
+
 
 @dataclass(frozen=True)
 class Split:
@@ -55,10 +57,17 @@ def merge_equal_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.
     Returns:
         For each row the number of its value, (C,), and for each value its first row, (V,).
     """
-    rows = np.ascontiguousarray(rows + rows.dtype.type(0))  # so that -0 equals 0 byte by byte
-    keys = rows.view([("", np.void, rows.shape[1] * rows.itemsize)]).reshape(-1)
-    _, first, value_of = np.unique(keys, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    return rank[value_of.reshape(-1)], first[order]
+    rows = np.ascontiguousarray(rows + rows.dtype.type(0))  # so that -0 equals 0 bit by bit
+    bits = rows.view(np.int32).reshape(len(rows), -1)
+    if bits.shape[1] > _MAX_SORTED_COLUMNS:
+        wide = rows.view([("", np.void, rows.shape[1] * rows.itemsize)]).reshape(-1)
+        bits = np.unique(wide, return_inverse=True)[1].reshape(-1, 1)
+    order = np.lexsort(bits.T)  # equal rows in the order of their appearance
+    is_first = np.ones(len(rows), bool)
+    is_first[1:] = (bits[order[1:]] != bits[order[:-1]]).any(1)
+    first = order[is_first]
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    value_of = np.empty(len(rows), np.int64)
+    value_of[order] = rank[np.cumsum(is_first) - 1]
+    return value_of, np.sort(first)

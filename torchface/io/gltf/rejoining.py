@@ -10,7 +10,7 @@ import numpy as np
 
 from torchface.io.gltf.container import Document
 from torchface.io.gltf.mesh_extras import read_mesh_count
-from torchface.io.gltf.primitives import Part, filled
+from torchface.io.gltf.primitive_reading import Part, filled
 from torchface.io.gltf.scene import Instance
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
-from torchface.io.gltf.primitives import Part
+from torchface.io.gltf.primitive_reading import Part
 
 
 @dataclass(frozen=True)

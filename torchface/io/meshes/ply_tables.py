@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,30 +135,34 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
     """First unit and number of units of every property in the first rows, (rows, properties, 2)."""
     if element.count > len(body) - at:
         raise _truncated(path, element, len(body) - at, f"at least {element.count}")
-    plan = [(_width(order, kind), count, _width(order, count or kind)) for _, kind, count in element.properties]
-    if any(count is not None and order and np.dtype(count).kind == "f" for _, count, _ in plan):
+    if any(count is not None and order and np.dtype(count).kind == "f" for _, _, count in element.properties):
         raise _truncated(path, element, len(body) - at, "an integer that gives a list's length")
+    plan = [
+        (_width(order, kind), None if count is None else _length_reader(order, count), _width(order, count or kind))
+        for _, kind, count in element.properties
+    ]
     units = body if rows == 1 else body.tobytes() if order else body.tolist()  # quicker one by one
     found: list[tuple[int, int]] = []
+    end = len(body)
     for _ in range(rows):  # where a row begins is known only after the one before
-        for width, count, before in plan:
+        for width, read_length, before in plan:
             length = 1
-            if count is not None:
-                length = _length(units[at : at + before], order, count)
+            if read_length is not None:
+                length = read_length(units, at) if at + before <= end else -1
                 at += before
             found.append((at, length * width))
             at += length * width
-            if length < 0 or at > len(body):
-                raise _truncated(path, element, max(len(body) - found[-1][0], 0), f"a list of {length}")
+            if length < 0 or at > end:
+                raise _truncated(path, element, max(end - found[-1][0], 0), f"a list of {length}")
     return np.array(found, np.int64).reshape(rows, -1, 2)
 
 
-def _length(units: Any, order: str, kind: str) -> int:
-    """The length of a list; -1 for none that can be."""
+def _length_reader(order: str, kind: str) -> Callable[[Any, int], int]:
+    """Reads the length of a list at a unit; -1 for none that can be."""
     if order:
-        return int.from_bytes(bytes(units), "big" if order == ">" else "little", signed=kind[0] == "i")
-    value = float(units[0]) if len(units) else -1.0
-    return int(value) if value.is_integer() else -1
+        unpack = struct.Struct(order + np.dtype(kind).char).unpack_from
+        return lambda units, at: unpack(units, at)[0]
+    return lambda units, at: int(units[at]) if float(units[at]).is_integer() else -1
 
 
 def _width(order: str, kind: str) -> int:

@@ -15,6 +15,7 @@ from pathlib import Path
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.io.length_units import millimetres_per
+from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.registration.corpus.cluster import import_ray, on_cluster
@@ -31,7 +32,7 @@ try:
 except ImportError:  # Windows has none; two runs into one folder then go unnoticed
     fcntl = None  # type: ignore[assignment]
 
-SCAN_ENDINGS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+SCAN_ENDINGS = (*MESH_ENDINGS, ".glb", ".gltf")
 SUMMARY = "summary.csv"
 
 

@@ -12,12 +12,12 @@ from torch import Tensor
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.io import MeshSequence, load_mesh, load_rig, load_take
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
 
-MESH_ENDINGS = (".obj", ".ply", ".stl", ".off")
 _GLTF = (".glb", ".gltf")
 _FORMS = "weights as .csv, an animated .glb, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
