@@ -190,3 +190,14 @@ def test_what_is_written_as_mp4_plays_in_browsers(tmp_path: Path) -> None:
         video = write_video([odd], tmp_path / "odd.mp4", 25.0)
         assert (video.width, video.height) == (161, 121)
         assert (torch.cat(list(video.chunks())).float() - odd.float().reshape(4, -1, 121, 161)[:, 0]).abs().mean() < 2
+
+
+def test_an_ffmpeg_without_x264_writes_mpeg4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(av, "codecs_available", av.codecs_available - {"libx264"})
+    frames = torch.from_numpy(np.stack([pattern(i, 161, 121) for i in range(8)])).permute(0, 3, 1, 2)
+    video = open_video(write_video([frames], tmp_path / "a.mp4", 120000 / 1001).path)
+    with av.open(str(video.path)) as container:
+        assert container.streams.video[0].codec_context.name == "mpeg4"
+    assert (video.width, video.height, video.count) == (161, 121, 8)
+    assert video.fps == pytest.approx(120000 / 1001, rel=1e-5)
+    assert (torch.cat(list(video.color_chunks())).float() - frames.float()).abs().mean() < 5

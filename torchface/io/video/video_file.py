@@ -42,11 +42,6 @@ class VideoFile:
     height: int
     count: int
 
-    @property
-    def seconds(self) -> float:
-        """Duration."""
-        return self.count / self.fps
-
     def check(self) -> None:
         """Goes through the file, decoding key frames alone, and refuses what cannot become a take.
 
