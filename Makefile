@@ -18,9 +18,9 @@ $(VENV)/.installed-%: $(STAMP)
 	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
 	touch $@
 
-# Two processes of one thread each; what costs minutes once (a filmed performer, a trained detector) stays in one of them.
+# Two processes of one thread each; what is costly to make once (a filmed performer, a browser) stays in one of them.
 test: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadgroup
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s

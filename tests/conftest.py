@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import settings
 
 from torchface.attachment import Attachment
+from torchface.geometry.cameras.pinhole import Camera
 from torchface.io import load_rig, load_take
 from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.marker_stage import place_markers
@@ -24,7 +30,33 @@ settings.register_profile("dev", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
+TOGETHER = ("capture/action_units", "viz/browser")
+"""Folders whose files share what costs seconds to make once a process: a filmed performer, a browser."""
+LONGEST = (
+    "capture/action_units",
+    "viz/browser",
+    "workflows",
+    "train",
+    "export",
+    "registration",
+    "modeling",
+    "io/gltf",
+    "cli",
+)
+"""Where the longest tests lie, which go first: then the processes of a run end together."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Orders the tests and says which stay in one process; those on real data are skipped where there is none."""
+    ranks: dict[str, int] = {}
+    for item in items:
+        path = item.path.relative_to(REPOSITORY).as_posix()
+        group = next((folder for folder in TOGETHER if path.startswith(f"tests/{folder}/")), path)
+        item.add_marker(pytest.mark.xdist_group(group))
+        starts = [number for number, folder in enumerate(LONGEST) if path.startswith(f"tests/{folder}/")]
+        ranks[item.nodeid] = min(starts, default=len(LONGEST))
+    items.sort(key=lambda item: ranks[item.nodeid])
     if DATA.is_dir():
         return
     skip = pytest.mark.skip(reason=f"real data not found at {DATA}; set TORCHFACE_DATA to run this test")
@@ -64,6 +96,23 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
         assert track is not None
         weights.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
     return rig, place_markers(rig, 100), weights
+
+
+@pytest.fixture(scope="module")
+def coarse_figures() -> Iterator[None]:
+    """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
+    figures = ("face_views", "marker_maps", "registration_views", "wireframe", "site_views")
+    pages = ("workflows.solve.solve_page", "workflows.register_scans")
+
+    def coarse(mesh: Mesh, camera: Camera, *rest: Any, **more: Any) -> torch.Tensor:
+        given = inspect.signature(render).bind(mesh, camera, *rest, **more)
+        lighting = replace(given.arguments.pop("lighting", DEFAULT_LIGHTING), occlusion_rays=0)
+        return render(**{**given.arguments, "lighting": lighting, "samples": 1})
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (*(f"viz.figures.{name}" for name in figures), *pages):
+            patch.setattr(f"torchface.{module}.render", coarse)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,8 @@ from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel
 from torchface.rig import BlendshapeRig
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 PICKS = torch.arange(26, 600, 41)
 
 

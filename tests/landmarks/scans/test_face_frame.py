@@ -8,6 +8,7 @@ import trimesh
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.nose_search import nose_candidates
 from torchface.landmarks.scans.surface_sample import sample_surface
@@ -30,7 +31,7 @@ def posed(identity: Tensor, seed: int) -> Example:
 
 @pytest.fixture(scope="module")
 def examples() -> list[Example]:
-    identities = draw_identities(9, torch.Generator().manual_seed(5))
+    identities = draw_identities(8, torch.Generator().manual_seed(5))
     return [posed(identity, seed) for seed, identity in enumerate(identities)]
 
 
@@ -39,8 +40,14 @@ def frame(examples: list[Example]) -> FaceFrame:
     return FaceFrame.fit([mesh for mesh, _ in examples[:5]], torch.stack([points for _, points in examples[:5]]))
 
 
-def away(frame: FaceFrame, mesh: Mesh, points: Tensor) -> float:
-    return float((frame.locate(mesh).apply(points[None])[0] - frame.landmarks).norm(dim=-1).mean())
+@pytest.fixture(scope="module")
+def poses(frame: FaceFrame, examples: list[Example]) -> list[Similarity]:
+    """The poses found of the three heads that the frame was not learned from."""
+    return [frame.locate(mesh) for mesh, _ in examples[5:]]
+
+
+def residual(frame: FaceFrame, pose: Similarity, points: Tensor) -> float:
+    return float((pose.apply(points[None])[0] - frame.landmarks).norm(dim=-1).mean())
 
 
 def test_the_frame_stands_upright_and_symmetric(frame: FaceFrame) -> None:
@@ -52,35 +59,35 @@ def test_the_frame_stands_upright_and_symmetric(frame: FaceFrame) -> None:
     assert (mirrored - frame.landmarks).abs().max() < 1.5
 
 
-def test_new_heads_are_found_in_any_pose(frame: FaceFrame, examples: list[Example]) -> None:
-    errors = [away(frame, mesh, points) for mesh, points in examples[5:]]
+def test_new_heads_are_found_in_any_pose(frame: FaceFrame, examples: list[Example], poses: list[Similarity]) -> None:
+    errors = [residual(frame, pose, points) for pose, (_, points) in zip(poses, examples[5:], strict=True)]
     assert max(errors) < 9.0
     assert sum(errors) / len(errors) < 5.0
 
 
-def test_turning_a_scan_turns_its_pose(frame: FaceFrame, examples: list[Example]) -> None:
+def test_turning_a_scan_turns_its_pose(frame: FaceFrame, examples: list[Example], poses: list[Similarity]) -> None:
     mesh, points = examples[6]
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     turned = mesh.with_vertices(mesh.vertices @ turn.T + 50)
-    first, second = frame.locate(mesh), frame.locate(turned)
+    first, second = poses[1], frame.locate(turned)
     here = first.apply(points[None])[0]
     there = second.apply((points @ turn.T.double() + 50)[None])[0]
     assert (here - there).norm(dim=-1).max() < 0.5
 
 
-def test_size_comes_out(frame: FaceFrame, examples: list[Example]) -> None:
+def test_size_comes_out(frame: FaceFrame, examples: list[Example], poses: list[Similarity]) -> None:
     mesh, _ = examples[7]
-    ratio = frame.locate(mesh.with_vertices(0.92 * mesh.vertices)).scale / frame.locate(mesh).scale
+    ratio = frame.locate(mesh.with_vertices(0.92 * mesh.vertices)).scale / poses[2].scale
     assert float(ratio) == pytest.approx(1 / 0.92, rel=0.01)
 
 
 def test_a_scan_inside_out_and_with_crumbs_is_found(frame: FaceFrame, examples: list[Example]) -> None:
-    mesh, points = examples[8]
+    mesh, points = examples[7]
     crumb = trimesh.creation.icosphere(subdivisions=2, radius=6.0)
     extra = torch.tensor(crumb.vertices).float() + mesh.vertices.mean(0) + 200
     vertices = torch.cat([mesh.vertices, extra])
     faces = torch.cat([mesh.faces.flip(1), torch.tensor(crumb.faces).flip(1) + len(mesh.vertices)])
-    assert away(frame, Mesh(vertices, faces), points) < 9.0
+    assert residual(frame, frame.locate(Mesh(vertices, faces)), points) < 9.0
 
 
 def test_the_nose_is_among_the_first_candidates(examples: list[Example]) -> None:

@@ -145,8 +145,8 @@ def test_a_scan_in_another_pose_is_laid_on_the_mesh_by_picked_points(face: Mesh,
 
 
 def test_wrinkles_come_back_from_a_scan_in_another_pose_without_picks(face: Mesh) -> None:
-    scan = moved(patch((-60, 60), (-30, 60), 560, 540, DEPTH), 100, (30.0, 200, -100))
-    baked = bake_normal_map(face, scan, (1024, 2048))
+    scan = moved(patch((-60, 60), (-30, 60), 480, 440, DEPTH), 100, (30.0, 200, -100))
+    baked = bake_normal_map(face, scan, (768, 1536))
     error, relief = error_degrees(face, baked)
     assert relief.median() > 12
     assert error.median() < 5
@@ -160,9 +160,9 @@ def test_a_mesh_baked_on_itself_is_flat_everywhere(face: Mesh) -> None:
 
 
 def test_a_scan_in_another_scale_is_fitted_when_asked(face: Mesh) -> None:
-    scan = patch((-150, 150), (-70, 70), 300, 200, 0.0)
+    scan = patch((-150, 150), (-70, 70), 150, 100, 0.0)
     scan = scan.with_vertices(scan.vertices * 1.04)
-    baked = bake_normal_map(face, scan, SIZE, scale=True)
+    baked = bake_normal_map(face, scan, 64, scale=True)
     assert baked.alignment is not None
     assert float(baked.alignment.similarity.scale) == pytest.approx(1 / 1.04, rel=2e-3)
 
@@ -189,11 +189,12 @@ def test_offset_tells_on_which_side_the_scan_lies(face: Mesh) -> None:
     )
 
 
-def test_a_turned_texture_turns_the_map_but_not_the_normals_it_stands_for(face: Mesh, forehead: Mesh) -> None:
+def test_a_turned_texture_turns_the_map_but_not_the_normals_it_stands_for(forehead: Mesh) -> None:
+    face = patch((-60, 60), (0, 65), 20, 20, 0.0)
     assert face.uvs is not None
     for uvs in (face.uvs.flip(1), torch.stack([1 - face.uvs[:, 0], face.uvs[:, 1]], 1)):  # mirrored, both
         turned = replace(face, uvs=uvs)
-        baked = bake_normal_map(turned, forehead, 2048, alignment=still())
+        baked = bake_normal_map(turned, forehead, 1024, alignment=still())
         assert error_degrees(turned, baked)[0].median() < 3
 
 
@@ -221,10 +222,10 @@ def test_wrinkles_planted_on_a_real_head_come_back_across_its_texture(ict_folder
     dense = torch.from_numpy(points)
     ways = torch.nn.functional.normalize(torch.from_numpy(attributes["normal"]), dim=1)
     scan = Mesh(dense + relief(dense)[:, None] * ways, torch.from_numpy(faces).long())
-    baked = bake_normal_map(mesh, scan, 2048, alignment=still())
+    baked = bake_normal_map(mesh, scan, 1536, alignment=still())
 
-    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, 2048, 2048)
-    hit = baked.hit.flatten()[texels.texels].nonzero()[::20, 0]
+    texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, 1536, 1536)
+    hit = baked.hit.flatten()[texels.texels].nonzero()[::11, 0]
     triangles, barycentric = texels.triangles[hit], texels.barycentric[hit]
     frames = tangent_space(mesh.vertices, mesh.faces, mesh.uvs.double(), mesh.uv_faces, smooth).frames(
         triangles, barycentric

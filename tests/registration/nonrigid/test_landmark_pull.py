@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from torchface.geometry.meshes.proximity import SurfaceIndex
-from torchface.io import load_identity_modes, load_mesh
-from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.mesh import Annotations, Mesh
 from torchface.registration import register
 
@@ -54,15 +51,3 @@ def test_a_jaw_that_is_drawn_right_still_leads(annotated: Mesh, warp, rescanned)
     found = register(annotated, scan, (annotated.landmarks, points))
     assert float((found.mesh.vertices - truth)[annotated.landmarks[:17]].norm(dim=1).mean()) < 0.5
     assert not any("disagree" in note for note in found.record.notes)
-
-
-@pytest.mark.real
-def test_a_real_registration_is_no_worse_with_landmarks(data: Path, ict_folder: Path) -> None:
-    template = load_identity_modes(ict_folder, count=1, part="face").neutral
-    scan = load_mesh(data / "scans" / "james" / "james.obj")
-    points = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug()
-    given, none = (register(template, scan, marks, texture_size=0) for marks in ((template.landmarks, points), None))
-    assert given.record.matched >= none.record.matched - 0.005
-    off = (given.mesh.vertices[template.landmarks[17:]].double() - points[17:]).norm(dim=1)
-    assert float(off.mean()) < 1.2
-    assert any("along the jaw" in note for note in given.record.notes)

@@ -24,6 +24,8 @@ from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 PICKS = torch.arange(26, 600, 41)
 
 

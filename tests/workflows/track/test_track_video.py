@@ -36,6 +36,8 @@ from torchface.workflows.track.track_page import write_track_page
 from torchface.workflows.track.track_state import FOLDER, TrackedFrames, TrackState
 from torchface.workflows.track.track_video import Tracked, TrackSettings, check_length, track_video
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 FRAMES = 11
 PIECE = 4
 QUICK = TrackSettings(overlay=False)
