@@ -57,7 +57,7 @@ class ShapeErrors:
     """Weights by one set of names against weights by another.
 
     Args:
-        names: shapes of the truth that the result has something to say of, N of them.
+        names: shapes of the truth that the result has too, N of them.
         error: of each.
         missing: shapes of the truth that the result lacks.
         frames: how many were compared.
@@ -84,17 +84,18 @@ def shape_errors(found: Tensor, found_names: Sequence[str], true: Tensor, true_n
     if len(found) != len(true):
         raise ShapeError(f"shape_errors: found {len(found)} and {len(true)} frames, expected as many")
     matrix = mapping(found_names, true_names)
-    told = matrix.any(1)
-    if not told.any():
+    compared = matrix.any(1)
+    if not compared.any():
         raise NameMismatchError(
             f"shape_errors: found {', '.join(found_names[:5])}, ...; expected some of {', '.join(true_names[:5])}, ..."
         )
     whole = torch.isfinite(found).all(1) & torch.isfinite(true).all(1)
     if not whole.any():
         raise ValueRangeError("shape_errors: found NaN in every frame, expected weights")
-    error = weight_error(found[whole].float() @ matrix[told].T, true[whole].float()[:, told])
+    error = weight_error(found[whole].float() @ matrix[compared].T, true[whole].float()[:, compared])
     names = [
-        [name for name, has in zip(true_names, told.tolist(), strict=True) if has is wanted] for wanted in (True, False)
+        [name for name, has in zip(true_names, compared.tolist(), strict=True) if has is wanted]
+        for wanted in (True, False)
     ]
     return ShapeErrors(tuple(names[0]), error, tuple(names[1]), int(whole.sum()))
 
@@ -203,15 +204,15 @@ class RigidAlignment:
 
     @property
     def degrees(self) -> Tensor:
-        """How far each frame was turned, (T,)."""
+        """The angle by which each frame was rotated, (T,)."""
         trace = self.motion.rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
         return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
 
 
 def rigidly_aligned(found: Tensor, true: Tensor) -> RigidAlignment:
-    """Each frame (T,V,3) turned and moved, without a change of size, to where it is nearest to the true one (T,V,3).
+    """Each frame (T,V,3) rotated and translated, without scaling, to where it is nearest to the true one (T,V,3).
 
-    A vertex that is NaN in either has no say. Where the two share a space this hides errors of the pose; it is for
+    A vertex that is NaN in either is ignored. Where the two share a space this hides errors of the pose; it is for
     scans and results whose spaces differ.
 
     Raises:
@@ -248,19 +249,19 @@ def error_figures(errors: Tensor) -> ErrorFigures:
 
     Source: thesis 4.2.13.
     """
-    known = torch.isfinite(errors)
-    if not known.any():
+    present = torch.isfinite(errors)
+    if not present.any():
         raise ValueRangeError("error_figures: found no distance that is a number, expected at least one")
-    values = errors[known].double().numpy()
+    values = errors[present].double().numpy()
     median, high = np.quantile(values, (0.5, 0.95))
-    totals = torch.where(known, errors, 0).double().sum(1)[known.any(1)]
+    totals = torch.where(present, errors, 0).double().sum(1)[present.any(1)]
     return ErrorFigures(
         float(values.mean()),
         float(median),
         float(high),
         float(values.max()),
         float(totals.mean()),
-        int(known.any(0).sum()),
+        int(present.any(0).sum()),
     )
 
 

@@ -134,7 +134,7 @@ def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
     """The heads to learn from on their common mean, and those to test on laid on it."""
     total, count = len(gathered.shapes), len(gathered.shapes) - gathered.held_out
     learn = SampleRange(gathered.shapes, 0, count)
-    found = generalised_procrustes(learn, scale, start=gathered.template.vertices)
+    found = generalised_procrustes(learn, scale, initial_mean=gathered.template.vertices)
     rest = SampleRange(gathered.shapes, count, total)
     poses = [
         similarity_transform(part.double(), found.mean.expand(part.shape), scale=scale)

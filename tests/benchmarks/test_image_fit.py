@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchface import load_take, zoo
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.geometry.cameras.pnp import solve_pnp
+from torchface.geometry.cameras.pnp import Pose, solve_pnp
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.images.image_files import load_image
@@ -28,10 +28,10 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images, transfer_deformation
-from torchface.modeling.photographs.image_alternation import alternate
 from torchface.modeling.photographs.image_fit import contour_curves
-from torchface.modeling.photographs.image_solve import Problem, State, solve
-from torchface.modeling.photographs.landmark_view import JAW, LinearPoints, Views, chosen_points
+from torchface.modeling.photographs.image_solve import Problem, State, solve, whitening
+from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views, chosen_points, linearised
+from torchface.optim import box_qp
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
 from torchface.rig import BlendshapeRig
@@ -81,6 +81,38 @@ def faces(ict_folder: Path, performances: list[Path]) -> Faces:
         assert track is not None
         takes.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
     return Faces(rig, load_identity_modes(ict_folder, part="face").deltas, takes)
+
+
+def alternate(problem: Problem, state: State, iterations: int = 40) -> State:
+    """Poses by PnP, then identity, then expression, each with the others held, ``iterations`` times.
+
+    Focal lengths stay as they are. The energy is that of ``solve``, so that only the way to its minimum differs.
+    Source: thesis 3.2.5, algorithm 2, lines 6 to 8.
+    """
+    lower, upper = problem.bounds()
+    precision, linear = problem.prior()
+    weights = torch.ones(LANDMARKS, dtype=torch.float64)
+    weights[: len(problem.points.rows)] /= problem.settings.inner_weight
+    groups = torch.arange(len(lower)) < problem.identities
+    for _ in range(iterations):
+        at = problem.points.at(state.coefficients)
+        if problem.settings.sliding:
+            state = replace(state, rows=chosen_points(problem.points, state.coefficients, state.views))
+        views = state.views
+        initial = Pose(views.rotation, views.translation, torch.zeros(len(views.rotation)))
+        pose = solve_pnp(at[state.rows], problem.found, views.intrinsics, weights, initial)
+        views = Views(views.intrinsics, pose.rotation, pose.translation)
+        for free in (groups, ~groups):
+            picked = problem.points.picked(state.rows)
+            state = replace(state, views=views)
+            factors = whitening(problem, state, picked)
+            lines = linearised(picked, state.coefficients, views, problem.targets, factors)
+            A, r = lines.by_coefficients.flatten(0, 2), lines.residual.flatten()
+            x, H = state.coefficients, A.T @ A
+            low, high = torch.where(free, lower, x), torch.where(free, upper, x)
+            found = box_qp(H + precision, (A.T @ r - H @ x + linear)[None], low, high, start=x[None])
+            state = replace(state, coefficients=found[0])
+    return state
 
 
 def planted(
@@ -166,7 +198,7 @@ HEADING = f"{'':50s}{'of mean':>8s}{'rest mm':>9s}{'posed mm':>9s}{'lips mm':>9s
 
 
 def table(faces: Faces, truths: list[Planted], model: HeadModel, transfers: int = 0, **changes: float) -> Row:
-    settings = replace(FitSettings(focal_spread=SPREAD), **changes)
+    settings = replace(FitSettings(focal_deviation=SPREAD), **changes)
     row = Row()
     for truth in truths:
         start = time.process_time()
@@ -276,7 +308,7 @@ def test_contour_at_seventy_degrees(faces: Faces) -> None:
     for seed in range(4):
         truth = planted(faces, seed, slides=True, yaws=(-70.0, 70.0))
         for slides in (True, False):
-            settings = FitSettings(focal_spread=SPREAD, sliding=slides)
+            settings = FitSettings(focal_deviation=SPREAD, sliding=slides)
             fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=settings, transfers=0)
             blank = torch.ones(3, SIZE[1], SIZE[0])
             off = similarity_transform(fit.mesh.vertices[None].double(), truth.rest[None].double())
@@ -440,7 +472,7 @@ def test_planted_single_views_beside_eos(faces: Faces) -> None:
     ours, theirs, mean = [], [], []
     for seed in range(12):
         truth = planted(faces, seed, slides=False, yaws=(20.0,))
-        settings = FitSettings(focal_spread=SPREAD)
+        settings = FitSettings(focal_deviation=SPREAD)
         fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=settings, transfers=0)
         _, _, posed = peer.fit(truth.landmarks[0], *SIZE, 0)
         ours.append(error(fit.posed.vertices, truth.face))

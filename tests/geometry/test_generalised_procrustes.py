@@ -50,7 +50,7 @@ def test_motions_are_taken_back(shapes: torch.Tensor) -> None:
 def test_the_mean_lies_where_it_is_asked_to(shapes: torch.Tensor) -> None:
     apart = SamplesInMemory(moved(shapes))
     start = shapes.mean(0)
-    found = generalised_procrustes(apart, start=start)
+    found = generalised_procrustes(apart, initial_mean=start)
     assert (found.mean - start).norm(dim=1).mean() < 0.5
     assert spread(aligned(apart, found).read(0, 11)) <= spread(shapes)
 
@@ -90,8 +90,8 @@ def test_weights_say_what_is_held_still(shapes: torch.Tensor) -> None:
 def test_what_cannot_be_laid_is_refused(shapes: torch.Tensor) -> None:
     with pytest.raises(ShapeError, match=r"expected \(M,V,3\)"):
         generalised_procrustes(SamplesInMemory(shapes[..., :2]))
-    with pytest.raises(ShapeError, match="start"):
-        generalised_procrustes(SamplesInMemory(shapes), start=shapes[0, :5])
+    with pytest.raises(ShapeError, match="initial_mean"):
+        generalised_procrustes(SamplesInMemory(shapes), initial_mean=shapes[0, :5])
     broken = shapes.clone()
     broken[6, 0, 0] = float("inf")
     with pytest.raises(ValueRangeError, match="number 6"):

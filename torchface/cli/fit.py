@@ -83,7 +83,7 @@ def fit(
         )
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False, markup=False)
-    marks = (picture.with_suffix(".pts") for picture in made.pictures[: len(made.found)])
-    cameras = (picture.with_suffix(".toml") for picture in made.pictures)
-    for path in (*marks, *cameras, *made.pictures, out):
+    marks = (overlay.with_suffix(".pts") for overlay in made.overlays[: len(made.found)])
+    cameras = (overlay.with_suffix(".toml") for overlay in made.overlays)
+    for path in (*marks, *cameras, *made.overlays, out):
         print(path)

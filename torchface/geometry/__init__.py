@@ -1,1 +1,1 @@
-"""What meshes, cameras and rotations compute of themselves; no room below knows of faces, files or learning."""
+"""What meshes, cameras and rotations compute of themselves; nothing here depends on faces, files or learning."""

@@ -13,7 +13,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.progress import Progress, silent
 
 _TOLERANCE = 1e-3
-_MOST_ROUNDS = 20
+_MAX_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,37 +23,37 @@ class Procrustes:
     Args:
         poses: what moves each shape, a batch of M, float64.
         mean: of the moved shapes, (V,3) float64.
-        rounds: how many it took.
+        iterations: how many were made.
     """
 
     poses: Similarity
     mean: Tensor
-    rounds: int
+    iterations: int
 
 
 def generalised_procrustes(
     shapes: Samples,
     scale: bool = False,
     weights: Tensor | None = None,
-    start: Tensor | None = None,
+    initial_mean: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Procrustes:
     r"""The rigid motions that lay shapes on their common mean.
 
     .. math:: \min_{R_m, t_m, \bar x} \sum_m \sum_v w_v \lVert s_m R_m x_{mv} + t_m - \bar x_v \rVert^2
 
-    In turn each shape is laid on the mean and the mean taken again, until it moves by less than a micrometre. With
+    Alternately shapes are aligned to the mean and the mean computed anew, until it moves by under a micrometre. With
     scales, the mean keeps the shapes' mean size, or all would shrink to nothing.
 
     Args:
         shapes: (M,V,3), millimetres; read in blocks.
         scale: estimate :math:`s`; otherwise sizes stay, and differ.
         weights: of the vertices, (V,); equal if absent.
-        start: where the mean is to lie, (V,3); where the first shape lies if absent.
-        progress: told each step and how far it is.
+        initial_mean: where the mean is to lie, (V,3); where the first shape lies if absent.
+        progress: called with each step and how far it is.
 
     Raises:
-        ShapeError: no (M,V,3), or a start or weights that do not fit.
+        ShapeError: no (M,V,3), or an initial mean or weights that do not fit.
         ValueRangeError: a shape holds NaN or infinity.
 
     Source: Gower 1975; thesis 3.2.4.
@@ -62,14 +62,14 @@ def generalised_procrustes(
     count, vertices, channels = shapes.shape
     if channels != 3 or count < 1:
         raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected (M,V,3)")
-    for name, tensor, expected in (("start", start, (vertices, 3)), ("weights", weights, (vertices,))):
+    for name, tensor, expected in (("initial_mean", initial_mean, (vertices, 3)), ("weights", weights, (vertices,))):
         if tensor is not None and tensor.shape != expected:
             raise ShapeError(f"{name}: found {tuple(tensor.shape)}, expected {expected}")
     parts = list(blocks(shapes))
-    mean = shapes.read(0, 1)[0].double() if start is None else start.double()
+    mean = shapes.read(0, 1)[0].double() if initial_mean is None else initial_mean.double()
     size = 0.0
-    rounds, moved = 0, float("inf")
-    while rounds < _MOST_ROUNDS and moved > _TOLERANCE:
+    iterations, moved = 0, float("inf")
+    while iterations < _MAX_ITERATIONS and moved > _TOLERANCE:
         poses, total, sizes = [], torch.zeros_like(mean), 0.0
         for begin, end in parts:
             read = shapes.read(begin, end).double()
@@ -84,12 +84,12 @@ def generalised_procrustes(
         if scale:
             size = size or sizes / count
             found = found * (size / float(_size(found[None], weights)))
-        # What the mean as a whole has drifted by is taken back: the frame is the start's.
+        # What the mean as a whole has drifted by is taken back: the frame is the initial mean's.
         found = similarity_transform(found[None], mean[None], _one(weights), scale=False).apply(found)[0]
-        moved, mean, rounds = float((found - mean).norm(dim=1).mean()), found, rounds + 1
-        progress("aligning the shapes", rounds)
+        moved, mean, iterations = float((found - mean).norm(dim=1).mean()), found, iterations + 1
+        progress("aligning the shapes", iterations)
     pose = Similarity(*(torch.cat(t) for t in zip(*((p.scale, p.rotation, p.translation) for p in poses), strict=True)))
-    return Procrustes(pose, mean, rounds)
+    return Procrustes(pose, mean, iterations)
 
 
 def aligned(shapes: Samples, found: Procrustes) -> MovedSamples:

@@ -31,7 +31,7 @@ def rotation_matrix(vectors: Tensor) -> Tensor:
 
 
 def rotation_vector(rotations: Tensor) -> Tensor:
-    r"""The axes times angles (...,3) of rotations (...,3,3): :func:`rotation_matrix` turned back, up to half a turn.
+    r"""The axes times angles (...,3) of rotations (...,3,3): :func:`rotation_matrix` inverted, up to an angle of π.
 
     By way of the unit quaternion whose largest part is computed first, so that no angle loses digits.
 

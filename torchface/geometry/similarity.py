@@ -1,4 +1,4 @@
-"""Rigid and similarity alignment of points whose correspondence is known."""
+"""Rigid and similarity alignment of corresponding points."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Similarity:
 
     def apply(self, points: Tensor) -> Tensor:
         """Moved points (B,N,3); points (N,3) go through each of the B similarities."""
-        turned = points @ self.rotation.transpose(-1, -2).to(points)
-        return self.scale.to(points)[:, None, None] * turned + self.translation.to(points)[:, None, :]
+        rotated = points @ self.rotation.transpose(-1, -2).to(points)
+        return self.scale.to(points)[:, None, None] * rotated + self.translation.to(points)[:, None, :]
 
     def apply_vectors(self, vectors: Tensor) -> Tensor:
-        """Turned and scaled, not translated: for deltas (..., B,N,3)."""
+        """Rotated and scaled, not translated: for deltas (..., B,N,3)."""
         return self.scale.to(vectors)[:, None, None] * (vectors @ self.rotation.transpose(-1, -2).to(vectors))
 
     def inverse(self) -> Similarity:

@@ -26,7 +26,7 @@ from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, rea
 
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
-_MOST_MASKED = 0.5
+_MAX_MASKED = 0.5
 _INSIST = "--insist writes the sites all the same"
 
 
@@ -52,36 +52,41 @@ class AttachReport:
         labels = self.fit.attachment.labels or ()
         worst = int(last.argmax())
         lines = [
-            f"{len(labels)} markers over {len(self.fit.weights)} frames, {len(self.fit.errors)} rounds",
+            f"{len(labels)} markers over {len(self.fit.weights)} frames, {len(self.fit.errors)} iterations",
             f"sites moved by {float(self.moved.mean()):.1f} mm on average, by {float(self.moved.max()):.1f} mm at most",
             f"marker error: mean {float(first.mean()):.2f} mm at first, {float(last.mean()):.2f} mm in the end; "
             f"worst {labels[worst]}, {float(last[worst]):.2f} mm",
         ]
         if self.fit.standoff:
-            lines.append(f"markers stand {self.fit.standoff:.2f} mm off the skin")
+            lines.append(f"markers stand {self.fit.standoff:.2f} mm above the skin")
         if self.fit.motion is not None:
             slid = float(self.fit.motion.translation.norm(dim=1).max())
-            turned = float(self.fit.motion.degrees().norm(dim=1).max())
-            lines.append(f"helmet: moved by up to {slid:.1f} mm and {turned:.1f} degrees; solved along")
+            angle = float(self.fit.motion.degrees().norm(dim=1).max())
+            lines.append(f"helmet: moved by up to {slid:.1f} mm and {angle:.1f} degrees; solved along")
         if self.cleanup.defects:
             lines.append(f"cleanup: {self.cleanup.summary()}")
         return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self._uncertain()]
 
     def _uncertain(self) -> list[str]:
-        """What the take did not tell."""
-        known = self.fit.uncertainty
-        shapes = [f"{name} (±{float(known.levels[known.names.index(name)]):.2f})" for name in known.shapes]
-        sites = [f"{label} (±{float(known.sites[known.labels.index(label)]):.1f} mm)" for label in known.markers]
-        told = []
+        """What the take leaves open."""
+        uncertainty = self.fit.uncertainty
+        shapes = [
+            f"{name} (±{float(uncertainty.levels[uncertainty.names.index(name)]):.2f})" for name in uncertainty.shapes
+        ]
+        sites = [
+            f"{label} (±{float(uncertainty.sites[uncertainty.labels.index(label)]):.1f} mm)"
+            for label in uncertainty.markers
+        ]
+        lines = []
         if sites:
-            told.append(f"sites that the take leaves uncertain, kept near the first guess: {_listed(sites)}")
+            lines.append(f"sites that the take leaves uncertain, kept near the first guess: {_listed(sites)}")
         if shapes:
-            told.append(
+            lines.append(
                 f"shapes whose level the take leaves uncertain: {_listed(shapes)}; play them strongly, each by itself"
             )
-        if known.unseen:
-            told.append(f"shapes that these markers hardly see: {_listed(known.unseen)}")
-        return told
+        if uncertainty.unseen:
+            lines.append(f"shapes that these markers hardly see: {_listed(uncertainty.unseen)}")
+        return lines
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -132,7 +137,7 @@ def _usable(cleanup: Cleanup, take: Take) -> Take:
     assert cleanup.take.markers is not None
     assert take.markers is not None
     seen = ~torch.isnan(take.markers.values).any(-1)
-    lost = (cleanup.masked & seen).sum(0) > _MOST_MASKED * seen.sum(0)
+    lost = (cleanup.masked & seen).sum(0) > _MAX_MASKED * seen.sum(0)
     values = torch.where(lost[:, None], take.markers.values, cleanup.take.markers.values)
     return replace(take, markers=Track(take.markers.names, values, take.markers.confidence))
 

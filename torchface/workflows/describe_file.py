@@ -20,8 +20,8 @@ from torchface.take import Take
 
 Rows = list[tuple[str, str]]
 
-_LONGEST_VALUE = 240
-_MOST_NAMED = 8
+_MAX_LENGTH = 240
+_MAX_NAMED = 8
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
@@ -29,8 +29,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
 
     Args:
         path: the file or folder.
-        attachment: report which shapes of the rig its markers tell apart.
-        part: look at this region of the rig only.
+        attachment: report which shapes of the rig its markers distinguish.
+        part: this region of the rig only.
 
     Raises:
         FileFormatError: nothing that torchface reads.
@@ -53,7 +53,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
             rows += [("what the markers see", str(seen))]
         return rows
     if attachment is not None:
-        raise FileFormatError(f"{path}: found no rig, expected one to say what the markers of {attachment} tell apart")
+        raise FileFormatError(f"{path}: found no rig, expected one to test the markers of {attachment} on")
     if suffix in MESH_ENDINGS:
         return _mesh_rows(load_mesh(path))
     if suffix in {".c3d", ".trc", ".csv"}:
@@ -92,7 +92,7 @@ def _mesh_rows(mesh: Mesh) -> Rows:
 def _rig_rows(rig: BlendshapeRig) -> Rows:
     reach = rig.deltas.norm(dim=-1).amax(1)
     shapes = ", ".join(f"{name} {float(r):.1f}" for name, r in zip(rig.names, reach, strict=True))
-    return [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("farthest move, mm", shapes)]
+    return [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("largest motion, mm", shapes)]
 
 
 def _animation_rows(path: Path) -> Rows:
@@ -101,7 +101,7 @@ def _animation_rows(path: Path) -> Rows:
     if take is None or take.weights is None:
         return []
     peaks = take.weights.values[..., 0].amax(0)
-    order = peaks.argsort(descending=True)[:_MOST_NAMED].tolist()
+    order = peaks.argsort(descending=True)[:_MAX_NAMED].tolist()
     peak = ", ".join(f"{take.weights.names[row]} {float(peaks[row]):.2f}" for row in order if peaks[row] > 0)
     return [
         ("animation", f"{len(take)} frames at {take.fps:g} a second, {len(take) / take.fps:.1f} s"),
@@ -154,4 +154,4 @@ def _graph_rows(path: Path) -> Rows:
 
 
 def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ... ({len(text):,} characters)"
+    return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ... ({len(text):,} characters)"

@@ -20,7 +20,7 @@ def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
 
     Args:
         mesh: V vertices.
-        matched: whose places the scan tells, (V,) bool.
+        matched: vertices that the scan shows, (V,) bool.
     """
     label = components(mesh.faces.cpu(), len(mesh.vertices))
     size = label.bincount().double()

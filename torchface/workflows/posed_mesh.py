@@ -50,7 +50,7 @@ def load_posed(
 
     Args:
         path: a mesh file, a rig file or a rig's folder.
-        weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` knows.
+        weights: the pose, by shape name in any of the spellings that ``torchface.shape_names`` reads.
         take: the pose from a frame of a weight take instead.
         frame: which.
         part: keep this annotated region only.
@@ -75,8 +75,8 @@ def load_posed(
         unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
         if unknown:
             near = sorted({close for name in unknown for close in get_close_matches(name, rig.names, 2)})
-            known = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(rig.names[:8])}, ..."
-            raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {known}")
+            hint = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(rig.names[:8])}, ..."
+            raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
         row = matrix @ torch.tensor([weights[name] for name in names])
     else:
         track = load_take(take).weights

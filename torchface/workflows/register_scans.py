@@ -29,13 +29,13 @@ CONTACT_SHEET = "contact_sheet.png"
 _WIDTH, _HEIGHT = 144, 180
 _TEXT = 11
 _SKIPPED = 0.85
-_MOST = 1.0  # end of the distance maps' scale, millimetres
+_MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 _KINDS = "HeadModel or MorphableModel"
 
 
 @dataclass(frozen=True)
 class RegisteredScans:
-    """What a run left on disk: the report with its table, and the picture of all scans."""
+    """What a run left on disk: the report with its table, and the contact sheet of all scans."""
 
     report: CorpusReport
     contact_sheet: Path
@@ -67,7 +67,7 @@ def register_scans(
     """Registers and draws; see ``torchface register --help`` for the arguments.
 
     Args:
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         finished: called with each scan's entry, as ``register_corpus`` does.
 
     Raises:
@@ -115,12 +115,12 @@ def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
 
 
 def contact_sheet(report: CorpusReport, template: Mesh, progress: Progress | None = None) -> Tensor:
-    """All registered faces from the front as the template looks, their lines and distances to the scan; (3,H,W).
+    """All registered faces from the template's front, their lines and distances to the scan; (3,H,W).
 
     Args:
         report: of the corpus.
-        template: gives the direction that is the front: a scan may be turned any way.
-        progress: told each step and how far it is.
+        template: gives the direction that is the front: a scan may have any orientation.
+        progress: called with each step and how far it is.
     """
     progress, cells = progress or silent, []
     for number, entry in enumerate(report.entries, 1):
@@ -137,25 +137,25 @@ def _cell(entry: CorpusEntry, template: Mesh, folder: Path) -> Tensor:
             mesh = load_mesh(entry.result)
             upright = in_place_of(mesh, template)
             camera = frame_face(upright, width=_WIDTH, height=_HEIGHT)
-            pictures = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
+            views = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
             distances = read_distances(folder, entry.name)
             if distances is not None and len(distances) == len(upright.vertices):
-                pictures.append(render(upright, camera, error_colors(distances, _MOST, "turbo"), samples=1))
-            told = f"{entry.median_distance:.2f} mm on {entry.shown:.0%}"
-            return caption(caption(sheet(pictures, 1), name, _TEXT), told, _TEXT)
-        except FileFormatError:  # somebody has taken it away meanwhile
+                views.append(render(upright, camera, error_colors(distances, _MAX_DISTANCE, "turbo"), samples=1))
+            caption_text = f"{entry.median_distance:.2f} mm on {entry.shown:.0%}"
+            return caption(caption(sheet(views, 1), name, _TEXT), caption_text, _TEXT)
+        except FileFormatError:  # somebody has deleted it meanwhile
             pass
     blank = torch.full((3, 3 * _HEIGHT, _WIDTH), _SKIPPED)
     return caption(caption(blank, name, _TEXT), "skipped", _TEXT)
 
 
 def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Mesh:
-    """A mesh turned and moved, without a change of size, to where a template of the same topology is.
+    """A mesh rotated and translated, without scaling, to where a template of the same topology is.
 
     Args:
         mesh: V vertices.
         template: V vertices.
-        weights: how much each vertex says, (V,); equal if absent.
+        weights: how much each vertex counts, (V,); equal if absent.
     """
     own, other = mesh.vertices.double(), template.vertices.double()
     pose = similarity_transform(own[None], other[None], None if weights is None else weights[None], scale=False)

@@ -24,7 +24,7 @@ def renamed_detail(detail: DetailMaps | None, rig: BlendshapeRig, names: Naming 
 
 
 def naming_lines(rig: BlendshapeRig, names: Naming | None) -> list[str]:
-    """Which shapes ARKit knows, for people to read; none under the rig's own names."""
+    """Which shapes are ARKit's, for people to read; none under the rig's own names."""
     if names is None:
         return []
     written = rig.with_arkit_names().names

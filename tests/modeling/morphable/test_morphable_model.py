@@ -158,7 +158,7 @@ def test_a_model_is_rebuilt_from_config_and_state(samples: torch.Tensor, model: 
     assert (ours.vertices - samples[0]).abs().max() < 1e-3
     plain = HeadModel(model, None, template.faces)
     assert HeadModel.from_config(plain.config).state_dict().keys() == plain.state_dict().keys()
-    with pytest.raises(TopologyError, match="knows no colours"):
+    with pytest.raises(TopologyError, match="has no colours"):
         plain(a[None], b[None])
 
 

@@ -158,7 +158,7 @@ def test_missing_landmarks_are_left_out(rig: BlendshapeRig, model: HeadModel) ->
 
 def test_focal_lengths_are_estimated(rig: BlendshapeRig, model: HeadModel) -> None:
     p = person(rig, model, 7)
-    settings = replace(FIXED, focal_spread=0.15)
+    settings = replace(FIXED, focal_deviation=0.15)
     fit = fit_images(model, rig, p.landmarks, SIZE, camera=1.2 * p.focal, settings=settings, transfers=0)
     found = torch.stack([camera.intrinsics[0, 0] for camera in fit.cameras])
     assert float((found / p.focal - 1).abs().max()) < 0.1
@@ -201,9 +201,9 @@ def test_too_few_or_none(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> 
 
 
 def test_pixels_of_another_picture(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
-    with pytest.raises(ValueRangeError, match="most of them outside a picture of 320 x 256"):
+    with pytest.raises(ValueRangeError, match="most of them outside an image of 320 x 256"):
         fit_images(model, rig, seen, (320, 256))
-    with pytest.raises(ValueRangeError, match="expected pixels in a picture of 1280 x 1024"):
+    with pytest.raises(ValueRangeError, match="expected pixels in an image of 1280 x 1024"):
         fit_images(model, rig, seen / 1280, SIZE)
 
 
@@ -217,7 +217,7 @@ def test_another_order(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> No
 def test_seen_from_behind(rig: BlendshapeRig, model: HeadModel) -> None:
     marks = rig.vertices[rig.neutral.landmarks].double()
     camera = look_at(marks.mean(0), 170.0, span=300.0, width=SIZE[0], height=SIZE[1])
-    with pytest.raises(AlignmentError, match=r"turned by 1\d\d° in view 0, as if seen from behind"):
+    with pytest.raises(AlignmentError, match=r"rotated by 1\d\d° in view 0, as if seen from behind"):
         fit_images(model, rig, camera.project(marks)[None], SIZE)
 
 

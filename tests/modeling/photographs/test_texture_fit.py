@@ -170,7 +170,7 @@ def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras
         render(replace(subject, colors=dressed), c, lighting=EVEN, background=GREEN, samples=1) for c in cameras
     ]
     painted = photo_texture(subject, pictures, cameras, 256)
-    masked = photo_texture(subject, pictures, cameras, 256, trust=skin_shares(subject, pictures, cameras))
+    masked = photo_texture(subject, pictures, cameras, 256, confidence=skin_shares(subject, pictures, cameras))
     skin = skins[40][regions["face"]].median(0).values
     for cloth, color in ((hair, black), (collar, blue)):
         assert float(((painted.colors[cloth] - color).norm(dim=-1) < 0.2).float().mean()) > 0.3

@@ -19,8 +19,8 @@ from torchface.optim import box_qp
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 
-SHORT = RiggingSchedule(rounds=4)
-KNOWN = RiggingSchedule(rounds=2, gamma=(1e9, 1e9))
+SHORT = RiggingSchedule(iterations=4)
+KNOWN = RiggingSchedule(iterations=2, gamma=(1e9, 1e9))
 EXAMPLES = [
     "mouthSmileLeft mouthSmileRight browInnerUp eyeLookUpLeft eyeLookUpRight jawForward",
     "jawOpen mouthRight browDownLeft browDownRight eyeLookDownLeft eyeLookDownRight",
@@ -103,7 +103,7 @@ def test_stiffness_is_high_where_the_template_is_still() -> None:
 
 def test_one_example_a_shape_gives_the_persons_own_shapes(template: BlendshapeRig, person: BlendshapeRig) -> None:
     weights = torch.eye(3, dtype=torch.float64)
-    firm = RiggingSchedule(rounds=1, beta=(1e-9, 1e-9), gamma=(1e9, 1e9))
+    firm = RiggingSchedule(iterations=1, beta=(1e-9, 1e-9), gamma=(1e9, 1e9))
     made = rig_from_examples(template, person.neutral, person(weights), weights, firm)
     # What is not recovered is the person's moving where the template is still.
     missing = (made.rig.deltas - person.deltas).norm(dim=-1)
@@ -238,7 +238,7 @@ def test_how_far_lips_part_is_learned(average: BlendshapeRig) -> None:
     template = average.select(["mouthUpperUpLeft", "mouthUpperUpRight", "mouthLowerDownLeft", "mouthLowerDownRight"])
     actor = BlendshapeRig(average.neutral, 1.6 * template.deltas, template.names)
     weights = torch.ones(1, 4)
-    trusting = RiggingSchedule(rounds=1, beta=(1e-4, 1e-4), gamma=(1e9, 1e9))
+    trusting = RiggingSchedule(iterations=1, beta=(1e-4, 1e-4), gamma=(1e9, 1e9))
     made = rig_from_examples(template, actor.neutral, actor(weights), weights, trusting)
     first, second = annotations.contacts.T
 
@@ -281,7 +281,7 @@ def test_bad_input_is_named(
 
 
 @pytest.mark.parametrize(
-    "numbers", [{"rounds": 0}, {"beta": (0.5, 0.0)}, {"gamma": (torch.nan, 1.0)}, {"kappa": -0.1}, {"theta": 0.0}]
+    "numbers", [{"iterations": 0}, {"beta": (0.5, 0.0)}, {"gamma": (torch.nan, 1.0)}, {"kappa": -0.1}, {"theta": 0.0}]
 )
 def test_schedules_without_sense_are_refused(numbers: dict[str, float]) -> None:
     with pytest.raises(ValueRangeError, match=next(iter(numbers))):

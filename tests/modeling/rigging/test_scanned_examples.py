@@ -20,7 +20,9 @@ def test_seen_vertices_keep_their_offset_and_unseen_ones_return_to_what_was_expe
     assert float((example - expected - smooth)[deep].norm(dim=-1).max()) < 0.06
     far = expected[:, 0] > 45
     assert float((example - expected)[far].norm(dim=-1).max()) < 0.5
-    everything = seen_example(found, expected, torch.ones(len(expected), dtype=torch.bool), trust=1e6, forget=1e-6)
+    everything = seen_example(
+        found, expected, torch.ones(len(expected), dtype=torch.bool), data_weight=1e6, damping=1e-6
+    )
     torch.testing.assert_close(everything, found.vertices, atol=1e-3, rtol=0)
     nothing = seen_example(found, expected, torch.zeros(len(expected), dtype=torch.bool))
     torch.testing.assert_close(nothing, expected, atol=1e-9, rtol=0)

@@ -137,11 +137,11 @@ def test_unsure_landmarks_are_left_out(studio: Path) -> None:
     face = TrackedFace(points, torch.tensor([10.0, 10, 60, 60]), confidence)
     boxes = torch.tensor([[200.0, 5, 80, 80], [10, 10, 60, 60]])
     found = FoundLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
-    assert found.trusted.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
+    assert found.confident.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
     assert "lowest at the mouth with 0.50; 9 left out" in found.lines()[0]
     assert found.lines()[1] == "  number 1 of 2 faces; others with --face 0: at (200, 5)"
     unsure = TrackedFace(points, face.box, torch.full((68,), 0.1))
-    kept = FoundLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).trusted
+    kept = FoundLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).confident
     assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
 
 
@@ -288,7 +288,7 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     made = fit_photographs([photograph], files, people.model, tmp_path / "rig.glb", texture_size=0)
     assert len(made.remarks) == 1
     assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
-    assert "those that face_landmarks finds are" in made.remarks[0]
+    assert "those that face_landmarks finds have" in made.remarks[0]
     assert made.remarks[0] in made.lines([photograph])
 
 

@@ -1,4 +1,4 @@
-"""What is known of a camera itself: focal length, centre and lens distortion at one resolution."""
+"""The intrinsics of a camera: focal length, centre and lens distortion at one resolution."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class CameraCalibration:
         """The same camera with its images scaled to another resolution of the same aspect.
 
         Raises:
-            ValueRangeError: another aspect: part of the image was cut off, and which is not known.
+            ValueRangeError: another aspect: part of the image was cropped, and which part is not known.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -85,7 +85,7 @@ class CameraCalibration:
 
 
 def assumed_calibration(width: int, height: int, field_of_view: float = ASSUMED_FIELD_OF_VIEW) -> CameraCalibration:
-    """A camera without distortion that looks through the image's centre, where none was calibrated.
+    """A camera without distortion whose principal point is the image's centre, where none was calibrated.
 
     Depths scale with the focal length: with a wrong one distances along the line of sight are wrong by as much, and
     rotations by a few degrees.

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 
-_ROUNDS, _DONE = 20, 1e-13
+_MAX_ITERATIONS, _DONE = 20, 1e-13
 
 
 def distort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
@@ -38,7 +38,7 @@ def distort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
 
 
 def undistort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
-    """Where a pinhole camera of the same K shows what the camera shows at some pixels: ``distort`` turned back.
+    """Where a pinhole camera of the same K shows what the camera shows at some pixels: ``distort`` inverted.
 
     By Newton's method from the distorted place, in float64.
 
@@ -61,7 +61,7 @@ def undistort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
     goal = _normalised(pixels.double(), K.double())
     coefficients = coefficients.double()
     place = goal
-    for _ in range(_ROUNDS):  # Newton's steps, all points at once; seen points need three or four
+    for _ in range(_MAX_ITERATIONS):  # Newton's steps, all points at once; seen points need three or four
         bent, jacobian = _bent(place, coefficients)
         (a, b), (c, d) = jacobian[..., 0, :].unbind(-1), jacobian[..., 1, :].unbind(-1)
         miss = bent - goal
@@ -74,7 +74,7 @@ def undistort(pixels: Tensor, calibration: CameraCalibration) -> Tensor:
         if not (step.nan_to_num(0.0).abs() > _DONE).any():
             break
     bent, jacobian = _bent(place, coefficients)
-    # Beyond the fold the image is turned over; there, and where no step led to the goal, nothing is seen.
+    # Beyond the fold the image is folded over; there, and where no step led to the goal, nothing is seen.
     upright = (jacobian.det() > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
     reached = ((bent - goal).abs().amax(-1) < 1e-9) & upright
     return _in_pixels(torch.where(reached[..., None], place, torch.nan), K.double()).to(pixels.dtype)

@@ -11,7 +11,7 @@ from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 
 _MIN_POINTS = 4
-_NEAREST = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
+_MIN_DEPTH = 1e-3  # of the points' own size; what is nearer to the camera than this counts as behind it
 _FLAT = 1e-2  # relative; points that extend less in their third direction count as flat at first
 _ORTHOGRAPHIC_ITERATIONS, _MAX_ITERATIONS, _DONE = 5, 60, 1e-10
 
@@ -38,7 +38,7 @@ def solve_pnp(
 
     .. math:: \min_{R,t} \sum_i w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \quad R \in SO(3)
 
-    Started by iterated scaled orthography (POSIT; for flat points from both of its mirrored answers), refined by
+    Initialised by iterated scaled orthography (POSIT; for flat points from both of its mirrored answers), refined by
     Levenberg's method in float64.
 
     Args:
@@ -142,9 +142,9 @@ def _orthographic_pose(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tens
 
     ``rays`` (B,N,2) are pixels of a camera with K = I.
     """
-    share = (w / w.sum(1, keepdim=True))[..., None]
-    centre = (share * x).sum(1, keepdim=True)
-    u, singular, vh = torch.linalg.svd((x - centre) * share.sqrt(), full_matrices=False)
+    weight = (w / w.sum(1, keepdim=True))[..., None]
+    centre = (weight * x).sum(1, keepdim=True)
+    u, singular, vh = torch.linalg.svd((x - centre) * weight.sqrt(), full_matrices=False)
     if (singular[:, 1] <= 1e-6 * singular[:, 0]).any():
         raise AlignmentError("solve_pnp: found points that lie on a line, expected some beside it")
     flat = singular[:, 2] < _FLAT * singular[:, 0]
@@ -154,8 +154,8 @@ def _orthographic_pose(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tens
     deeper = torch.zeros_like(x[..., 0])
     for _ in range(_ORTHOGRAPHIC_ITERATIONS):  # each corrects for perspective with the depths of the one before
         goal = rays * (1 + deeper)[..., None]
-        middle = (share * goal).sum(1, keepdim=True)
-        ij = (inverse @ ((goal - middle) * share.sqrt())).transpose(-1, -2)
+        middle = (weight * goal).sum(1, keepdim=True)
+        ij = (inverse @ ((goal - middle) * weight.sqrt())).transpose(-1, -2)
         i, j = (ij + torch.where(flat[:, None, None], _out_of_plane(ij, normal), 0.0)).unbind(1)
         scale = (i.norm(dim=-1) * j.norm(dim=-1)).sqrt().clamp(min=1e-12)
         rows = torch.stack([i, j, torch.linalg.cross(i, j) / scale[:, None]], dim=1) / scale[:, None, None]
@@ -166,13 +166,13 @@ def _orthographic_pose(x: Tensor, rays: Tensor, w: Tensor) -> tuple[Tensor, Tens
     depth = 1 / scale[:, None]
     translation = torch.cat([middle[:, 0] * depth, depth], dim=1) - (rotation @ centre.transpose(-1, -2))[..., 0]
     # In front of the camera, whatever the first guess was.
-    lack = _NEAREST * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
+    lack = _MIN_DEPTH * singular[:, 0] - ((x @ rotation.transpose(-1, -2))[..., 2] + translation[:, 2:]).amin(1)
     translation[:, 2] += 2 * lack.clamp(min=0)
     return rotation, translation, normal, flat
 
 
 def _out_of_plane(ij: Tensor, normal: Tensor) -> Tensor:
-    """What flat points do not tell of the two rows (B,2,3): (λ, μ) times the normal, so that they are orthonormal."""
+    """What flat points leave open of the two rows (B,2,3): (λ, μ) times the normal, so that they are orthonormal."""
     i, j = ij.unbind(1)
     product, difference = -(i * j).sum(-1), j.square().sum(-1) - i.square().sum(-1)
     first = (0.5 * (difference + (difference.square() + 4 * product.square()).sqrt())).clamp(min=0).sqrt()
@@ -213,9 +213,9 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
     Returns:
         ``Pose``; errors are infinite where points stay behind the camera.
     """
-    nearest = _NEAREST * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
+    min_depth = _MIN_DEPTH * (x - x.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     damping = torch.full_like(translation[:, 0], 1e-4)
-    error = _error(x, q, K, w, rotation, translation, nearest)
+    error = _error(x, q, K, w, rotation, translation, min_depth)
     total, going = w.sum(1), torch.arange(len(x), device=x.device)
     found = Pose(rotation.clone(), translation.clone(), error.clone())
     for _ in range(_MAX_ITERATIONS):
@@ -225,11 +225,11 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
         g = weighted @ (pixels - q).flatten(1)[..., None]
         H = H + torch.diag_embed(damping[:, None] * H.diagonal(dim1=1, dim2=2) + 1e-12)
         step = -torch.linalg.solve(H, g)[..., 0]
-        turned, moved = rotation_matrix(step[:, :3]) @ rotation, translation + step[:, 3:]
-        reached = _error(x, q, K, w, turned, moved, nearest)
+        next_rotation, next_translation = rotation_matrix(step[:, :3]) @ rotation, translation + step[:, 3:]
+        reached = _error(x, q, K, w, next_rotation, next_translation, min_depth)
         better = reached < error
-        rotation = torch.where(better[:, None, None], turned, rotation)
-        translation = torch.where(better[:, None], moved, translation)
+        rotation = torch.where(better[:, None, None], next_rotation, rotation)
+        translation = torch.where(better[:, None], next_translation, translation)
         settled = (better & (error - reached < _DONE * error)) | (~better & (damping > 1e6)) | (error < 1e-20)
         error = torch.where(better, reached, error)
         damping = torch.where(better, damping * 0.1, damping * 10).clamp(min=1e-12)
@@ -238,27 +238,27 @@ def refined_poses(x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, 
             left = (~settled).nonzero()[:, 0]
             going, x, q, K, w = going[left], x[left], q[left], K[left], w[left]
             rotation, translation, error, damping = rotation[left], translation[left], error[left], damping[left]
-            nearest = nearest[left]
+            min_depth = min_depth[left]
             if not len(left):
                 break
     found.rotation[going], found.translation[going], found.errors[going] = rotation, translation, error
     return Pose(found.rotation, found.translation, (found.errors / total).sqrt())
 
 
-def _jacobian(turned: Tensor, translation: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+def _jacobian(rotated: Tensor, translation: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (B,N,2) of points rotated into the camera's frame (B,N,3), and their derivatives: (B,2N,6)."""
-    pixels, by_translation = pixel_jacobian(turned + translation[:, None], K)
+    pixels, by_translation = pixel_jacobian(rotated + translation[:, None], K)
     # A rotation by r moves the point s by r x s, so the pixel by (s x a) r where a translation by m moves it by a m.
-    by_rotation = torch.linalg.cross(turned[:, :, None].expand_as(by_translation), by_translation)
+    by_rotation = torch.linalg.cross(rotated[:, :, None].expand_as(by_translation), by_translation)
     return pixels, torch.cat([by_rotation, by_translation], dim=-1).flatten(1, 2)
 
 
 def _error(
-    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, nearest: Tensor
+    x: Tensor, q: Tensor, K: Tensor, w: Tensor, rotation: Tensor, translation: Tensor, min_depth: Tensor
 ) -> Tensor:
     """Weighted squared error (B,); infinite where a point lies behind the camera."""
     seen = x @ rotation.transpose(-1, -2) + translation[:, None]
     image = seen @ K.transpose(-1, -2)
     squared = (image[..., :2] / image[..., 2:] - q).square().sum(-1) * w
-    behind = ((seen[..., 2] < nearest[:, None]) & (w > 0)).any(1)
+    behind = ((seen[..., 2] < min_depth[:, None]) & (w > 0)).any(1)
     return torch.where(w > 0, squared, 0.0).sum(1).masked_fill(behind, torch.inf)

@@ -47,7 +47,7 @@ def robust_pnp(
     hypotheses: int = 128,
     seed: int = 0,
 ) -> RobustPose:
-    r"""The poses in which a camera sees most points where they are seen, whatever the others do.
+    r"""The poses in which a camera sees most points where they are seen, whatever the outliers do.
 
     .. math:: \min_{R,t} \sum_i \min\big( w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \tau^2 \big)
 
@@ -114,7 +114,7 @@ def _consensus(
     translations = torch.cat([translations, guess[enough, None, :, 3]], dim=1)
     row = torch.arange(len(q), device=q.device)[:, None]
     if rotations.shape[1] > _CANDIDATES:
-        # Single precision is enough to tell which are worth more work.
+        # Single precision is enough to choose which are worth more work.
         rough = _scores(
             x.float(), q.float(), K.float(), w.float(), rotations.float(), translations.float(), limit.float()
         )

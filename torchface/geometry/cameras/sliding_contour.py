@@ -1,4 +1,4 @@
-"""Where a face ends before the background: points that slide over the skin as the head turns."""
+"""Where a face ends before the background: points that slide over the skin as the head rotates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
-_BEFORE_START = 2.0  # millimetres by which a curve may lie behind the point that it starts from, or beyond the midline
+_START_MARGIN = 2.0  # millimetres by which a curve may lie behind the point that it starts from, or beyond the midline
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves
     x = vertices.detach().double().cpu()
     first, second = _edges_once(faces.cpu())
     begin = x[starts.cpu()]
-    middle = begin[:, 0].abs() < _BEFORE_START
+    middle = begin[:, 0].abs() < _START_MARGIN
     side = begin[:, 0].sign().masked_fill(middle, 0.0)
     below = x[:, 1] < begin[:, 1:2]
     crossed = (below[:, first] != below[:, second]) & ~middle[:, None]
@@ -68,7 +68,7 @@ def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves
     share = (start[:, 1] - a[:, 1]) / (b[:, 1] - a[:, 1])
     points = a + share[:, None] * (b - a)
     outward = points[:, 0] * side[curve]
-    kept = (outward > -_BEFORE_START) & (points[:, 2] > start[:, 2] - _BEFORE_START)
+    kept = (outward > -_START_MARGIN) & (points[:, 2] > start[:, 2] - _START_MARGIN)
     curve, edge, share = curve[kept], edge[kept], share[kept]
     count = curve.bincount(minlength=len(starts))
     place = torch.arange(len(curve)) - torch.repeat_interleave(count.cumsum(0) - count, count) + 1
@@ -83,7 +83,7 @@ def level_curves(vertices: Tensor, faces: Tensor, starts: Tensor) -> LevelCurves
 
 
 def _edges_once(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends of every edge; on a surface whose triangles turn alike an edge inside it runs once each way."""
+    """Both ends of every edge; on a surface whose triangles are oriented alike an edge inside it runs once each way."""
     first, second = faces.flatten(), faces.roll(-1, 1).flatten()
     kept = first < second
     return first[kept], second[kept]
@@ -95,7 +95,7 @@ def outermost(pixels: Tensor, valid: Tensor, outward: Tensor) -> Tensor:
     Args:
         pixels: where the curves' points are seen.
         valid: which of them are points, (J,C) bool.
-        outward: directions in the picture, (B,J,2); zero for curves whose start is meant.
+        outward: directions in the image, (B,J,2); zero for curves whose start is meant.
     """
     reach = (pixels * outward[:, :, None]).sum(-1).masked_fill(~valid, -torch.inf)
     furthest = reach.argmax(-1)

@@ -37,7 +37,7 @@ class ContactFinder:
     Args:
         faces: (F,3) int64.
         count: how many vertices there are.
-        contacts: pairs of vertices that are known to touch, (K,2) int64.
+        contacts: given pairs of vertices that touch, (K,2) int64.
     """
 
     def __init__(self, faces: Tensor, count: int, contacts: Tensor | None = None) -> None:

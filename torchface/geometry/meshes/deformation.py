@@ -1,4 +1,4 @@
-"""How triangles deform: gradients with a fourth vertex, and the sparse operator that reads them off vertices."""
+"""How triangles deform: gradients with a fourth vertex, and the sparse operator that computes them from vertices."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def deformation_gradients(rest: Tensor, deformed: Tensor, faces: Tensor) -> Tens
 
     Returns:
         Gradients (...,F,3,3). A triangle that has no area at rest has no gradient: it gets the identity.
-        One that loses its area keeps what its edges say; its normal is mapped to zero.
+        One that loses its area keeps the gradient of its edges; its normal is mapped to zero.
 
     Source: thesis 3.3.1, equations 19 to 21; Sumner and Popovic 2004.
     """
@@ -62,7 +62,7 @@ def deformation_gradients(rest: Tensor, deformed: Tensor, faces: Tensor) -> Tens
 
 
 def gradient_operator(vertices: Tensor, faces: Tensor) -> sparse.csr_array:
-    r"""The operator that reads the tangential part of every triangle's deformation gradient off vertex positions.
+    r"""The operator that reads the tangential part of every triangle's deformation gradient from vertex positions.
 
     With :math:`g_1, g_2, g_3` the gradients of the corners' hat functions, :math:`g_2, g_3` rows of the pseudo-inverse
     of :math:`[v_2 - v_1,\; v_3 - v_1]` and :math:`g_1 = -g_2 - g_3`,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 
-_LEAST_Z = 0.02  # a slope of 89 degrees; steeper ones have no finite height
+_MIN_Z = 0.02  # a slope of 89 degrees; steeper ones have no finite height
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class DetailMaps:
 
     Args:
         names: of the shapes that have a map, no name twice.
-        maps: what the skin looks like at each shape's weight of 1, unit vectors, (N,3,H,W).
-        neutral: what it looks like at rest, (3,H,W); flat where absent.
+        maps: the skin's normals at each shape's weight of 1, unit vectors, (N,3,H,W).
+        neutral: the normals at rest, (3,H,W); flat where absent.
 
     Raises:
         ShapeError: the maps are not (N,3,H,W), or the neutral's has another size.
@@ -42,7 +42,7 @@ class DetailMaps:
             raise NameMismatchError(f"detail maps: found names more than once: {', '.join(twice[:5])}")
 
     def blend(self, names: Sequence[str], weights: Tensor) -> Tensor:
-        """The map (3,H,W) at a rig's weights (N',), shapes without a map having no say.
+        """The map (3,H,W) at a rig's weights (N',), ignoring shapes without a map.
 
         Args:
             names: of the rig's shapes, N'.
@@ -112,7 +112,7 @@ def blend_normal_maps(maps: Tensor, weights: Tensor, neutral: Tensor | None = No
 
 
 def _slopes(normals: Tensor) -> Tensor:
-    return normals[:2] / normals[2:].clamp(min=_LEAST_Z)
+    return normals[:2] / normals[2:].clamp(min=_MIN_Z)
 
 
 def _check_maps(maps: Tensor, neutral: Tensor | None) -> None:
@@ -134,12 +134,12 @@ def flat_normal_map(height: int, width: int) -> Tensor:
 
 
 def encode_normals(normals: Tensor) -> Tensor:
-    """The picture (3,H,W) in [0,1] of unit vectors (3,H,W): red x, green y (up), blue z; flat is (0.5, 0.5, 1)."""
+    """The image (3,H,W) in [0,1] of unit vectors (3,H,W): red x, green y (up), blue z; flat is (0.5, 0.5, 1)."""
     return normals * 0.5 + 0.5
 
 
 def decode_normals(image: Tensor) -> Tensor:
-    """Unit vectors (3,H,W) of a normal map's picture (3,H,W) in [0,1]; flat where the picture holds no direction."""
+    """Unit vectors (3,H,W) of a normal map's image (3,H,W) in [0,1]; flat where the image holds no direction."""
     vectors = image * 2 - 1
     length = vectors.norm(dim=0, keepdim=True)
     flat = flat_normal_map(*image.shape[1:]).to(image)

@@ -173,7 +173,7 @@ def triangle_coordinates(ab2: Tensor, ac2: Tensor, abac: Tensor, d1: Tensor, d2:
     v, w = ac2 * d1 - abac * d2, ab2 * d2 - abac * d1
     inside = (v >= 0) & (w >= 0) & (v + w <= determinant) & (determinant > 1e-14 * ab2 * ac2)
     # Outside, the nearest point lies on one of three edges: the best of the three projections. How good v and w
-    # are is told up to the constant |ap|².
+    # are is computed up to the constant |ap|².
     on_ab = (d1 / ab2.clamp(min=_TINY)).clamp(0, 1)
     on_ac = (d2 / ac2.clamp(min=_TINY)).clamp(0, 1)
     on_bc = ((d2 - d1 + ab2 - abac) / (ab2 + ac2 - 2 * abac).clamp(min=_TINY)).clamp(0, 1)
@@ -207,7 +207,7 @@ def _cover(a: Tensor, ab: Tensor, ac: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             break
     cuts = (own / high).ceil().clamp(min=1).long() if high > 0 else torch.ones(len(a), dtype=torch.int64)
     points, triangles = [], []
-    for n in cuts.unique().tolist():  # a class of triangles a turn
+    for n in cuts.unique().tolist():  # a class of triangles at a time
         rows = (cuts == n).nonzero()[:, 0]
         grid = _small_centroids(n)
         offsets = grid[None, :, :1] * ab[rows, None] + grid[None, :, 1:] * ac[rows, None]
@@ -234,6 +234,6 @@ def _dot(x: Tensor, y: Tensor) -> Tensor:
 def _small_centroids(n: int) -> Tensor:
     """Coordinates (n²,2) along two edges of the centroids of the n² equal triangles that a triangle is cut into."""
     i, j = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
-    upright, turned = (i + j) < n, (i + j) < n - 1
+    upright, inverted = (i + j) < n, (i + j) < n - 1
     pairs = torch.stack([i, j], dim=-1).double()
-    return torch.cat([pairs[upright] + 1 / 3, pairs[turned] + 2 / 3]) / n
+    return torch.cat([pairs[upright] + 1 / 3, pairs[inverted] + 2 / 3]) / n

@@ -1,4 +1,4 @@
-"""Vertices from deformation gradients: pins hold exactly, soft constraints as well as their weight asks."""
+"""Vertices from deformation gradients: pins hold exactly, soft constraints as well as their weights demand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchface.optim.sparse import SparseCholesky
 
 @dataclass(frozen=True, eq=False)
 class SoftConstraints:
-    r"""Linear wishes :math:`\omega_k \lVert \sum_v C_{kv} \tilde x_v - y_k \rVert^2`.
+    r"""Linear soft constraints :math:`\omega_k \lVert \sum_v C_{kv} \tilde x_v - y_k \rVert^2`.
 
     Args:
         matrix: C, (K,V) sparse.
@@ -31,7 +31,7 @@ class SoftConstraints:
 
 
 def offset_constraints(pairs: Tensor, offsets: Tensor, weights: Tensor, vertex_count: int) -> SoftConstraints:
-    """Asks that vertex ``pairs[k,0]`` stands ``offsets[k]`` (..., K,3) away from vertex ``pairs[k,1]``."""
+    """Constraints: vertex ``pairs[k,0]`` lies at the offset ``offsets[k]`` (..., K,3) from vertex ``pairs[k,1]``."""
     count = len(pairs)
     rows = np.arange(count)
     ends = pairs.cpu().numpy()
@@ -46,7 +46,7 @@ def offset_constraints(pairs: Tensor, offsets: Tensor, weights: Tensor, vertex_c
 
 
 class GradientReconstruction:
-    r"""Finds the vertices whose triangles deform as asked.
+    r"""Finds the vertices whose triangles have given deformation gradients.
 
     .. math:: \min_{\tilde x} \; \sum_t a_t \lVert (Q_t - T_t(\tilde x)) P_t \rVert_F^2
         + \sum_k \omega_k \lVert (C \tilde x)_k - y_k \rVert^2 + \epsilon \lVert \tilde x - \bar x \rVert^2
@@ -101,7 +101,7 @@ class GradientReconstruction:
 
         Args:
             pinned: (V,) bool.
-            constraints: their values are not looked at.
+            constraints: their values are not used.
         """
         free = (~pinned).nonzero()[:, 0].cpu().numpy()
         matrix = self.stiffness[free]
@@ -161,7 +161,7 @@ class PreparedReconstruction:
         if len(self._free) == 0:
             return torch.from_numpy(result)
         count = len(result)
-        # Unknown is the step away from ``positions``: pins are then zeros, and what already fits is left as it is.
+        # Unknown is the step from ``positions``: pins are then zeros, and what already fits is left as it is.
         anchored = result.transpose(1, 0, 2).reshape(self.vertex_count, -1)
         asked = gradients.detach().double().cpu().permute(1, 3, 0, 2).reshape(self._transposed.shape[1], -1).numpy()
         rhs = self._transposed @ asked - self._stiffness @ anchored

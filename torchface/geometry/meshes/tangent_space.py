@@ -50,7 +50,7 @@ def tangent_space(vertices: Tensor, faces: Tensor, uvs: Tensor, uv_faces: Tensor
     """Tangents by MikkTSpace's rule: each triangle's direction of growing u, laid into the vertex's tangent plane,
     averaged by corner angle over the triangles that share vertex, texture coordinate and orientation.
 
-    Where a triangle has no extent in the texture it has no say; a vertex of such triangles only gets any tangent.
+    Where a triangle has no extent in the texture it is ignored; a vertex of such triangles only gets any tangent.
 
     Args:
         vertices: (V,3), millimetres.

@@ -1,4 +1,4 @@
-"""Values at texels laid out as a picture, with a margin round the charts so that no background shows at their seams."""
+"""Values at texels laid out as an image, with a margin around the charts so that no background shows at their seams."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def laid_out(values: Tensor, texels: TexelMap, rings: int = _RINGS) -> Tensor:
     image = torch.zeros(channels, texels.height * texels.width)
     image[:, texels.texels] = values.T.float()
     image = image.reshape(1, channels, texels.height, texels.width)
-    known = texels.mask()[None, None].float()
+    filled = texels.mask()[None, None].float()
     background = values.float().mean(0) if len(values) else torch.zeros(channels)
-    for _ in range(rings):  # a ring of texels a turn
-        count = torch.nn.functional.avg_pool2d(known, 3, 1, 1, count_include_pad=True)
-        mean = torch.nn.functional.avg_pool2d(image * known, 3, 1, 1) / count.clamp(min=1e-6)
-        image = torch.where(known > 0, image, torch.where(count > 0, mean, image))
-        known = (count > 1e-6).float()
-    return torch.where(known > 0, image, background.reshape(1, channels, 1, 1))[0].contiguous()
+    for _ in range(rings):  # a ring of texels at a time
+        count = torch.nn.functional.avg_pool2d(filled, 3, 1, 1, count_include_pad=True)
+        mean = torch.nn.functional.avg_pool2d(image * filled, 3, 1, 1) / count.clamp(min=1e-6)
+        image = torch.where(filled > 0, image, torch.where(count > 0, mean, image))
+        filled = (count > 1e-6).float()
+    return torch.where(filled > 0, image, background.reshape(1, channels, 1, 1))[0].contiguous()

@@ -11,7 +11,7 @@ from torchface.errors import ShapeError, TopologyError, ValueRangeError
 
 _ON_EDGE = 1e-6  # texels; a centre on the edge of two triangles belongs to both
 _DEGENERATE = 1e-9  # square texels
-_MOST_OVERLAP = 64
+_MAX_OVERLAP = 64
 _BATCH = 2**22
 
 
@@ -56,7 +56,7 @@ def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> Tex
     """Finds for every texel the triangle that its centre lies in.
 
     The centre of texel (row, column) is at :math:`u = (column + 1/2)/W`, :math:`v = 1 - (row + 1/2)/H`. Where
-    triangles overlap, the first one has the texel. What lies outside the unit square is cut off.
+    triangles overlap, the first one has the texel. What lies outside the unit square is left out.
 
     Args:
         uvs: texture coordinates, origin at the lower left, (U,2).
@@ -150,10 +150,10 @@ def _position_in_run(count: Tensor) -> Tensor:
 
 
 def _refuse_overlap(work: int, texels: int) -> None:
-    if work > _MOST_OVERLAP * max(texels, 2**16):
+    if work > _MAX_OVERLAP * max(texels, 2**16):
         raise TopologyError(
             f"uvs: triangles cover the texture {work / texels:.0f} times over, expected a layout whose charts "
-            f"do not overlap (at most {_MOST_OVERLAP} times)"
+            f"do not overlap (at most {_MAX_OVERLAP} times)"
         )
 
 

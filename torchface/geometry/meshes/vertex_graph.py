@@ -9,7 +9,7 @@ from torchface.geometry.meshes.operators import edges
 
 
 class VertexGraph:
-    """Which vertices are neighbours: values fade, blur and fill over the mesh rather than over its layout.
+    """Which vertices are neighbours: values are blurred and filled over the mesh rather than over its layout.
 
     Args:
         faces: triangles (F,3).
@@ -27,10 +27,10 @@ class VertexGraph:
         total = torch.zeros_like(values).index_add_(0, self.first, values[self.second])
         return total.index_add_(0, self.second, values[self.first])
 
-    def smoothed(self, values: Tensor, weights: Tensor, rounds: int) -> Tensor:
+    def smoothed(self, values: Tensor, weights: Tensor, iterations: int) -> Tensor:
         """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""
         top, bottom = values * weights[:, None], weights[:, None]
-        for _ in range(rounds):
+        for _ in range(iterations):
             both = torch.cat([top, bottom], dim=1)
             both = 0.5 * (both + self.sum(both) / self.degree[:, None])
             top, bottom = both[:, :-1], both[:, -1:]

@@ -19,7 +19,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.detail.scan_alignment import Correspondences, ScanAlignment, align_scan
 from torchface.rendering.raycast import RayCaster
 
-LARGEST_SIDE = 8192
+MAX_SIDE = 8192
 _BATCH = 2**19
 _STAND_OFF = 1e-3  # millimetres; rays start this far behind the surface, so that a scan that touches it is hit
 
@@ -49,7 +49,7 @@ class NormalMap:
 
     Args:
         normals: unit vectors in tangent space (see ``torchface.geometry.meshes.tangent_space``), (3,H,W).
-        hit: the texels that the scan has told something about, (H,W) bool; the others are flat.
+        hit: the texels that the scan covers, (H,W) bool; the others are flat.
         alignment: how the scan was laid on the mesh; none where it was given.
         statistics: what the rays found.
     """
@@ -61,7 +61,7 @@ class NormalMap:
 
     @property
     def image(self) -> Tensor:
-        """The picture as files hold it, (3,H,W) in [0,1]."""
+        """The image as files hold it, (3,H,W) in [0,1]."""
         return encode_normals(self.normals)
 
 
@@ -79,7 +79,7 @@ def bake_normal_map(
     """Writes the normals of a high-resolution scan into a map for a mesh of the same face and expression.
 
     The scan is laid on the mesh. From each texel's point two rays go along the interpolated normal, outward and
-    inward; the nearer hit whose smooth normal turns by no more than ``maximum_angle`` counts, and that normal is
+    inward; the nearer hit whose smooth normal deviates by no more than ``maximum_angle`` counts, and that normal is
     written in the mesh's tangent space. Texels without such a hit stay flat, (0, 0, 1).
 
     Args:
@@ -88,7 +88,7 @@ def bake_normal_map(
         size: of the map, texels a side, or height and width.
         correspondences: vertex ids (L,) or points (L,3) of the mesh, and points (L,3) of the scan, at least three;
             the scan finds its place by itself if they are absent, see ``align_scan``.
-        alignment: scan space to mesh space where it is known; then nothing is estimated.
+        alignment: scan space to mesh space, if given; then nothing is estimated.
         scale: estimate the scan's scale too.
         maximum_distance: along the normal, millimetres.
         maximum_angle: between the normals of mesh and scan, degrees, less than 90.
@@ -143,7 +143,7 @@ def bake_normal_map(
 def detail_maps(names: Sequence[str], baked: Sequence[NormalMap], neutral: NormalMap | None = None) -> DetailMaps:
     """Maps baked from scans of expressions, one a shape, ready to be mixed by weight.
 
-    Where a scan has told nothing, its shape keeps what the neutral's map says.
+    Where a scan covers nothing, its shape keeps the neutral's map.
 
     Args:
         names: the shapes.
@@ -239,10 +239,10 @@ def _nearest_hits(
     for side in (1.0, -1.0):
         distance, found = scan.hits(points - side * _STAND_OFF * ways, side * ways)
         offset = side * (distance - _STAND_OFF)
-        turn = (found * ways).sum(-1)
+        agreement = (found * ways).sum(-1)
         near = (distance - _STAND_OFF).abs() <= reach
-        back |= near & (turn < -cosine)
-        counts = near & (turn >= cosine) & (offset.abs() < best.abs())
+        back |= near & (agreement < -cosine)
+        counts = near & (agreement >= cosine) & (offset.abs() < best.abs())
         best = torch.where(counts, offset, best)
         normals = torch.where(counts[:, None], found, normals)
     return best, normals, back
@@ -264,8 +264,8 @@ def _statistics(offsets: Tensor, texels: int) -> BakeStatistics:
 def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
     sides = size if isinstance(size, tuple) else (size, size)
     whole = len(sides) == 2 and all(isinstance(side, int) and not isinstance(side, bool) for side in sides)
-    if not whole or not all(1 <= side <= LARGEST_SIDE for side in sides):
-        raise ValueRangeError(f"size: found {size!r}, expected one or two whole numbers from 1 to {LARGEST_SIDE}")
+    if not whole or not all(1 <= side <= MAX_SIDE for side in sides):
+        raise ValueRangeError(f"size: found {size!r}, expected one or two whole numbers from 1 to {MAX_SIDE}")
     return sides[0], sides[1]
 
 

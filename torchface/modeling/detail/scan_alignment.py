@@ -19,10 +19,10 @@ Correspondences = tuple[Tensor, Tensor]
 
 _SAMPLES, _COARSE_SAMPLES = 3000, 400
 _COARSE_POINTS = 10_000
-_REACH = 40.0  # millimetres; further away no partner is looked for
+_REACH = 40.0  # millimetres; no partner is sought beyond
 _NEAR = 3.0  # millimetres; what an expression's scan and its shape differ by at most places
-_FOUND = 0.6  # share of the samples with a place on the scan that must come to lie near it
-_LEAST_OVERLAP = 0.1
+_MIN_NEAR = 0.6  # share of the samples with a place on the scan that must come to lie near it
+_MIN_OVERLAP = 0.1
 _SEED = 0
 
 
@@ -44,29 +44,29 @@ class ScanAlignment:
 def align_scan(
     mesh: Mesh, scan: Mesh, correspondences: Correspondences | None = None, scale: bool = False
 ) -> ScanAlignment:
-    """Lays a scan on a mesh of the same face: a start, then iterated closest points, trimmed to where they overlap.
+    """Aligns a scan to a mesh of the same face by iterated closest points, trimmed to where they overlap.
 
-    The start comes from the correspondences; without them the scan may lie in any pose, and whichever of many
-    starts ends closest is taken. A scan that shows less than a tenth of the mesh needs picked points.
+    The initial pose comes from the correspondences; without them the scan may lie in any pose, and whichever of many
+    initial poses ends closest is taken. A scan that shows less than a tenth of the mesh needs picked points.
 
     Args:
         mesh: the face.
         scan: the same face, millimetres, all of it or a part.
-        correspondences: at least three, see ``Correspondences``; closest points follow, so picks may be off by some
+        correspondences: at least three, see ``Correspondences``; closest points follow, so picks may be wrong by some
             millimetres.
         scale: estimate the scan's scale too.
 
     Raises:
         ShapeError: fewer than three correspondences, or not of the shapes above.
         ValueRangeError: a correspondence is NaN, on a line, or the scan is in another unit.
-        AlignmentError: no start ends close enough.
+        AlignmentError: no initial pose ends close enough.
     """
     _check_extent(mesh, scan)
     target = _Target.of(scan)
     if correspondences is not None:
         picked = _picked(mesh, correspondences)
-        start = similarity_transform(picked[0][None], picked[1][None], scale=scale)
-        return _result(_iterate(_samples(mesh, _SAMPLES), target, _Pose.of(start), 40, scale))
+        initial = similarity_transform(picked[0][None], picked[1][None], scale=scale)
+        return _result(_iterate(_samples(mesh, _SAMPLES), target, _Pose.of(initial), 40, scale))
     return _automatic(mesh, target, scale)
 
 
@@ -77,9 +77,9 @@ def _check_extent(mesh: Mesh, scan: Mesh) -> None:
     if not 0.12 <= ratio <= 12:
         units = {"metres": 1e-3, "centimetres": 0.1, "inches": 1 / 25.4, "micrometres": 1e3}
         close = [name for name, size in units.items() if 0.4 < ratio / size < 2.5]
-        looks = f"; it looks as if the scan were in {close[0]}" if close else ""
+        hint = f"; it looks as if the scan were in {close[0]}" if close else ""
         raise ValueRangeError(
-            f"scan: found an extent of {sizes[1]:.4g} mm beside a mesh of {sizes[0]:.4g} mm{looks}; "
+            f"scan: found an extent of {sizes[1]:.4g} mm beside a mesh of {sizes[0]:.4g} mm{hint}; "
             "expected both in millimetres"
         )
 
@@ -106,8 +106,8 @@ def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tenso
     for name, points in (("mesh", on_mesh), ("scan", on_scan)):
         if not torch.isfinite(points).all():
             raise ValueRangeError(f"correspondences: found NaN or infinite points on the {name}, expected none")
-        spread = torch.linalg.svdvals(points.double() - points.double().mean(0))
-        if float(spread[1]) < 1e-3 * float(spread[0]) or float(spread[0]) == 0:
+        singular = torch.linalg.svdvals(points.double() - points.double().mean(0))
+        if float(singular[1]) < 1e-3 * float(singular[0]) or float(singular[0]) == 0:
             raise ValueRangeError(
                 f"correspondences: the points on the {name} lie on a line, expected a triangle of them"
             )
@@ -130,7 +130,7 @@ class _Target:
         return _Target(points, normals[used], border_vertices(scan.faces, len(vertices))[used], cKDTree(points.numpy()))
 
     def thinned(self, count: int) -> _Target:
-        """Fewer points, but the whole border, so that what lies beyond it is still known to."""
+        """Fewer points, but the whole border, so that points beyond it are still recognised."""
         keep = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(_SEED))[:count]
         keep = torch.cat([keep, self.border.nonzero()[:, 0]]).unique()
         points = self.points[keep]
@@ -176,15 +176,15 @@ def _automatic(mesh: Mesh, target: _Target, scale: bool) -> ScanAlignment:
     samples = _samples(mesh, _SAMPLES)
     identity = _Pose(torch.ones(()).double(), torch.eye(3).double(), torch.zeros(3).double())
     best = _iterate(samples, target, identity, 40, False)
-    if best.near < _FOUND:
+    if best.near < _MIN_NEAR:
         few, thin = samples.first(_COARSE_SAMPLES), target.thinned(_COARSE_POINTS)
-        # Each start is an iteration of its own; four hundred points against a thinned scan take milliseconds.
-        coarse = [_iterate(few, thin, start, 15, False) for start in _starts(samples, target)]
+        # Each initial pose is iterated by itself; four hundred points against a thinned scan take milliseconds.
+        coarse = [_iterate(few, thin, initial, 15, False) for initial in _initial_poses(samples, target)]
         coarse.sort(key=lambda pose: -pose.near * pose.overlap)
         best = max(
             (_iterate(samples, target, pose, 40, False) for pose in coarse[:4]), key=lambda p: p.near * p.overlap
         )
-    if best.near < _FOUND or best.overlap < _LEAST_OVERLAP:
+    if best.near < _MIN_NEAR or best.overlap < _MIN_OVERLAP:
         raise AlignmentError(
             f"scan: no pose found by itself that lays it on the mesh (best: {best.near:.0%} of the overlap within "
             f"{_NEAR:g} mm); expected scan and mesh of one face in one expression, triangles counter-clockwise seen "
@@ -193,21 +193,21 @@ def _automatic(mesh: Mesh, target: _Target, scale: bool) -> ScanAlignment:
     return _result(_iterate(samples, target, best, 40, scale) if scale else best)
 
 
-def _starts(samples: _Samples, target: _Target) -> list[_Pose]:
-    """Centre on centre, turned to each of the 24 poses of a cube and each half-way to its neighbours."""
+def _initial_poses(samples: _Samples, target: _Target) -> list[_Pose]:
+    """Centre on centre, rotated to each of the 24 poses of a cube and each half-way to its neighbours."""
     one = torch.ones(()).double()
     middle, other = samples.points.mean(0), target.points.mean(0)
     cube = Rotation.create_group("O")
-    turns = torch.from_numpy(
+    rotations = torch.from_numpy(
         Rotation.concatenate([cube, Rotation.from_euler("xyz", [45, 35, 0], True) * cube]).as_matrix()
     )
-    return [_Pose(one, turn, other - turn @ middle) for turn in turns]
+    return [_Pose(one, rotation, other - rotation @ middle) for rotation in rotations]
 
 
-def _iterate(samples: _Samples, target: _Target, pose: _Pose, rounds: int, scale: bool) -> _Pose:
-    """Point to plane, each round on the pairs that agree; the pairs of one round need the pose of the last."""
+def _iterate(samples: _Samples, target: _Target, pose: _Pose, iterations: int, scale: bool) -> _Pose:
+    """Point to plane, each iteration on the pairs that agree, found in the pose of the one before."""
     s, rotation, translation, reach = pose.scale, pose.rotation, pose.translation, _REACH
-    for _ in range(rounds):
+    for _ in range(iterations):
         points = s * samples.points @ rotation.T + translation
         pairs = _pairs(points, samples.normals @ rotation.T, target, reach)
         if len(pairs.rows) < 12:
@@ -257,11 +257,11 @@ class _Step:
     scale: Tensor
     rotation: Tensor
     centre: Tensor
-    shift: Tensor
+    translation: Tensor
     motion: float
 
     def apply(self, point: Tensor) -> Tensor:
-        return self.scale * self.rotation @ (point - self.centre) + self.centre + self.shift
+        return self.scale * self.rotation @ (point - self.centre) + self.centre + self.translation
 
 
 def _step(points: Tensor, targets: Tensor, normals: Tensor, scale: bool) -> _Step:
@@ -274,12 +274,12 @@ def _step(points: Tensor, targets: Tensor, normals: Tensor, scale: bool) -> _Ste
         columns.append((offset * normals).sum(1, keepdim=True) / reach)
     system = torch.cat(columns, dim=1)
     right = ((targets - points) * normals).sum(1, keepdim=True)
-    # A little damping leaves still what the surface does not tell, such as the turn of a ball.
+    # A little damping keeps still what the surface leaves open, such as the rotation of a ball.
     gram = system.T @ system + 1e-6 * len(points) * torch.eye(system.shape[1], dtype=torch.float64)
     x = torch.linalg.solve(gram, system.T @ right)[:, 0]
-    turn = torch.from_numpy(Rotation.from_rotvec((x[:3] / reach).numpy()).as_matrix())
+    rotation = torch.from_numpy(Rotation.from_rotvec((x[:3] / reach).numpy()).as_matrix())
     grown = 1 + x[6] / reach if scale else torch.ones(()).double()
-    return _Step(grown, turn, centre, x[3:6], float(x.norm()))
+    return _Step(grown, rotation, centre, x[3:6], float(x.norm()))
 
 
 def _result(pose: _Pose) -> ScanAlignment:

@@ -13,7 +13,7 @@ _DARK, _BRIGHT = 0.02, 0.98
 _STEPS = 20
 _TOLERANCE = 1e-5
 _UNALIKE = 0.15
-"""In natural logarithms of light: a brow where others have none does not tell the exposure."""
+"""In natural logarithms of light: a brow where others have none is no sign of another exposure."""
 
 
 def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -25,7 +25,7 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
 
     with x in linear light and Geman and McClure's :math:`\phi` (width 0.15), so that beards, brows and make-up of some
     do not count as the light of all. Clipped values (below 0.02, above 0.98) are left out. What makes one person's
-    skin darker as a whole cannot be told from exposure and counts as such.
+    skin darker as a whole cannot be distinguished from exposure and counts as such.
 
     Args:
         colors: of the same vertices, (M,V,3) in [0,1], sRGB as textures hold them.
@@ -49,19 +49,19 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
     if not bool(torch.isfinite(colors).all()):
         raise ValueRangeError("colors: found NaN or infinity, expected colours in [0,1]")
     valid = ((colors > _DARK) & (colors < _BRIGHT)).float() * weights.to(colors)[None, :, None]
-    told = valid.sum(1)
-    if bool((told <= 0).any()):
-        bad = int((told <= 0).any(1).nonzero()[0, 0])
+    sampled = valid.sum(1)
+    if bool((sampled <= 0).any()):
+        bad = int((sampled <= 0).any(1).nonzero()[0, 0])
         raise ValueRangeError(f"colors: number {bad} is black or blown out everywhere, expected some colours between")
     light = to_linear(colors.clamp(_DARK, _BRIGHT)).log()
-    gains = (valid * light).sum(1) / told
+    gains = (valid * light).sum(1) / sampled
     gains -= gains.mean(0)
-    trusted = valid
+    robust = valid
     for _ in range(_STEPS):
-        reference = (trusted * (light - gains[:, None])).sum(0) / trusted.sum(0).clamp(min=1e-9)
+        reference = (robust * (light - gains[:, None])).sum(0) / robust.sum(0).clamp(min=1e-9)
         left = light - reference
-        trusted = valid * (1 + ((left - gains[:, None]) / _UNALIKE).square()).pow(-2)
-        found = (trusted * left).sum(1) / trusted.sum(1).clamp(min=1e-9)
+        robust = valid * (1 + ((left - gains[:, None]) / _UNALIKE).square()).pow(-2)
+        found = (robust * left).sum(1) / robust.sum(1).clamp(min=1e-9)
         found -= found.mean(0)
         moved, gains = float((found - gains).abs().max()), found
         if moved < _TOLERANCE:

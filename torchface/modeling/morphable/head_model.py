@@ -15,7 +15,7 @@ from torchface.mesh import Annotations, Mesh, submesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.rig import BlendshapeRig
 
-_LARGEST = 2**31
+_MAX_BYTES = 2**31
 _MAX_SHAPES = _MAX_REGIONS = 1000
 _TOPOLOGY = ("faces", "polygons", "uvs", "uv_faces", "landmarks", "mirror", "contacts")
 
@@ -171,11 +171,11 @@ class HeadModel(nn.Module):
         )
 
     def forward(self, shape_coefficients: Tensor, color_coefficients: Tensor | None = None) -> Heads:
-        """Heads of coefficients (B,K) and, where given and known, their colours of coefficients (B,L)."""
+        """Heads of coefficients (B,K) and, where given and modelled, their colours of coefficients (B,L)."""
         colors = None
         if color_coefficients is not None:
             if self.color is None:
-                raise TopologyError("head model: found colour coefficients, expected none: it knows no colours")
+                raise TopologyError("head model: found colour coefficients, expected none: it has no colours")
             colors = self.color(color_coefficients)
         return Heads(self.shape(shape_coefficients), colors)
 
@@ -248,8 +248,8 @@ class HeadModel(nn.Module):
 
 def _rig_of(found: Value, vertices: int) -> tuple[list[str], bool]:
     """A rig's shapes by name, and whether it has colours."""
-    most = min(_MAX_SHAPES, _LARGEST // (12 * vertices))
-    names = [name.text() for name in found["shapes"].rows(1, most, f"1 to {most} names")]
+    limit = min(_MAX_SHAPES, _MAX_BYTES // (12 * vertices))
+    names = [name.text() for name in found["shapes"].rows(1, limit, f"1 to {limit} names")]
     return names, found["colors"].found is True
 
 

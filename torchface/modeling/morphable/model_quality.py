@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.geometry.sample_batches import Samples, blocks
 
-_MOST_LEFT_OUT = 400
+_MAX_LEFT_OUT = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def model_quality(
     :math:`\sqrt{\sum_k (a_k \sigma_k - b_{jk})^2}` with b its coordinates along all components.
 
     Args:
-        samples: (M,V,C), aligned; of more than 400 the first 400 by even steps are left out in turn.
+        samples: (M,V,C), aligned; of more than 400, 400 at even steps are left out, one at a time.
         components: how many components to measure with, each from 1 to M-2.
         drawn: how many random samples.
         generator: draws them; seeded with 0 if absent.
@@ -66,7 +66,7 @@ def model_quality(
     values, vectors = torch.linalg.eigh(gram)
     values, vectors = values.flip(0).clamp(min=0), vectors.flip(1)
     along = vectors * values.sqrt()  # training samples along all components, (M,M)
-    left = torch.linspace(0, count - 1, min(count, _MOST_LEFT_OUT)).round().long()
+    left = torch.linspace(0, count - 1, min(count, _MAX_LEFT_OUT)).round().long()
     missed = torch.stack([_left_out(gram, int(i), numbers) for i in left]) / vertices
     errors = missed.clamp(min=0).sqrt()
     deviations = (values / (count - 1)).sqrt()

@@ -13,7 +13,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.modeling.morphable.principal_components import principal_components
 
-_LARGEST = 2**31
+_MAX_BYTES = 2**31
 
 
 class MorphableModel(nn.Module):
@@ -120,7 +120,7 @@ class MorphableModel(nn.Module):
 
         with modes :math:`M`: the posterior mean under noise of deviation :math:`\nu`. Without noise the second term
         is left out: the orthogonal projection, or the shortest least-squares solution where the vertices do not
-        tell all coefficients.
+        determine all coefficients.
 
         Args:
             samples: (B,V,C), or (B,N,C) of the ``vertices``; a vertex with a NaN counts as missing.
@@ -159,9 +159,9 @@ class MorphableModel(nn.Module):
         result = residual.new_empty((len(samples), self.count))
         for number, group in enumerate(groups):
             rows = (member == number).nonzero()[:, 0]
-            known = modes[:, group].flatten(1)
-            told = residual[rows][:, group].flatten(1)
-            result[rows] = _posterior(known, told) if noise is not None else _least_squares(known, told)
+            basis = modes[:, group].flatten(1)
+            observed = residual[rows][:, group].flatten(1)
+            result[rows] = _posterior(basis, observed) if noise is not None else _least_squares(basis, observed)
         return result.float()
 
     def log_prob(self, coefficients: Tensor) -> Tensor:
@@ -231,16 +231,16 @@ class MorphableModel(nn.Module):
             FileFormatError: a size is missing, no whole number, or too large.
         """
         values = Value("config", "", config)
-        sizes = (values[name].whole(1, _LARGEST - 1) for name in ("vertices", "channels", "components"))
+        sizes = (values[name].whole(1, _MAX_BYTES - 1) for name in ("vertices", "channels", "components"))
         vertices, channels, components = sizes
-        if 4 * vertices * channels * (components + 1) > _LARGEST:
-            raise FileFormatError(f"morphable model: found sizes of more than {_LARGEST} bytes, expected fewer")
+        if 4 * vertices * channels * (components + 1) > _MAX_BYTES:
+            raise FileFormatError(f"morphable model: found sizes of more than {_MAX_BYTES} bytes, expected fewer")
         return cls(
             torch.zeros(vertices, channels),
             torch.zeros(components, vertices, channels),
             torch.zeros(components),
             0.0,
-            values["samples"].whole(0, _LARGEST - 1),
+            values["samples"].whole(0, _MAX_BYTES - 1),
         )
 
     def _check(self, coefficients: Tensor) -> None:
@@ -270,7 +270,7 @@ def _posterior(modes: Tensor, residual: Tensor) -> Tensor:
 
 
 def _least_squares(modes: Tensor, residual: Tensor) -> Tensor:
-    """The shortest solution; directions that the vertices do not tell stay at the mean."""
+    """The shortest solution; directions that the vertices leave open stay at the mean."""
     values, vectors = torch.linalg.eigh(modes @ modes.T)
     inverse = torch.where(values > 1e-10 * values[-1].clamp(min=1e-300), 1 / values, 0.0)
     return (residual @ modes.T) @ (vectors * inverse) @ vectors.T

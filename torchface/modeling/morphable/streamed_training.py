@@ -21,7 +21,7 @@ from torchface.progress import Progress, silent
 
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
-_MANY = 200
+_MAX_COMPONENTS = 200
 _FORMAT = "torchface.gram-rows/1"
 
 
@@ -42,7 +42,7 @@ def fit_sequence(
         components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
         checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
             samples and folder, the fit continues; in the end the files are removed.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: fewer than two samples.
@@ -55,7 +55,7 @@ def fit_sequence(
     count, vertices, channels = samples.shape
     check_count(count, components)
     if components is None and count > _WHOLE_SPECTRUM:
-        components = _MANY
+        components = _MAX_COMPONENTS
     parts = list(blocks(samples, _BLOCK_BYTES))
     work = 2 * len(parts) + len(parts) * (len(parts) + 1) // 2
     steps = iter(range(1, work + 1))
@@ -67,8 +67,8 @@ def fit_sequence(
     gram = torch.zeros(count, count, dtype=torch.float64)
     rows = _Rows(None if checkpoint is None else Path(checkpoint), mean, count)
     for number, (begin, end) in enumerate(parts):
-        if (known := rows.read(number, end - begin, end)) is not None:
-            gram[begin:end, :end] = known
+        if (stored := rows.read(number, end - begin, end)) is not None:
+            gram[begin:end, :end] = stored
             for _ in range(number + 1):
                 step()
             continue

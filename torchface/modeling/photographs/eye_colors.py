@@ -15,10 +15,10 @@ from torchface.mesh import Mesh
 from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.raycast import RayCaster
 
-_FEWEST_PIXELS = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
+_MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
 _SHARE = (0.15, 0.40)
 """Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
-_FEWEST = 40
+_MIN_PIXELS = 40
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -58,10 +58,10 @@ def iris_color(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) 
         shown = shown_in(image.cpu(), camera, caster, vertices, normals)
         for ball in balls:
             pixels = camera.project(vertices[ball])
-            if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _FEWEST_PIXELS:
+            if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _MIN_DIAMETER:
                 seen.append(shown.colors[ball & (shown.cosine > 0.3)].double())
     colors = torch.cat(seen) if seen else torch.zeros(0, 3, dtype=torch.float64)
-    if len(colors) < _FEWEST:
+    if len(colors) < _MIN_PIXELS:
         return None
     order = colors.mean(1).argsort()
     first, last = (round(share * len(order)) for share in _SHARE)

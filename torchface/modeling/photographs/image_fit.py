@@ -25,8 +25,8 @@ from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mirror
 
-_TURNED = 100.0  # degrees from the camera; a face turned further shows none of its inner landmarks
-_UNLIKE = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
+_MAX_ANGLE = 100.0  # degrees from the camera; a face rotated further shows none of its inner landmarks
+_MAX_MISFIT = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
 _SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
 
 
@@ -44,7 +44,7 @@ class ImageFit:
         landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
         noise: estimated deviation of an inner landmark, pixels.
         covariance: of coefficients and weights, (K+N,K+N); rows of those that lie on their bound are zero.
-        color: what the colour model tells of the photographs; None without one, or without photographs.
+        color: the colour model's fit to the photographs; None without one, or without photographs.
     """
 
     mesh: Mesh
@@ -83,7 +83,7 @@ def fit_images(
     .. math:: \min_{a,w,P} \sum_{i,l} c_l \lVert P_i(\bar S + \sum_k a_k s_k + \sum_n w_n B_n)_{v_l} - q_{il} \rVert^2
               / \sigma^2 + \lVert a \rVert^2 + \rho(w), \quad |a| \le 3, \; 0 \le w \le 1
 
-    for all photographs of one person with one expression together. Poses start by PnP; then identity, expression,
+    for all photographs of one person with one expression together. PnP gives initial poses; then identity, expression,
     poses and focal length move at once, each step a quadratic program in a box. Landmarks of the face's contour slide
     to where the silhouette is. At the end the shapes that show are transferred to the head found, and it is fitted
     again.
@@ -95,13 +95,13 @@ def fit_images(
         image_size: (width, height) of all photographs, or one for each.
         images: the photographs, (3,H,W) each, for the head's skin; see ``photographed_skin``.
         landmark_vertices: of the 68, (68,); the rig's annotated ones, or the model's, if absent.
-        camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as known unless
-            ``settings.focal_spread`` says how far it may be off. Estimated if absent.
-        settings: how landmarks are trusted; see ``FitSettings``.
+        camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as exact unless
+            ``settings.focal_deviation`` gives its deviation. Estimated if absent.
+        settings: the noise of landmarks; see ``FitSettings``.
         transfers: how often shapes are transferred to the head found; 0 keeps the template's.
         texture_size: of the skin, texels a side; 0 makes no texture.
         masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         The head, what it took to find it, and how sure it is; see ``ImageFit``. Solved in float64 on the CPU.
@@ -109,7 +109,7 @@ def fit_images(
     Raises:
         ShapeError: the landmarks are not (I,68,2), or sizes do not fit.
         TopologyError: model and rig have other triangles.
-        ValueRangeError: too few landmarks in a view, or landmarks outside its picture.
+        ValueRangeError: too few landmarks in a view, or landmarks outside its image.
         AlignmentError: a face seen from behind, or landmarks that are not a face's in iBUG's order.
 
     Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
@@ -129,16 +129,16 @@ def fit_images(
     pose = _checked_pose(points.mean[:LANDMARKS], found, intrinsics)
     twins = len(modes) + _twins(rig.names)
     problem = Problem(points, len(modes), found, intrinsics[:, 0, 0], settings, twins)
-    start = State(
+    initial = State(
         torch.zeros(len(points.basis), dtype=torch.float64),
         Views(intrinsics, pose.rotation, pose.translation),
         torch.arange(LANDMARKS).expand(len(found), -1),
         float(pose.errors.mean()) if settings.noise is None else settings.noise,
     )
     progress("fitting identity and expression")
-    problem, state = solve_either(problem, start)
-    for turn in range(transfers):
-        progress("transferring the shapes that show", turn, transfers)
+    problem, state = solve_either(problem, initial)
+    for number in range(transfers):
+        progress("transferring the shapes that show", number, transfers)
         weights = state.coefficients[len(modes) :].float()
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)
@@ -182,7 +182,7 @@ def _result(
 
 
 def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
-    """The rig's deltas (N,V,3) where the model's heads are, turned and scaled as they are."""
+    """The rig's deltas (N,V,3) where the model's heads are, rotated and scaled as they are."""
     rest, deltas = rig.vertices.detach().cpu(), rig.deltas.detach().cpu()
     if torch.allclose(rest, mean, atol=1e-3):
         return deltas.float()
@@ -211,18 +211,18 @@ def _checked_pose(mean: Tensor, found: Tensor, intrinsics: Tensor) -> Pose:
     pose = solve_pnp(mean, found, intrinsics, inner)
     marks = found[:, JAW:]
     size = (marks - marks.nanmean(1, keepdim=True)).square().sum(-1).nanmean(1).sqrt()
-    turned = torch.rad2deg(torch.arccos((-pose.rotation[:, 2, 2]).clamp(-1, 1)))
+    angle = torch.rad2deg(torch.arccos((-pose.rotation[:, 2, 2]).clamp(-1, 1)))
     for i in range(len(found)):  # a view at a time, for its message
         share = float(pose.errors[i] / size[i])
-        if share > _UNLIKE:
+        if share > _MAX_MISFIT:
             raise AlignmentError(
-                f"landmarks: found view {i}'s {share:.0%} of their extent away from a face's, expected less than "
-                f"{_UNLIKE:.0%}; are they in iBUG's order of 68, x before y?"
+                f"landmarks: found view {i}'s {share:.0%} of their extent from a face's, expected less than "
+                f"{_MAX_MISFIT:.0%}; are they in iBUG's order of 68, x before y?"
             )
-        if float(turned[i]) > _TURNED:
+        if float(angle[i]) > _MAX_ANGLE:
             raise AlignmentError(
-                f"landmarks: found a face turned by {float(turned[i]):.0f}° in view {i}, as if seen from behind, "
-                f"expected at most {_TURNED:.0f}°; are left and right swapped, or is y up?"
+                f"landmarks: found a face rotated by {float(angle[i]):.0f}° in view {i}, as if seen from behind, "
+                f"expected at most {_MAX_ANGLE:.0f}°; are left and right swapped, or is y up?"
             )
     return pose
 

@@ -1,4 +1,4 @@
-"""What is asked of landmarks, pictures and lenses before a head is fitted to them."""
+"""Checks of landmarks, images and lenses before a head is fitted to them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torchface.modeling.photographs.image_solve import FitSettings
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
 from torchface.rig import BlendshapeRig
 
-_FEWEST = 6
-_FOCAL, _FOCAL_SPREAD = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
+_MIN_INNER = 6
+_FOCAL, _FOCAL_DEVIATION = 1.5, 0.3  # of the longer side: what is assumed where nothing is known of the lens
 _INSIDE = 0.5
 
 
@@ -25,7 +25,7 @@ def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig, landmark_ver
 
     Raises:
         TopologyError: model and rig have other triangles, or a vertex is none of theirs.
-        ValueRangeError: landmarks are known nowhere.
+        ValueRangeError: landmarks are annotated nowhere.
         ShapeError: not (68,) int64.
     """
     faces = rig.neutral.faces
@@ -35,8 +35,8 @@ def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig, landmark_ver
             f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
         )
     if landmark_vertices is None:
-        known = rig.neutral.annotations
-        landmark_vertices = known.landmarks if known is not None and known.landmarks is not None else model.landmarks
+        annotated = rig.neutral.annotations.landmarks if rig.neutral.annotations is not None else None
+        landmark_vertices = model.landmarks if annotated is None else annotated
     if landmark_vertices is None:
         raise ValueRangeError(
             "landmark_vertices: found none, neither given nor annotated on rig or model; expected (68,) vertex ids"
@@ -59,7 +59,7 @@ def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tupl
 
     Raises:
         ShapeError: not (I,68,2), or not one size for all or for each.
-        ValueRangeError: too few landmarks in a view, or landmarks outside its picture.
+        ValueRangeError: too few landmarks in a view, or landmarks outside its image.
     """
     if landmarks.ndim != 3 or landmarks.shape[1:] != (LANDMARKS, 2) or len(landmarks) == 0:
         raise ShapeError(
@@ -82,27 +82,27 @@ def check_images(images: Sequence[Tensor], sizes: Tensor) -> None:
     found = [tuple(image.shape) for image in images]
     expected = [(3, int(height), int(width)) for width, height in sizes.tolist()]
     if found != expected:
-        raise ShapeError(f"images: found {found}, expected {expected}, as image_size says")
+        raise ShapeError(f"images: found {found}, expected {expected}, as in image_size")
 
 
 def _check_view(i: int, marks: Tensor, size: Tensor) -> None:
     seen = torch.isfinite(marks).all(-1)
-    picture = f"a picture of {int(size[0])} x {int(size[1])}"
+    image = f"an image of {int(size[0])} x {int(size[1])}"
     if int(seen.sum()) == 0:
-        raise ValueRangeError(f"landmarks: found none in view {i}, expected at least {_FEWEST}; leave that view out")
-    if int(seen[JAW:].sum()) < _FEWEST:
+        raise ValueRangeError(f"landmarks: found none in view {i}, expected at least {_MIN_INNER}; leave that view out")
+    if int(seen[JAW:].sum()) < _MIN_INNER:
         raise ValueRangeError(
             f"landmarks: found {int(seen[JAW:].sum())} on brows, eyes, nose and mouth in view {i}, expected at least "
-            f"{_FEWEST}"
+            f"{_MIN_INNER}"
         )
     low, high = marks[seen].amin(0), marks[seen].amax(0)
     found = f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
     if float((high - low).max()) < 4:
-        raise ValueRangeError(f"landmarks: found view {i}'s from {found}, expected pixels in {picture}")
+        raise ValueRangeError(f"landmarks: found view {i}'s from {found}, expected pixels in {image}")
     inside = ((marks[seen] > -0.1 * size) & (marks[seen] < 1.1 * size)).all(-1)
     if float(inside.double().mean()) < _INSIDE:
         raise ValueRangeError(
-            f"landmarks: found view {i}'s from {found}, most of them outside {picture}; expected pixels of that picture"
+            f"landmarks: found view {i}'s from {found}, most of them outside {image}; expected pixels of that image"
         )
 
 
@@ -122,8 +122,8 @@ def lens(camera: float | Tensor | None, sizes: Tensor, settings: FitSettings) ->
         return intrinsics.expand(count, 3, 3), settings
     if camera is None:
         focal = _FOCAL * sizes.amax(1)
-        if settings.focal_spread == 0:
-            settings = replace(settings, focal_spread=_FOCAL_SPREAD)
+        if settings.focal_deviation == 0:
+            settings = replace(settings, focal_deviation=_FOCAL_DEVIATION)
         if not bool((sizes == sizes[0]).all()):  # other sizes, other cameras or crops
             settings = replace(settings, shared_focal=False)
     else:

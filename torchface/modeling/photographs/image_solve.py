@@ -20,13 +20,13 @@ from torchface.modeling.photographs.landmark_view import (
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
-_ILL, _SETTLED, _TRIAL = 1.5, 0.02, 3
-_LEAST_NOISE = 1e-5  # of the focal length: finer than any landmark is found
+_MAX_CONTOUR_ERROR, _SETTLED, _TRIAL_ITERATIONS = 1.5, 0.02, 3
+_MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How landmarks are trusted, and what is expected of faces.
+    """The noise of landmarks, and the priors on faces.
 
     Args:
         inner_weight: of a squared error at brows, eyes, nose and mouth beside one at the contour.
@@ -37,12 +37,12 @@ class FitSettings:
         expression_mean: how strong a shape is on average, in weights; the prior falls exponentially.
         expression_ridge: prior deviation of a weight beside that.
         asymmetry: prior deviation of the difference between a shape's weight and its mirror image's. Faces move almost
-            alike on both sides, and 68 landmarks of a turned head hardly tell a lopsided smile from the turn.
+            alike on both sides, and 68 landmarks of a rotated head hardly distinguish a lopsided smile from it.
         identity_bound: on each coefficient, standard deviations.
         noise: of an inner landmark, pixels; estimated from the residuals if absent.
-        focal_spread: relative deviation of the true focal length from the given one; 0 takes it as known.
+        focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
-        rounds: at most.
+        max_iterations: of Gauss-Newton.
     """
 
     inner_weight: float = 2.0
@@ -53,9 +53,9 @@ class FitSettings:
     asymmetry: float = 0.1
     identity_bound: float = 3.0
     noise: float | None = None
-    focal_spread: float = 0.0
+    focal_deviation: float = 0.0
     shared_focal: bool = True
-    rounds: int = 20
+    max_iterations: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def whitening(problem: Problem, state: State, picked: PickedPoints) -> Tensor:
 def step_focal(problem: Problem) -> Tensor:
     """How the unknowns of focal length, F of them, act on the views, (I,F)."""
     count, settings = len(problem.found), problem.settings
-    if settings.focal_spread == 0:
+    if settings.focal_deviation == 0:
         return torch.zeros(count, 0, dtype=torch.float64)
     if settings.shared_focal:
         return torch.ones(count, 1, dtype=torch.float64)
@@ -171,7 +171,7 @@ def normal_equations(problem: Problem, at: Linearised, views: Views) -> Normal:
     H_bb, g_b = B.T @ B, B.T @ r
     if focal.shape[1]:
         logs = (views.intrinsics[:, 0, 0] / problem.focal).log()
-        precision = 1 / problem.settings.focal_spread**2
+        precision = 1 / problem.settings.focal_deviation**2
         each = focal / focal.sum(0)
         H_bb.diagonal()[6 * count :] += precision
         g_b[6 * count :] += precision * (each.T @ logs)
@@ -193,19 +193,19 @@ def energy(problem: Problem, state: State, picked: PickedPoints, factors: Tensor
     focal = step_focal(problem)
     if focal.shape[1]:
         logs = (state.views.intrinsics[:, 0, 0] / problem.focal).log()
-        total = total + 0.5 * ((focal / focal.sum(0)).T @ logs).square().sum() / problem.settings.focal_spread**2
+        total = total + 0.5 * ((focal / focal.sum(0)).T @ logs).square().sum() / problem.settings.focal_deviation**2
     return float(total)
 
 
-def solve_either(problem: Problem, start: State) -> tuple[Problem, State]:
+def solve_either(problem: Problem, initial: State) -> tuple[Problem, State]:
     """``solve``, with sliding contour landmarks and where they fit ill without, whichever leaves less."""
     if problem.settings.sliding is not None:
-        return problem, solve(problem, start)
+        return problem, solve(problem, initial)
     sliding = replace(problem, settings=replace(problem.settings, sliding=True))
-    state = solve(replace(sliding, settings=replace(sliding.settings, rounds=_TRIAL)), start)
-    if _contour_error(sliding, state) >= _ILL:
+    state = solve(replace(sliding, settings=replace(sliding.settings, max_iterations=_TRIAL_ITERATIONS)), initial)
+    if _contour_error(sliding, state) >= _MAX_CONTOUR_ERROR:
         fixed = replace(problem, settings=replace(problem.settings, sliding=False))
-        other = solve(fixed, start)
+        other = solve(fixed, initial)
         if _contour_error(fixed, other) < _contour_error(sliding, state):
             return fixed, other
     return sliding, solve(sliding, state)
@@ -225,16 +225,16 @@ def _contour_error(problem: Problem, state: State) -> float:
 
 
 def solve(problem: Problem, state: State, free: Tensor | None = None) -> State:
-    """Rounds of Gauss-Newton until nothing changes.
+    """Gauss-Newton until nothing changes.
 
     Args:
         problem: see there.
-        state: where to start.
+        state: the initial guess.
         free: which coefficients may change, (D,) bool; all if absent.
     """
     lower, upper = problem.bounds()
     precision, linear = problem.prior()
-    for _ in range(problem.settings.rounds):
+    for _ in range(problem.settings.max_iterations):
         if problem.settings.sliding:
             rows = chosen_points(problem.points, state.coefficients, state.views)
             state = replace(state, rows=rows)
@@ -271,13 +271,13 @@ def _searched(
     """The step, halved until the energy falls."""
     count, focal = len(problem.found), step_focal(problem)
     camera = normal.alone + normal.back @ change
-    turn = camera[: 6 * count].reshape(count, 6)
+    motion = camera[: 6 * count].reshape(count, 6)
     longer = focal @ camera[6 * count :]
     for halving in range(_HALVINGS):
-        share = 0.5**halving
+        fraction = 0.5**halving
         tried = State(
-            state.coefficients + share * change,
-            state.views.moved(share * turn, share * longer),
+            state.coefficients + fraction * change,
+            state.views.moved(fraction * motion, fraction * longer),
             state.rows,
             state.noise,
         )
@@ -288,18 +288,18 @@ def _searched(
 
 
 def _noise(problem: Problem, state: State, picked: PickedPoints, factors: Tensor, normal: Normal) -> float:
-    """What is left over, for each number that neither the cameras nor the coefficients can explain away."""
+    """What is left over, for each number that neither the cameras nor the coefficients can explain."""
     r = residuals(picked, state.coefficients, state.views, problem.targets, factors)
     precision, _ = problem.prior()
     factor = torch.linalg.cholesky(precision)
     half = torch.linalg.solve_triangular(factor, normal.H, upper=False)
     values = torch.linalg.eigvalsh(torch.linalg.solve_triangular(factor, half.T, upper=False)).clamp(min=0)
     used = float((values / (values + 1)).sum()) + len(normal.alone)
-    # A contour landmark that slides tells hardly more than one number.
-    told = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
-    left = max(told - used, 0.2 * told)
+    # A contour landmark that slides constrains hardly more than one number.
+    measured = 2 * float(problem.seen.sum()) - (1 - problem.settings.contour_slide) * float(problem.seen[:, :JAW].sum())
+    left = max(measured - used, 0.2 * measured)
     found = state.noise * (float(r.square().sum()) / left) ** 0.5
-    return max(found, _LEAST_NOISE * float(problem.focal.mean()))
+    return max(found, _MIN_NOISE * float(problem.focal.mean()))
 
 
 def covariance(problem: Problem, state: State) -> Tensor:

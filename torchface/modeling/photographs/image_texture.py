@@ -41,7 +41,7 @@ def photographed_skin(
     size: int = 1024,
     masked: bool = True,
 ) -> Skin:
-    """What photographs and a colour model tell of a head's skin.
+    """A head's skin from photographs and a colour model.
 
     Args:
         posed: the head as the photographs show it; its own skin is the template's.
@@ -60,22 +60,22 @@ def photographed_skin(
     base = _own_colors(posed) if fit is None else fit.colors
     if posed.uvs is None or size == 0:
         return Skin(base, None, fit)
-    trust = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
+    confidence = skin_shares(posed, images, cameras) if masked and _has_landmarks(posed) else None
     if base is not None:
-        laid = photo_texture(posed, images, cameras, size, base, trust)
+        laid = photo_texture(posed, images, cameras, size, base, confidence)
         return Skin(laid.colors, laid.image, fit)
     parts = part_vertices(posed)
     if parts.any() and not parts.all():
-        trust = torch.ones(len(images), len(parts)) if trust is None else trust
-        trust = torch.where(parts, 0.0, trust)
-    laid = photo_texture(posed, images, cameras, size, base, trust)
+        confidence = torch.ones(len(images), len(parts)) if confidence is None else confidence
+        confidence = torch.where(parts, 0.0, confidence)
+    laid = photo_texture(posed, images, cameras, size, base, confidence)
     worn = with_part_colors(replace(posed, colors=laid.colors), iris_color(posed, images, cameras))
     return Skin(worn.colors, laid.image, fit)
 
 
 def _has_landmarks(mesh: Mesh) -> bool:
-    known = mesh.annotations
-    return known is not None and known.landmarks is not None and len(known.landmarks) == LANDMARKS
+    annotations = mesh.annotations
+    return annotations is not None and annotations.landmarks is not None and len(annotations.landmarks) == LANDMARKS
 
 
 def _own_colors(mesh: Mesh) -> Tensor | None:

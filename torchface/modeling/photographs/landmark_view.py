@@ -1,4 +1,4 @@
-"""What landmarks in photographs tell of a linear face: where its points are seen, and what moves them."""
+"""Landmarks in photographs of a linear face: where its points are seen, and their derivatives."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Views:
     translation: Tensor
 
     def moved(self, step: Tensor, focal_step: Tensor) -> Views:
-        """Turned and shifted by (I,6), with focal lengths longer by the factors exp of (I,)."""
+        """Rotated and translated by (I,6), with focal lengths longer by the factors exp of (I,)."""
         focal = torch.stack([focal_step.exp(), focal_step.exp(), torch.ones_like(focal_step)], dim=-1)
         scaled = self.intrinsics * torch.where(torch.eye(3, dtype=torch.bool), focal[:, :, None], 1.0)
         return Views(scaled, rotation_matrix(step[:, :3]) @ self.rotation, self.translation + step[:, 3:])
@@ -91,8 +91,8 @@ class Views:
 def chosen_points(points: LinearPoints, coefficients: Tensor, views: Views, slides: bool = True) -> Tensor:
     """Which point each landmark is in each view, rows (I,68) into the points.
 
-    A contour landmark is the point of its curve that the view shows furthest out, away from the face's own vertical;
-    on the near side of a turned face that is the landmark's own vertex.
+    A contour landmark is the point of its curve that the view shows furthest out from the face's own vertical;
+    on the near side of a rotated face that is the landmark's own vertex.
     """
     count = len(points.mean) - points.rows.numel()
     rows = torch.arange(count).expand(len(views.rotation), -1).clone()
@@ -130,14 +130,14 @@ def linearised(
     points: PickedPoints, coefficients: Tensor, views: Views, found: Tensor, whitening: Tensor
 ) -> Linearised:
     """At landmarks found (I,L,2) whose errors ``whitening`` (I,L,2,2) makes unit and independent."""
-    turned = points.at(coefficients) @ views.rotation.transpose(-1, -2)
-    pixels, by_place = pixel_jacobian(turned + views.translation[:, None], views.intrinsics)
-    by_place = whitening @ by_place
-    by_world = by_place @ views.rotation[:, None]
+    rotated = points.at(coefficients) @ views.rotation.transpose(-1, -2)
+    pixels, by_translation = pixel_jacobian(rotated + views.translation[:, None], views.intrinsics)
+    by_translation = whitening @ by_translation
+    by_world = by_translation @ views.rotation[:, None]
     return Linearised(
         (whitening @ (pixels - found)[..., None])[..., 0],
         by_world @ points.basis,
-        torch.cat([by_place @ -cross_matrix(turned), by_place], dim=-1),
+        torch.cat([by_translation @ -cross_matrix(rotated), by_translation], dim=-1),
         (whitening @ (pixels - views.intrinsics[:, None, :2, 2])[..., None])[..., 0],
     )
 

@@ -1,4 +1,4 @@
-"""Whether several photographs show one person: what each tells of the head alone, held against the others."""
+"""Whether several photographs show one person: the evidence of each alone, compared with the others'."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.modeling.photographs.image_fit import ImageFit
 
-_LEAST_VARIANCE = 1e-2  # of a coefficient that lies on its bound, about which the covariance is silent
+_MIN_VARIANCE = 1e-2  # of a coefficient that lies on its bound, about which the covariance is silent
 
 
 def same_person(fits: Sequence[ImageFit]) -> Tensor:
@@ -18,7 +18,7 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
     .. math:: \log \frac{p(q_i, q_{\ne i} \mid \text{one } a)}{p(q_i)\, p(q_{\ne i})}, \qquad a \sim N(0, I)
 
     with landmarks :math:`q` taken to be Gaussian about each fit's coefficients :math:`a`, expression and camera
-    unknown. It is 0 where a photograph tells nothing, positive where it fits to the others, negative where another
+    unknown. It is 0 where a photograph holds no evidence, positive where it fits to the others, negative where another
     head explains it better.
 
     Args:
@@ -34,20 +34,20 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
     precisions, pulls = [], []
     for fit in fits:  # photographs
         covariance = fit.covariance[:count, :count].double()
-        silent = torch.diag((covariance.diagonal() <= 0).double() * _LEAST_VARIANCE)
+        silent = torch.diag((covariance.diagonal() <= 0).double() * _MIN_VARIANCE)
         posterior = torch.linalg.inv(covariance + silent + 1e-9 * eye)
         values, vectors = torch.linalg.eigh(0.5 * (posterior + posterior.T) - eye)
         precisions.append((vectors * values.clamp(min=0)) @ vectors.T)
         pulls.append(posterior @ fit.coefficients.double())
-    told, pull = torch.stack(precisions), torch.stack(pulls)
-    together = _log_evidence(told.sum(0), pull.sum(0))
+    information, pull = torch.stack(precisions), torch.stack(pulls)
+    together = _log_evidence(information.sum(0), pull.sum(0))
     return torch.stack([
-        together - _log_evidence(told[i], pull[i]) - _log_evidence(told.sum(0) - told[i], pull.sum(0) - pull[i])
-        for i in range(len(fits))
+        together - _log_evidence(one, own) - _log_evidence(information.sum(0) - one, pull.sum(0) - own)
+        for one, own in zip(information, pull, strict=True)
     ])  # fmt: skip
 
 
 def _log_evidence(precision: Tensor, pull: Tensor) -> Tensor:
-    """Of what landmarks tell, beside that of landmarks that tell nothing."""
+    """Relative to landmarks that hold no evidence."""
     whole = precision + torch.eye(len(pull), dtype=torch.float64)
     return 0.5 * pull @ torch.linalg.solve(whole, pull) - 0.5 * torch.logdet(whole)

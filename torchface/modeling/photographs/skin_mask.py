@@ -1,4 +1,4 @@
-"""Which part of a photographed head is skin: neither hair nor clothes, nor what stands behind an ear that is off."""
+"""Which part of a photographed head is skin: neither hair nor clothes, nor what stands behind a misplaced ear."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from torchface.rendering.camera_visibility import Shown, shown_in
 from torchface.rendering.raycast import RayCaster
 
 _FEATURES = 0.10
-_SURE = 0.75
+_SURELY_SKIN = 0.75
 _NECK, _BEHIND = (0.05, 0.35), (0.05, 0.30)
 _FOREHEAD = 0.15
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 _ALIKE, _UNLIKE = 1.8, 2.8
-_LEAST, _MOST = (0.25, 0.06, 0.06), (0.45, 0.14, 0.14)  # deviations of skin: of brightness, of two ratios of channels
-_SQUARE, _FEWEST, _AROUND = 0.35, 30, 60
-_SETTLING = 4
+# Of skin: of brightness, of two ratios of channels.
+_MIN_DEVIATIONS, _MAX_DEVIATIONS = (0.25, 0.06, 0.06), (0.45, 0.14, 0.14)
+_SQUARE, _MIN_VERTICES, _AROUND = 0.35, 30, 60
+_ITERATIONS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +66,9 @@ class FacePlaces:
         brow[:, 1] += _FOREHEAD
         outline = torch.cat([at[:JAW], brow])[:, :2]
         middle = at[[27, 33, 36, 45, 48, 54], :2].mean(0)
-        away = place[:, :2] - middle
-        reach = _radius(outline - middle, torch.atan2(away[:, 1], away[:, 0]))
-        length = away.norm(dim=1)
+        offsets = place[:, :2] - middle
+        reach = _radius(outline - middle, torch.atan2(offsets[:, 1], offsets[:, 0]))
+        length = offsets.norm(dim=1)
         features = torch.cdist(place, torch.cat([at[JAW:27], at[31:LANDMARKS]])).amin(1) < _FEATURES
         ears = at[[0, 16], 2].mean()
         return FacePlaces(
@@ -78,7 +79,7 @@ class FacePlaces:
 def skin_shares(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
     """How far photographs show skin, or a feature of the face, at each vertex, (I,V) in [0,1].
 
-    Inside the face's outline everything is the person's. Around it counts what looks like the cheeks nearby, in
+    Inside the face's outline everything is the person's. Around it counts what resembles the cheeks nearby, in
     brightness and in the ratios of the channels; far below the chin and behind the ears nothing does.
 
     Args:
@@ -102,42 +103,44 @@ def skin_shares(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Camera])
 
 def _share(shown: Shown, places: FacePlaces, graph: VertexGraph) -> Tensor:
     light = shown.colors.double().clamp(min=0.02).log()
-    look = torch.stack([light.mean(1), light[:, 0] - light[:, 1], light[:, 2] - light[:, 1]], dim=1)
-    core = (places.out < _SURE) & ~places.features & (shown.cosine > _SQUARE) & (places.place[:, 1] < places.brows)
-    alike = torch.ones(len(look), dtype=torch.float64)
-    if int(core.sum()) >= _FEWEST:
-        alike = _alike(look, core, graph)
-    share = torch.where((places.out < _SURE) | (places.features & (places.out < 1)), 1.0, alike)
+    appearance = torch.stack([light.mean(1), light[:, 0] - light[:, 1], light[:, 2] - light[:, 1]], dim=1)
+    core = (
+        (places.out < _SURELY_SKIN) & ~places.features & (shown.cosine > _SQUARE) & (places.place[:, 1] < places.brows)
+    )
+    alike = torch.ones(len(appearance), dtype=torch.float64)
+    if int(core.sum()) >= _MIN_VERTICES:
+        alike = _alike(appearance, core, graph)
+    share = torch.where((places.out < _SURELY_SKIN) | (places.features & (places.out < 1)), 1.0, alike)
     below = places.beyond * (places.place[:, 1] < 0.5 * places.chin[1])
-    fade = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
-    return graph.smoothed((share * fade)[:, None], torch.ones_like(share), 2)[:, 0]
+    falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
+    return graph.smoothed((share * falloff)[:, None], torch.ones_like(share), 2)[:, 0]
 
 
-def _alike(look: Tensor, core: Tensor, graph: VertexGraph) -> Tensor:
-    """How much each vertex (V,) looks like the skin of the core nearest to it."""
-    least, most = (look.new_tensor(bound) for bound in (_LEAST, _MOST))
+def _alike(appearance: Tensor, core: Tensor, graph: VertexGraph) -> Tensor:
+    """How much each vertex (V,) resembles the skin of the core nearest to it."""
+    lower, upper = (appearance.new_tensor(bound) for bound in (_MIN_DEVIATIONS, _MAX_DEVIATIONS))
     weight = core.double()
-    middle = look[core].median(0).values
-    spread = (1.4826 * (look[core] - middle).abs().median(0).values).clamp(least, most)
-    for _ in range(_SETTLING):  # what is no skin loses its say, and the middle moves
-        far = ((look - middle) / spread).square().sum(1)
+    middle = appearance[core].median(0).values
+    deviations = (1.4826 * (appearance[core] - middle).abs().median(0).values).clamp(lower, upper)
+    for _ in range(_ITERATIONS):  # what is no skin loses its weight, and the median moves
+        far = ((appearance - middle) / deviations).square().sum(1)
         weight = core * torch.exp(-0.5 * far / 4)
-        middle = (weight[:, None] * look).sum(0) / weight.sum()
-    local = graph.smoothed(look, weight, _AROUND)
-    told = graph.smoothed(weight[:, None], torch.ones_like(weight), _AROUND)
-    expected = torch.lerp(middle.expand_as(look), local, (told / 0.02).clamp(max=1))
-    return 1 - _ramp(((look - expected) / spread).square().sum(1).sqrt(), _ALIKE, _UNLIKE)
+        middle = (weight[:, None] * appearance).sum(0) / weight.sum()
+    local = graph.smoothed(appearance, weight, _AROUND)
+    coverage = graph.smoothed(weight[:, None], torch.ones_like(weight), _AROUND)
+    expected = torch.lerp(middle.expand_as(appearance), local, (coverage / 0.02).clamp(max=1))
+    return 1 - _ramp(((appearance - expected) / deviations).square().sum(1).sqrt(), _ALIKE, _UNLIKE)
 
 
 def _radius(outline: Tensor, angle: Tensor) -> Tensor:
     """How far a star-shaped outline (P,2) about the origin reaches in directions (V,)."""
-    turns = torch.atan2(outline[:, 1], outline[:, 0])
-    order = turns.argsort()
-    turns, reach = turns[order], outline.norm(dim=1)[order]
-    turns = torch.cat([turns[-1:] - 2 * torch.pi, turns, turns[:1] + 2 * torch.pi])
+    angles = torch.atan2(outline[:, 1], outline[:, 0])
+    order = angles.argsort()
+    angles, reach = angles[order], outline.norm(dim=1)[order]
+    angles = torch.cat([angles[-1:] - 2 * torch.pi, angles, angles[:1] + 2 * torch.pi])
     reach = torch.cat([reach[-1:], reach, reach[:1]])
-    after = torch.searchsorted(turns, angle).clamp(1, len(turns) - 1)
-    share = (angle - turns[after - 1]) / (turns[after] - turns[after - 1]).clamp(min=1e-9)
+    after = torch.searchsorted(angles, angle).clamp(1, len(angles) - 1)
+    share = (angle - angles[after - 1]) / (angles[after] - angles[after - 1]).clamp(min=1e-9)
     return torch.lerp(reach[after - 1], reach[after], share.clamp(0, 1)).clamp(min=1e-6)
 
 

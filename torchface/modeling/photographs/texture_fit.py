@@ -18,15 +18,15 @@ from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.raycast import RayCaster
 
 _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with what stands behind
-_LEAST_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
-_FEWEST = 50
+_MIN_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
+_MIN_VERTICES = 50
 _LIGHT_PRIOR = 1.0
-_ROUNDS, _DONE = 30, 1e-5
+_MAX_ITERATIONS, _DONE = 30, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class ColorFit:
-    """What a colour model tells of I photographs.
+    """A colour model fitted to I photographs.
 
     Args:
         coefficients: (L,), standard deviations.
@@ -51,7 +51,7 @@ def fit_colors(
     bound: float = 3.0,
     prior: float = 0.1,
 ) -> ColorFit:
-    r"""The coefficients of a colour model under which a head looks as its photographs do.
+    r"""The coefficients of a colour model under which a head resembles its photographs.
 
     .. math:: E_T = \frac1n \sum_v \lVert L_i(n_v)\, C_v(b) - c_{iv} \rVert, \quad |b| \le 3
 
@@ -70,7 +70,7 @@ def fit_colors(
         prior: weight of the model's own distribution beside one vertex at a colour error of 0.05.
 
     Raises:
-        ShapeError: not one camera an image, or a picture of another size than its camera's.
+        ShapeError: not one camera an image, or an image of another size than its camera's.
         TopologyError: the model has other vertices than the mesh.
         AlignmentError: a photograph shows next to nothing of the head.
 
@@ -91,12 +91,12 @@ def fit_colors(
     light[..., 0] = 1.0
     strength = prior / 0.05
     before = torch.inf
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         H, f, total = strength * torch.eye(len(modes), dtype=torch.float64), torch.zeros_like(coefficients), 0.0
         for i, view in enumerate(views):  # photographs: each shows other vertices
             albedo = mean[view.ids] + torch.einsum("l,lvc->vc", coefficients, modes[:, view.ids])
             shade = view.basis @ light[i].T
-            weight = view.share / (albedo * shade - view.colors).norm(dim=-1).clamp(min=_LEAST_ERROR)
+            weight = view.share / (albedo * shade - view.colors).norm(dim=-1).clamp(min=_MIN_ERROR)
             if lighting:
                 light[i] = _light(albedo, view, weight)
                 shade = view.basis @ light[i].T
@@ -136,9 +136,9 @@ def _shown_vertices(mesh: Mesh, images: Sequence[Tensor], cameras: Sequence[Came
     for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         shown = shown_in(image.cpu(), camera, caster, vertices, normals)
         ids = (shown.cosine > _SQUARELY).nonzero()[:, 0]
-        if len(ids) < _FEWEST:
+        if len(ids) < _MIN_VERTICES:
             raise AlignmentError(
-                f"images: found {len(ids)} of {len(vertices)} vertices in view {i}, expected at least {_FEWEST}; "
+                f"images: found {len(ids)} of {len(vertices)} vertices in view {i}, expected at least {_MIN_VERTICES}; "
                 "does the camera see the head?"
             )
         basis = torch.cat([torch.ones(len(ids), 1, dtype=torch.float64), normals[ids]], dim=1)

@@ -19,13 +19,13 @@ from torchface.rendering.camera_visibility import Shown, shown_in
 from torchface.rendering.raycast import RayCaster
 
 _SQUARELY = 0.2
-_TRUSTED = 0.5
+_MIN_CONFIDENCE = 0.5
 _SHARP = 3.0
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _TYPICAL, _SPARSE = 0.15, 0.05
-_LOST, _LOST_AT_MASK = 0.004, 0.01  # a ring of vertices, of what the edge knows
-_MOST_GAIN = 4.0
-_DARK, _MOST_TONE = 0.05, 0.5
+_HEAT_LOSS, _HEAT_LOSS_AT_MASK = 0.004, 0.01  # a ring of vertices, relative
+_MAX_GAIN = 4.0
+_DARK, _MAX_TONE = 0.05, 0.5
 _NEVER_SEEN = (0.72, 0.68, 0.66)  # parts that no photograph shows, such as teeth behind lips
 
 
@@ -50,11 +50,11 @@ def photo_texture(
     cameras: Sequence[Camera],
     size: int = 1024,
     base: Tensor | None = None,
-    trust: Tensor | None = None,
+    confidence: Tensor | None = None,
 ) -> PhotoTexture:
     """Lays photographs on a head.
 
-    Each texel takes the photographs that see it, the squarest most. Weights are made on the vertices and fade out over
+    Each texel takes the photographs that see it, the squarest most. Weights, made on the vertices, go to zero over
     the mesh before a photograph ends, so that no edge of one shows, also not where the layout is cut. What photographs
     differ in broadly (exposure, white balance, shading) is brought to their mean, detail is kept from the squarest.
     Where none shows the skin, the mirror image of the other side is taken, then the base; both are toned to what is
@@ -66,11 +66,11 @@ def photo_texture(
         cameras: one each.
         size: texels a side.
         base: colours for what no photograph shows, (V,3), such as ``fit_colors`` gives; those nearby if absent.
-        trust: how far each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
+        confidence: that each photograph shows the head at each vertex, (I,V) in [0,1], such as ``skin_shares`` gives;
             everywhere if absent.
 
     Raises:
-        ShapeError: not one camera an image, a picture of another size than its camera's, or a base of another shape.
+        ShapeError: not one camera an image, an image of another size than its camera's, or a base of another shape.
         TopologyError: the mesh has no texture coordinates.
         AlignmentError: no photograph shows the head.
 
@@ -92,12 +92,14 @@ def photo_texture(
         shown_in(image.cpu(), camera, caster, vertices, normals) for image, camera in zip(images, cameras, strict=True)
     ]
     outside = _outer_border(vertices, faces)
-    trusted = torch.ones(len(images), len(vertices), dtype=torch.float64) if trust is None else trust.cpu().double()
+    confidences = (
+        torch.ones(len(images), len(vertices), dtype=torch.float64) if confidence is None else confidence.cpu().double()
+    )
     weights = torch.stack([
-        _squareness(shown) * _inside((shown.cosine > _SQUARELY) & (one >= _TRUSTED) & ~outside, graph)
-        for shown, one in zip(at_vertices, trusted, strict=True)
+        _squareness(shown) * _inside((shown.cosine > _SQUARELY) & (one >= _MIN_CONFIDENCE) & ~outside, graph)
+        for shown, one in zip(at_vertices, confidences, strict=True)
     ])  # fmt: skip
-    soft = torch.stack([_feathered((one >= _TRUSTED).double(), graph) for one in trusted]).amax(0)
+    soft = torch.stack([_feathered((one >= _MIN_CONFIDENCE).double(), graph) for one in confidences]).amax(0)
     seen = weights.sum(0)
     if float(seen.max()) <= 0:
         raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
@@ -105,7 +107,7 @@ def photo_texture(
     toned = [shown.colors.double() * gain for shown, gain in zip(at_vertices, gains, strict=True)]
     blended, offsets = _blended(toned, weights, graph)
     alpha = (seen / 0.05).clamp(max=1) * soft
-    filled = _filled(mesh, blended, alpha, base, graph, trust is not None)
+    filled = _filled(mesh, blended, alpha, base, graph, confidence is not None)
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
     points = texels.interpolate(vertices, faces)
@@ -145,7 +147,7 @@ def _squareness(shown: Shown) -> Tensor:
 def _inside(shown: Tensor, graph: VertexGraph) -> Tensor:
     """1 well inside what a photograph shows of the head (V,) bool, falling to 0 before it ends."""
     inner = shown.double()
-    for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is off
+    for _ in range(2):  # rings of vertices: those at an edge show what lies behind it as soon as the fit is inexact
         inner = graph.least(inner)
     return _feathered(inner, graph)
 
@@ -171,16 +173,16 @@ def _gains(shown: Sequence[Shown], weights: Tensor) -> Tensor:
                 continue
             ratio = logs[i] - logs[j]
             middle = ratio[both > 0].median(0).values
-            trust = both * (1 / (1 + ((ratio - middle) / 0.2).square().sum(-1)))
-            step = (trust[:, None] * ratio).sum(0) / trust.sum()
-            strength = trust.sum()
+            confidence = both * (1 / (1 + ((ratio - middle) / 0.2).square().sum(-1)))
+            step = (confidence[:, None] * ratio).sum(0) / confidence.sum()
+            strength = confidence.sum()
             H[i, i] += strength
             H[j, j] += strength
             H[i, j] -= strength
             H[j, i] -= strength
             g[i] -= strength * step
             g[j] += strength * step
-    return torch.linalg.solve(H, g).exp().clamp(1 / _MOST_GAIN, _MOST_GAIN)
+    return torch.linalg.solve(H, g).exp().clamp(1 / _MAX_GAIN, _MAX_GAIN)
 
 
 def _blended(toned: Sequence[Tensor], weights: Tensor, graph: VertexGraph) -> tuple[Tensor, Tensor]:
@@ -199,7 +201,7 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
 
     What is nearest is the pixel at the edge where the photograph ends, and a broad mean where a mask ends it.
     """
-    known, guess = alpha.clone(), colors * alpha[:, None]
+    covered, guess = alpha.clone(), colors * alpha[:, None]
     mirror = None if mesh.annotations is None else mesh.annotations.mirror
     if mirror is not None:
         there = alpha[mirror.cpu()]
@@ -207,38 +209,38 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         # The other side stands in other light, in one factor: channels apart would tint what is dark.
         other = _toned(other, colors, alpha * there, graph, _BROAD, apart=False)
         guess = guess + ((1 - alpha) * there)[:, None] * other
-        known = known + (1 - alpha) * there
+        covered = covered + (1 - alpha) * there
     if base is not None:
         under = base.detach().cpu().double()
-        # The tone at the edge of what is known counts, not that of the face as a whole.
-        edge = graph.smoothed(1 - known[:, None], torch.ones_like(known), _FEATHER)[:, 0]
-        told = guess / known.clamp(min=1e-9)[:, None]
-        return guess + (1 - known)[:, None] * _toned(under, told, known * (edge + 1e-3), graph, _FILL)
+        # The tone at the edge of what is covered counts, not that of the face as a whole.
+        edge = graph.smoothed(1 - covered[:, None], torch.ones_like(covered), _FEATHER)[:, 0]
+        seen_color = guess / covered.clamp(min=1e-9)[:, None]
+        return guess + (1 - covered)[:, None] * _toned(under, seen_color, covered * (edge + 1e-3), graph, _FILL)
     mean = (
         colors[alpha > 0.5].median(0).values
         if bool((alpha > 0.5).any())
         else (guess * alpha[:, None]).sum(0) / alpha.sum()
     )
     label = components(mesh.faces.cpu(), len(alpha))
-    shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, known)
+    shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, covered)
     mean = torch.where((shown > 0)[label][:, None], mean, torch.tensor(_NEVER_SEEN, dtype=torch.float64))
-    fixed = (known > 0.5)[:, None]
-    told = guess / known.clamp(min=0.5)[:, None]
-    if masked:  # lips, brows and what the edge still shows of hair do not spread
-        typical = known * torch.exp(-0.5 * ((told - mean) / _TYPICAL).square().sum(-1))
-        weight = graph.smoothed(typical[:, None], torch.ones_like(known), _BROAD)
-        told = torch.lerp(mean, graph.smoothed(told, typical, _BROAD), weight / (weight + _SPARSE))
-    under = torch.where(fixed, told, mean)
-    lost = _LOST_AT_MASK if masked else _LOST
-    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is known; behind a mask it is lost
+    fixed = (covered > 0.5)[:, None]
+    seen_color = guess / covered.clamp(min=0.5)[:, None]
+    if masked:  # lips, brows and what the edge still shows of hair are not spread
+        typical = covered * torch.exp(-0.5 * ((seen_color - mean) / _TYPICAL).square().sum(-1))
+        weight = graph.smoothed(typical[:, None], torch.ones_like(covered), _BROAD)
+        seen_color = torch.lerp(mean, graph.smoothed(seen_color, typical, _BROAD), weight / (weight + _SPARSE))
+    under = torch.where(fixed, seen_color, mean)
+    lost = _HEAT_LOSS_AT_MASK if masked else _HEAT_LOSS
+    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is covered; behind a mask it is lost
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
-    return guess + (1 - known)[:, None] * under
+    return guess + (1 - covered)[:, None] * under
 
 
 def _toned(
-    colors: Tensor, goal: Tensor, weights: Tensor, graph: VertexGraph, rounds: int, apart: bool = True
+    colors: Tensor, goal: Tensor, weights: Tensor, graph: VertexGraph, iterations: int, apart: bool = True
 ) -> Tensor:
     """Colours (V,3) times what makes them as bright as a goal where weights (V,) compare them, carried on beyond."""
     ratio = goal.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()
     ratio = ratio if apart else ratio.mean(-1, keepdim=True)
-    return colors * graph.smoothed(ratio, weights, rounds).clamp(-_MOST_TONE, _MOST_TONE).exp()
+    return colors * graph.smoothed(ratio, weights, iterations).clamp(-_MAX_TONE, _MAX_TONE).exp()

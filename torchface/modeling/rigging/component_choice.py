@@ -53,7 +53,7 @@ def choose_components(
             as all of them.
 
     Raises:
-        ShapeError: fewer than three samples: with one left out, nothing tells how the others differ.
+        ShapeError: fewer than three samples: with one left out, the others do not show how they differ.
     """
     if len(inputs) < 3 or len(inputs) != len(outputs):
         raise ShapeError(f"found {len(inputs)} inputs and {len(outputs)} outputs, expected as many, three at least")
@@ -74,7 +74,7 @@ def choose_components(
         allowed[:, min(input_components, most) :] = False
     if output_components is not None:
         allowed[:, :, min(output_components, most) + 1 :] = False
-    # Of equal errors the first: the smallest ridge and the fewest components.
+    # Of equal errors the first: the smallest ridge and the smallest number of components.
     best = int(torch.where(allowed, errors, torch.inf).argmin())
     r, k, j = (int(index) for index in torch.unravel_index(torch.tensor(best), errors.shape))
     return Choice(k + 1, j, ridges[r], float(errors[r, k, j]), of_mean)
@@ -95,14 +95,14 @@ def _fold_errors(gram_in: Tensor, gram_out: Tensor, left_out: int, ridges: tuple
     _, directions = _spectrum(centre @ gram_out[kept][:, kept] @ centre, most)
     across = centre @ (gram_in[kept, left_out] - gram_in[kept][:, kept].mean(1))
     # Of sample i: scores sqrt(λ_k) v_ik; of the one left out: v_kᵀ g / sqrt(λ_k).
-    told = vectors.T @ across
+    projected = vectors.T @ across
     average = values.cumsum(0) / torch.arange(1, len(values) + 1)
     errors = torch.zeros(len(ridges), most, most + 1, dtype=torch.float64)
     inner = gram_out[kept][:, kept]
     aside = gram_out[kept, left_out]
     for r, ridge in enumerate(ridges):
         # Weight of input component k where k+1 of them are kept: (K,K), lower triangular.
-        weight = (told / (values + ridge * average[:, None])).tril()
+        weight = (projected / (values + ridge * average[:, None])).tril()
         combined = weight @ vectors.T @ directions  # along each output direction, (K,J)
         steps = combined[:, :, None] * directions.T[None]
         combination = torch.cat([torch.zeros(len(steps), 1, count), steps.cumsum(1)], 1) + 1 / count

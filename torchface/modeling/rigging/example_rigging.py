@@ -19,33 +19,33 @@ from torchface.optim import box_qp
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 
-_EXACT = 0.01  # millimetres a vertex; a rig that misses examples by less has nothing to tell of how good weights are
+_EXACT = 0.01  # millimetres a vertex; a rig that misses examples by less does not show how good weights are
 
 
 @dataclass(frozen=True)
 class RiggingSchedule:
-    r"""How the examples' say grows from round to round.
+    r"""How the examples' influence grows from iteration to iteration.
 
     Args:
-        rounds: how often shapes and weights are solved in turn.
-        beta: weight of the prior beside the fit, first and last round; in between it goes evenly. What is left at the
+        iterations: how often shapes and weights are solved alternately.
+        beta: weight of the prior beside the fit, first and last iteration; linear in between. What is left at the
             end is for examples as good as the person's own shapes; scans are noisier.
-        gamma: how firmly weights are held to the given ones, first and last round; in between evenly. Its unit is what
+        gamma: weight of the pull to the given weights, first and last iteration; linear in between. Its unit is what
             the transferred shapes leave of an example at the weights that suit them best (squared distances summed
             over the vertices, the mean of the examples): with 100, a weight that leaves the given one by 0.1 costs as
             much as all of that. Much lower, and the weights take in what is the person's own; weights that are mere
             guesses want 10 to 25.
         unnamed: how many times more firmly a weight is held that was given as 0: what was not asked for.
-        kappa: where the prior's stiffness levels off, in gradients without unit.
+        kappa: where the prior's stiffness saturates, in gradients without unit.
         theta: how steeply the stiffness falls where the template deforms.
 
     Raises:
-        ValueRangeError: no round, or a number that is not positive.
+        ValueRangeError: no iteration, or a number that is not positive.
 
     Source: Li, Weise and Pauly 2010.
     """
 
-    rounds: int = 10
+    iterations: int = 10
     beta: tuple[float, float] = (0.5, 0.03)
     gamma: tuple[float, float] = (100.0, 100.0)
     unnamed: float = 20.0
@@ -53,11 +53,11 @@ class RiggingSchedule:
     theta: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueRangeError(f"rounds: found {self.rounds}, expected at least 1")
+        if self.iterations < 1:
+            raise ValueRangeError(f"iterations: found {self.iterations}, expected at least 1")
         for name in ("beta", "gamma"):
             if len(getattr(self, name)) != 2:
-                raise ShapeError(f"{name}: found {getattr(self, name)}, expected two numbers, first and last round")
+                raise ShapeError(f"{name}: found {getattr(self, name)}, expected two numbers, first and last iteration")
         for name, numbers in (
             ("beta", self.beta),
             ("gamma", self.gamma),
@@ -68,8 +68,8 @@ class RiggingSchedule:
                 raise ValueRangeError(f"{name}: found {numbers}, expected finite numbers above 0")
 
     def at(self, number: int) -> tuple[float, float]:
-        """Beta and gamma of a round, counted from 0."""
-        share = number / max(self.rounds - 1, 1)
+        """Beta and gamma of an iteration, counted from 0."""
+        share = number / max(self.iterations - 1, 1)
         return tuple(first + share * (last - first) for first, last in (self.beta, self.gamma))  # type: ignore[return-value]
 
 
@@ -80,8 +80,8 @@ class ExampleRig:
     Args:
         rig: the person's neutral and shapes, with the template's names.
         weights: what each example is in the rig, (M,N).
-        transferred: where the shapes started: the template's by deformation transfer.
-        errors: root mean square distance of every example's vertices from the rig's, millimetres, (rounds+1,M); the
+        transferred: the initial shapes: the template's by deformation transfer.
+        errors: root mean square distance of every example's vertices from the rig's, millimetres, (iterations+1,M); the
             first row is the transferred rig at the given weights.
         angles: how far each shape's direction went from the transferred one's, degrees, (N,).
         report: what the transfer found on its way.
@@ -125,9 +125,9 @@ def rig_from_examples(
         examples: the person's expressions, (M,V,3), in the template's topology and the neutral's place: the head's
             own motion taken out.
         weights: roughly what each example is in the template's shapes, (M,N), in [0,1].
-        schedule: rounds, stiffness and pull; those of the paper if absent.
+        schedule: iterations, stiffness and pull; those of the paper if absent.
         contact_weight: as in ``transfer_deformation``.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         The rig, in the neutral's dtype; solved in float64 on the CPU. The same input gives the same result.
@@ -142,12 +142,12 @@ def rig_from_examples(
     progress = progress or silent
     _check(template, neutral, examples, weights, contact_weight)
     job = _Rigging(template, neutral, examples, weights, schedule or RiggingSchedule(), contact_weight)
-    for number in range(job.schedule.rounds):
+    for number in range(job.schedule.iterations):
         beta, gamma = job.schedule.at(number)
         job.solve_shapes(beta)
         job.solve_weights(gamma)
         job.errors.append(job.example_errors())
-        progress("learning from examples", number + 1, job.schedule.rounds)
+        progress("learning from examples", number + 1, job.schedule.iterations)
     transfer = job.transfer
     return ExampleRig(
         rig=transfer.rig(template, neutral, job.prior + job.personal),
@@ -168,7 +168,7 @@ def angles_between(first: Tensor, second: Tensor) -> Tensor:
 
 
 class _Rigging:
-    """The state that shapes and weights improve in turn, in the template's place and size, float64."""
+    """The state that shapes and weights improve alternately, in the template's place and size, float64."""
 
     def __init__(
         self,
@@ -189,7 +189,7 @@ class _Rigging:
         placed = self.transfer.similarity.inverse().apply(examples.detach().double().cpu())
         self.offsets = placed - self.transfer.goal
         self.given = self.weights = weights.detach().double().cpu()
-        # What only the normals' columns of the gradients say is not asked of vertices; what is left is linear in them.
+        # What only the normals' columns of the gradients hold is not demanded of vertices; the rest is linear in them.
         self.operator = gradient_operator(self.transfer.goal, faces)
         self.prior_gradients = self._gradients(self.prior)
         self.example_gradients = self._gradients(self.offsets)
@@ -202,7 +202,7 @@ class _Rigging:
         """The squared distance between an example and the transferred rig's nearest pose, square millimetres.
 
         A person's own shapes are mostly stronger or weaker ones, which other weights of the transferred shapes fit
-        as well. How far weights may leave the given ones is therefore told by what no weights can fit.
+        as well. How far weights may leave the given ones is therefore measured by what no weights can fit.
         """
         least = _EXACT**2 * len(self.transfer.goal)
         shapes, offsets = self.prior.flatten(1), self.offsets.flatten(1)
@@ -231,14 +231,14 @@ class _Rigging:
         return torch.stack(rows) * transfer.moving[:, transfer.faces].any(-1)
 
     def _vertex_means(self, values: Tensor) -> Tensor:
-        """The mean over the triangles round each vertex: (N,F) to (N,V)."""
+        """The mean over the triangles around each vertex: (N,F) to (N,V)."""
         faces = self.transfer.faces
         sums = torch.zeros(len(values), len(self.transfer.goal), dtype=torch.float64)
         sums.index_add_(1, faces.T.flatten(), values.repeat(1, 3))
         return sums / torch.bincount(faces.flatten(), minlength=sums.shape[1]).clamp(min=1)
 
     def solve_shapes(self, beta: float) -> None:
-        """Shapes at fixed weights: triangle by triangle what the examples say, then vertices that agree with it."""
+        """Shapes at fixed weights: triangle by triangle what the examples show, then vertices that agree with it."""
         residuals = self.example_gradients - _combined(self.weights, self.prior_gradients)
         missing = (self.offsets - _combined(self.weights, self.prior)).transpose(0, 1).flatten(1).numpy()
         shares = example_shares(residuals, self.weights, self.compliance / beta)

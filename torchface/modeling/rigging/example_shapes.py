@@ -1,4 +1,4 @@
-"""The shapes' half of example-based rigging: what examples say beyond a prior, triangle by triangle."""
+"""The shapes' half of example-based rigging: what examples add to a prior, triangle by triangle."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def shape_stiffness(changes: Tensor, kappa: float, theta: float) -> Tensor:
 
 
 def example_shares(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
-    r"""What each example has to say, element by element, once what shapes share among them is taken out.
+    r"""What each example adds, element by element, once what shapes share among them is taken out.
 
     .. math:: \min_D \sum_j \lVert R_j - \sum_i \alpha_{ji} D_i \rVert^2 + \sum_i c_i^{-1} \lVert D_i \rVert^2
 

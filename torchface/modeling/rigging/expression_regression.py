@@ -21,7 +21,7 @@ NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 Form = Literal["offsets", "expressions"]
 
 _STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
-# Of the vertex that moves most. The form of ears and neck tells little of a smile, and would fill the components.
+# Of the vertex that moves most. The form of ears and neck predicts little of a smile, and would fill the components.
 _MOVES = 0.05
 
 
@@ -35,16 +35,16 @@ class ExpressionRegression(nn.Module):
     away, and it is here for comparison.
 
     A neutral face may have any pose: it is laid onto the mean neutral first, rotation and translation only, and
-    what is predicted is turned back. N is the part of the neutral that moves in some expression. Vertices that no
+    what is predicted is rotated back. N is the part of the neutral that moves in some expression. Vertices that no
     example moves are not stored and stay exactly where they are.
 
     Args:
         vertices: V.
         names: of the N expressions.
-        region: how many of the vertices the prediction looks at.
+        region: how many of the vertices the prediction depends on.
         moving: how many of the N·V places are predicted.
         neutral_components, offset_components: of the two bases.
-        topology: ``Mesh.fingerprint()`` of the faces learned from, checked where known.
+        topology: ``Mesh.fingerprint()`` of the faces learned from, checked where given.
         form: "offsets" or "expressions".
 
     Source: thesis 3.3.4, equations 30 to 32.
@@ -128,7 +128,7 @@ class ExpressionRegression(nn.Module):
             names: of the expressions; ``expression0``, ... if absent.
             topology: ``Mesh.fingerprint()`` of the faces.
             form: "offsets" (equation 32) or "expressions" (equation 31).
-            region: mask (V,) of the vertices to look at; those that move by a twentieth as far as the one that moves
+            region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
                 most in some expression, if absent; all of them for the form "expressions", as in the thesis.
 
         Raises:
@@ -196,9 +196,9 @@ class ExpressionRegression(nn.Module):
             laid
         )
         Y = X @ self.coefficients.to(X)
-        told = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
-        whole = told.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
-        whole = whole.index_copy(1, self.places, told).unflatten(1, (len(self.names), -1))
+        moving = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
+        whole = moving.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
+        whole = whole.index_copy(1, self.places, moving).unflatten(1, (len(self.names), -1))
         if self.form == "expressions":
             whole = whole - laid[:, None]
         return whole @ pose.rotation.to(whole)[:, None]
@@ -220,7 +220,7 @@ class ExpressionRegression(nn.Module):
 def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, neutral: Mesh) -> BlendshapeRig:
     """A whole personal rig from one neutral face.
 
-    Shapes of the template that the regression knows, in any spelling that ``shape_names`` reads, are predicted; the
+    Shapes of the template that the regression has, in any spelling that ``shape_names`` reads, are predicted; the
     others come by deformation transfer. A predicted whole is divided between a template's halves as transfer does.
 
     Args:
@@ -233,7 +233,7 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
 
     Raises:
         TopologyError: regression, template and neutral have not the same topology.
-        NameMismatchError: the regression knows none of the template's shapes.
+        NameMismatchError: the regression has none of the template's shapes.
 
     Source: thesis 3.3.4 for predicted shapes, 3.3.1 for the others.
     """
@@ -250,8 +250,8 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
             f"neutral's {len(neutral.vertices)}"
         )
     translation = mapping(regression.names, template.names)
-    known = translation.any(1)
-    if not known.any():
+    predictable = translation.any(1)
+    if not predictable.any():
         raise NameMismatchError(
             f"rig_from_neutral: found a regression of {', '.join(regression.names[:5])}, expected some of the "
             f"template's shapes, {', '.join(template.names[:5])}, ..."
@@ -260,12 +260,12 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
         predicted = regression.offsets(neutral.vertices[None].float())[0]
     split = (translation > 0) & ((translation > 0).sum(0) > 1)
     # All of them: a shape that undoes another is transferred on top of it.
-    needless = bool(known.all()) and not bool(split.any())
+    needless = bool(predictable.all()) and not bool(split.any())
     transferred = torch.zeros_like(template.deltas) if needless else transfer_deformation(template, neutral).deltas
     # Deltas of halves add up to those of their whole.
     named = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
     named = (named * _shares_of_the_whole(transferred, split)).to(transferred)
-    return BlendshapeRig(neutral, torch.where(known[:, None, None], named, transferred), template.names)
+    return BlendshapeRig(neutral, torch.where(predictable[:, None, None], named, transferred), template.names)
 
 
 def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torchface.shape_names import mapping
 
 _BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 # After the second the lids still move, no longer toward the true ones.
-_ROUNDS = 2
+_ITERATIONS = 2
 
 
 def open_eyes(
@@ -57,7 +57,7 @@ def open_eyes(
     reference = template.neutral.with_vertices(template.vertices + closing)
     opening = BlendshapeRig(reference, -closing[None], ["eyesOpen"])
     opened = closed.vertices + transfer_with_report(opening, closed, contact_weight).rig.deltas[0].to(closed.vertices)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         own = transfer_with_report(blinks, closed.with_vertices(opened), contact_weight).rig
         opened = closed.vertices - own.deltas.sum(0).to(closed.vertices)
     return closed.with_vertices(opened)

@@ -12,12 +12,12 @@ from torchface.rig import BlendshapeRig
 
 _BONE_MARGIN, _SHELL_MARGIN = 0.15, 0.5
 _ALLOWED = 0.1
-_ROUNDS = 6
-_LONGEST_STEP = 2.0
+_MAX_ITERATIONS = 6
+_MAX_STEP = 2.0
 _SHELL_REACH, _SKIN_REACH = 2.0, 4.0
 _STILL = 0.01
-_LIFTED, _DEEPEST = 0.3, 3.0
-_MIXED_POSES, _MIXED, _WEAKEST, _STRONGEST = 32, 3, 0.3, 0.9
+_LIFTED, _MAX_DEPTH = 0.3, 3.0
+_MIXED_POSES, _MIXED, _MIN_WEIGHT, _MAX_WEIGHT = 32, 3, 0.3, 0.9
 _MOVES, _BESIDE = 1.5, 3.0
 
 
@@ -32,7 +32,7 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     Args:
         rig: N shapes, V vertices.
         parts: of a head in the rig's topology; see ``inner_parts``.
-        poses: weights to look at, (K,N), in this order; every shape by itself and mixtures of the shapes that move the
+        poses: weights to test, (K,N), in this order; every shape by itself and mixtures of the shapes that move the
             skin before the eyes if absent.
     """
     poses = clearance_poses(rig, parts) if poses is None else poses
@@ -51,7 +51,7 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
 def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance) -> Tensor:
     """Changes deltas (N,V,3) in place until each pose (K,N) in turn is clear; which shapes were changed, (N,) bool."""
     changed = torch.zeros(len(deltas), dtype=torch.bool)
-    for weights in poses:  # what one pose changes, the next one starts from
+    for weights in poses:  # each pose builds on the changes of the one before
         active = weights.nonzero()[:, 0]
         pose = clearance.rest + torch.tensordot(weights[active], deltas[active], dims=1)
         step = clearance.step(pose, closing=len(active) == 1)
@@ -68,7 +68,7 @@ def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance
 def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
     """Every shape at weight 1, then random mixtures of three of those that move the skin before each small group.
 
-    Groups do not know each other: one pose mixes shapes for all of them. The largest group, the mouth, is left out:
+    Groups are independent: one pose mixes shapes for all of them. The largest group, the mouth, is left out:
     lips part where they are mixed, and so many of them do that no few mixtures stand for all.
 
     Returns:
@@ -92,7 +92,7 @@ def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
             others = 1 + torch.randperm(len(movers) - 1, generator=generator)
             drawn = movers[torch.cat([torch.zeros(1 - number % 2, dtype=torch.int64), others])[:_MIXED]]
             strength = torch.rand(len(drawn), generator=generator, dtype=torch.float64)
-            row[drawn] = _WEAKEST + (_STRONGEST - _WEAKEST) * strength
+            row[drawn] = _MIN_WEIGHT + (_MAX_WEIGHT - _MIN_WEIGHT) * strength
     return torch.cat([torch.eye(count, dtype=torch.float64), mixed[mixed.any(1)]])
 
 
@@ -110,7 +110,7 @@ class Clearance:
         parts, start = self.parts, pose
         if closing and len(self.shells):
             pose = self._shells_on_bone(pose)
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ITERATIONS):
             standing = parts.standing(pose)
             through = standing.depth > _ALLOWED
             if not through.any():
@@ -118,7 +118,7 @@ class Clearance:
             pose = pose.clone()
             normals = triangle_normals(pose, parts.skin)[standing.triangle]
             margin = torch.where(self.hard, _BONE_MARGIN, _SHELL_MARGIN)
-            back = normals * (standing.depth + margin).clamp(max=_LONGEST_STEP)[:, None]
+            back = normals * (standing.depth + margin).clamp(max=_MAX_STEP)[:, None]
             shells, bones = through & ~self.hard, through & self.hard
             if bones.any():
                 met = pose[parts.vertices[bones]] - standing.way[bones, None] * standing.outward[bones]
@@ -135,7 +135,7 @@ class Clearance:
         closing = torch.zeros(len(group), dtype=torch.bool)
         for one in group.unique().tolist():  # two eyes
             closing |= (group == one) & (lifted[group == one].median() > _LIFTED)
-        sink = torch.where(closing, 2 * lifted, 0.0).clamp(0, _DEEPEST)
+        sink = torch.where(closing, 2 * lifted, 0.0).clamp(0, _MAX_DEPTH)
         pose = pose.clone()
         pose[self.shells] -= sink[:, None] * self._outward(pose)
         return pose
@@ -145,8 +145,8 @@ class Clearance:
         return (pose[self.shells] - self.parts.middles(pose)[self.parts.group[~self.hard]]).norm(dim=-1)
 
     def _outward(self, pose: Tensor) -> Tensor:
-        away = pose[self.shells] - self.parts.middles(pose)[self.parts.group[~self.hard]]
-        return torch.nn.functional.normalize(away, dim=-1)
+        offsets = pose[self.shells] - self.parts.middles(pose)[self.parts.group[~self.hard]]
+        return torch.nn.functional.normalize(offsets, dim=-1)
 
 
 def _spread(points: Tensor, at: Tensor, steps: Tensor, reach: float) -> Tensor:

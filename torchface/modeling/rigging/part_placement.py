@@ -16,14 +16,14 @@ from torchface.modeling.rigging.penetration import InnerParts
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
-_THIN, _THICKER, _FEWEST = 0.05, 4.0, 20
-_ROUNDS = 8
-_SAYS = 60.0
-_FAR, _LARGER = 2.0, 0.03
+_THIN, _THICKER, _MIN_VERTICES = 0.05, 4.0, 20
+_MAX_ITERATIONS = 8
+_MAX_TOTAL_WEIGHT = 60.0
+_TRANSLATION_DEVIATION, _SCALE_DEVIATION = 2.0, 0.03
 _FACING = 0.6
-_OUTLIER, _LARGEST_CHANGE = 2.0, 0.1
+_OUTLIER, _MAX_SCALE_CHANGE = 2.0, 0.1
 _HOSTS = 8
-_HIGHEST, _LOWEST = 1.0, 0.2
+_MAX_RISE, _MAX_DROP = 1.0, 0.2
 _NOTHING = 1e-3
 
 
@@ -31,7 +31,7 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     r"""A head at rest with the template's parts fitted into it, whatever places they had.
 
     Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: that of
-    the skin around them, then the shift :math:`\tau` and the growth :math:`\sigma` that give the skin before each
+    the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that give the skin before each
     vertex p the thickness :math:`t_p` it has in the template, measured from the group's middle outward,
 
     .. math:: \min_{\tau,\sigma} \sum_p w_p (t'_p(\tau,\sigma) - t_p)^2
@@ -42,7 +42,7 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
 
     Args:
         template: the rig whose neutral has every part in place.
-        neutral: a head of the same topology, millimetres, turned as the template is; a registered scan shows none of
+        neutral: a head of the same topology, millimetres, oriented as the template is; a registered scan shows none of
             its parts.
         parts: of the template; see ``inner_parts``.
 
@@ -65,9 +65,9 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
         shells = parts.vertices[own & ~parts.hard]
         middle = placed[bones].mean(0)
         height = fitted.scale[0] * (laid[shells] - laid[bones].mean(0)).norm(dim=-1)
-        away = placed[shells] - middle
-        kept = away.norm(dim=-1).clamp(height - _LOWEST, height + _HIGHEST)
-        placed[shells] = middle + torch.nn.functional.normalize(away, dim=-1) * kept[:, None]
+        outward = placed[shells] - middle
+        kept = outward.norm(dim=-1).clamp(height - _MAX_DROP, height + _MAX_RISE)
+        placed[shells] = middle + torch.nn.functional.normalize(outward, dim=-1) * kept[:, None]
     placed = placed + Clearance(placed, parts).step(placed, closing=False)
     if float((placed - found).abs().max()) < _NOTHING:
         return neutral
@@ -96,27 +96,27 @@ def _fitted(laid: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Si
     thin = wanted.thickness[wanted.met].clamp(min=0)
     use = wanted.met & (wanted.thickness < (float(thin.quantile(_THIN)) if len(thin) else 0.0) + _THICKER)
     around = parts.skin[wanted.triangle[use]].unique()
-    if len(around) < _FEWEST:
+    if len(around) < _MIN_VERTICES:
         around = parts.skin.unique()
-    # Lids alone say little of how a head is turned and how large an eyeball is: it is turned as the whole head is.
+    # Lids alone hardly determine a head's rotation and an eyeball's size: the rotation is the whole head's.
     local = similarity_transform(laid[None, around], found[None, around])
-    size = float(local.scale[0].clamp(1 - _LARGEST_CHANGE, 1 + _LARGEST_CHANGE))
+    size = float(local.scale[0].clamp(1 - _MAX_SCALE_CHANGE, 1 + _MAX_SCALE_CHANGE))
     centre = found[around].mean(0) + size * (middle - laid[around].mean(0))
     offsets = size * (laid[bones[use]] - middle)
     state = torch.zeros(4, dtype=torch.float64)
-    prior = torch.tensor([1 / _FAR**2] * 3 + [1 / _LARGER**2], dtype=torch.float64)
-    for _ in range(_ROUNDS if bool(use.any()) else 0):
+    prior = torch.tensor([1 / _TRANSLATION_DEVIATION**2] * 3 + [1 / _SCALE_DEVIATION**2], dtype=torch.float64)
+    for _ in range(_MAX_ITERATIONS if bool(use.any()) else 0):
         now = centre + state[:3] + (1 + state[3]) * offsets
         have = _SkinBefore.of(found, parts.skin, centre + state[:3], now)
         error = torch.where(have.met, have.thickness - wanted.thickness[use], 0.0)
-        says = have.met / (1 + (error / _OUTLIER) ** 2)
-        says = says * (_SAYS / max(float(says.sum()), _SAYS))
+        weight = have.met / (1 + (error / _OUTLIER) ** 2)
+        weight = weight * (_MAX_TOTAL_WEIGHT / max(float(weight.sum()), _MAX_TOTAL_WEIGHT))
         rows = torch.cat([have.across, offsets.norm(dim=-1)[:, None]], dim=1)
-        system = rows.T @ (says[:, None] * rows) + prior.diag()
-        state = state + torch.linalg.solve(system, rows.T @ (says * error) - prior * state)
+        system = rows.T @ (weight[:, None] * rows) + prior.diag()
+        state = state + torch.linalg.solve(system, rows.T @ (weight * error) - prior * state)
     scale = torch.tensor([size * (1 + float(state[3]))], dtype=torch.float64)
-    turned = torch.eye(3, dtype=torch.float64)[None]
-    return Similarity(scale, turned, (centre + state[:3] - scale * middle)[None])
+    rotation = torch.eye(3, dtype=torch.float64)[None]
+    return Similarity(scale, rotation, (centre + state[:3] - scale * middle)[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class _SkinBefore:
     """The skin before points (n,3), seen from a middle.
 
     Args:
-        met: whether there is any, and looks the same way, (n,) bool.
+        met: whether there is any, and faces the same way, (n,) bool.
         thickness: how far it lies before each point, (n,), negative behind.
         triangle: which, (n,) int64.
         across: how much thinner it gets as the middle and the point move, (n,3).

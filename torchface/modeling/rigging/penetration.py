@@ -84,9 +84,9 @@ class InnerParts:
         """``depth`` with where each vertex has come through."""
         vertices = vertices.detach().cpu().double()
         points = vertices[self.vertices]
-        away = points - self.middles(vertices)[self.group]
-        far = away.norm(dim=-1)
-        outward = away / far.clamp(min=1e-9)[:, None]
+        offsets = points - self.middles(vertices)[self.group]
+        far = offsets.norm(dim=-1)
+        outward = offsets / far.clamp(min=1e-9)[:, None]
         if len(points) == 0 or len(self.skin) == 0:
             none = torch.zeros(len(points), dtype=torch.float64)
             return Standing(none, outward, torch.full((len(points),), -1), none)
@@ -116,7 +116,7 @@ def inner_parts(template: BlendshapeRig) -> InnerParts:
     which stand before the skin by nature, and groups of parts from which nearly half of all directions are free.
 
     Args:
-        template: a rig, millimetres; its shapes tell which parts are bone.
+        template: a rig, millimetres; its shapes show which parts are bone.
     """
     mesh = template.neutral
     vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()

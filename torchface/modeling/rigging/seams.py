@@ -1,4 +1,4 @@
-"""The seams of a rig: lines along which its surface closes, read off its shapes without knowing their names."""
+"""The seams of a rig: lines along which its surface closes, found from its shapes, whatever their names."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ REST_REACH = 1.5
 """How close vertices of a seam that is closed at rest are, millimetres."""
 
 POSE_REACH = 3.0
-"""How close vertices come, in millimetres, where a shape closes a seam; closeness fades toward it."""
+"""How close vertices come, in millimetres, where a shape closes a seam; closeness decreases to zero there."""
 
 _CLOSED_SHARE = 0.1
 """A seam is closed at rest when this share of its vertices has a partner at rest: 0.3 for lips, 0.03 for lids."""
 
-_DEEPEST_OVERLAP = 10.0
+_MAX_OVERLAP = 10.0
 """A shape that drives a closed seam further than this through itself, in millimetres, is meant to undo another."""
 
 _CANCELLED = 0.2
@@ -101,10 +101,10 @@ def _undone_shapes(deltas: Tensor, closed: Tensor, normals: Tensor) -> dict[int,
     gram = flat @ flat.T
     square = gram.diagonal()
     undoes = {}
-    for shape in (deepest > _DEEPEST_OVERLAP).nonzero()[:, 0].tolist():
+    for shape in (deepest > _MAX_OVERLAP).nonzero()[:, 0].tolist():
         left = (square + 2 * gram[shape] + square[shape]) / square[shape]
         left[shape] = torch.inf
         other = int(left.argmin())
-        if left[other] < _CANCELLED and deepest[other] <= _DEEPEST_OVERLAP:
+        if left[other] < _CANCELLED and deepest[other] <= _MAX_OVERLAP:
             undoes[shape] = other
     return undoes

@@ -31,7 +31,7 @@ STILL = 0.01
 
 _LINK_WEIGHT = 100.0
 _LINK_TOLERANCE = 0.02
-_CONTACT_FADE = 4.0
+_CONTACT_DECAY = 4.0
 
 
 class ShapeTransfer:
@@ -146,9 +146,9 @@ class ShapeTransfer:
             moved = pose - self.rest
             change = moved[first] - moved[second]
             # Lips that go far apart are no longer in contact: how far is the target's own affair.
-            fade = 1 / (1 + change.square().sum(-1) / _CONTACT_FADE**2) if below is None else torch.ones(len(pairs))
+            decay = 1 / (1 + change.square().sum(-1) / _CONTACT_DECAY**2) if below is None else torch.ones(len(pairs))
             offsets = self.goal[first] - self.goal[second] + change + self.closed_gaps.extra(moves, change)
-            constraints.append(offset_constraints(pairs, offsets, self.contact_weight * fade, len(pose)))
+            constraints.append(offset_constraints(pairs, offsets, self.contact_weight * decay, len(pose)))
         closing = self.seams.closing[shape]
         if len(closing.pairs) and below is None:
             first, second = closing.pairs.T
@@ -171,7 +171,7 @@ class Follower:
 
     Args:
         matrices: of ties and contacts, each (K,V): what they measure may change too.
-        system: factored once, for the rounds to come.
+        system: factored once, for the iterations to come.
     """
 
     matrices: list[sparse.csr_array]

@@ -74,7 +74,7 @@ def transfer_deformation(
     .. math:: \min_{\tilde x} \sum_t \lVert S_t - T_t(\tilde x) \rVert_F^2
 
     for each shape, with the source's gradients S. The global similarity between the faces is removed first and carried
-    by the deltas, so that a turned or scaled target has turned or scaled shapes. Vertices that a shape leaves still
+    by the deltas, so that a rotated or scaled target has rotated or scaled shapes. Vertices that a shape leaves still
     are pinned. Parts of a head that are not connected to the face (teeth, eyes, lashes) keep what offset to it they
     keep in the source, and give way where they would come through the skin, also where the source's do. Lids close and
     lips meet as the source's do. The source's own face gets the source's own shapes.
@@ -83,7 +83,7 @@ def transfer_deformation(
         source: the template: N shapes, V vertices, millimetres.
         target: the new neutral, of the same topology, millimetres.
         contact_weight: how firmly lids and lips keep their gap; 0 leaves that out, and lets parts come through.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         A rig of ``target`` with the source's names; solved in float64 on the CPU. Triangles without area are

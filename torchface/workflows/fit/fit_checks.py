@@ -47,7 +47,7 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
         photographs: the files, I of them.
         marks: their landmarks, (I,68,2).
         bare: see there.
-        insist: say it only.
+        insist: report it only.
 
     Raises:
         AlignmentError: they do not, and nobody insists.
@@ -61,10 +61,10 @@ def one_person_lines(photographs: Sequence[Path], marks: Tensor, bare: BareFit, 
         return []
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
-    told = ", ".join(f"{path.name} {value:+.1f}" for path, value in zip(photographs, odds.tolist(), strict=True))
+    listed = ", ".join(f"{path.name} {value:+.1f}" for path, value in zip(photographs, odds.tolist(), strict=True))
     figures = (
-        f"logarithm of the odds that each shows the head of the others: {told}, expected above {ONE_PERSON:+.0f}; "
-        f"landmarks {joint:.1%} of the eyes' distance off together, {each:.1%} alone"
+        f"logarithm of the odds that each shows the head of the others: {listed}, expected above {ONE_PERSON:+.0f}; "
+        f"residual of the landmarks {joint:.1%} of the eyes' distance together, {each:.1%} alone"
     )
     if float(odds[worst]) < OTHERS and not insist:
         raise AlignmentError(
@@ -93,21 +93,19 @@ def landmark_lines(
         bare: see there.
     """
     lines = []
-    for i, off in enumerate(misfits(fit).tolist()):  # photographs, the few that are off
-        if off < MISFIT:
+    for i, misfit in enumerate(misfits(fit).tolist()):  # photographs, the few that do not fit
+        if misfit < MISFIT:
             continue
         name = photographs[i].name
-        said = f"{name}: the given landmarks do not fit well, {off:.1%} of the eyes' distance off"
+        said = f"{name}: the given landmarks do not fit well, residual {misfit:.1%} of the eyes' distance"
         found = _found_there(photographs[i], images[i], marks[i], finder)
         if found is None:
-            lines.append(
-                f"{said}; {finder} finds no face there to compare with; look at them in the picture of the fit"
-            )
+            lines.append(f"{said}; {finder} finds no face there to compare with; look at them in the image of the fit")
             continue
-        other = float(misfits(bare(found.trusted[None], [i]))[0])
+        other = float(misfits(bare(found.confident[None], [i]))[0])
         lines.append(
-            f"{said}; those that {finder} finds are {other:.1%} off; look at both in the pictures of the fit"
-            + (", and leave --landmarks away to take the found ones" if other < off else "")
+            f"{said}; those that {finder} finds have {other:.1%}; look at both in the images of the fit"
+            + (", and leave out --landmarks to take the found ones" if other < misfit else "")
         )
     return lines
 
@@ -119,10 +117,10 @@ def _found_there(photograph: Path, image: Tensor, marks: Tensor, finder: str | P
     try:
         first = find_in_photographs([photograph], [image], finder)[0]
         centres = first.boxes[:, :2] + first.boxes[:, 2:] / 2
-        away = (centres.double() - middle).norm(dim=1)
-        if float(away.min()) > _NEAR * float(size):
+        distances = (centres.double() - middle).norm(dim=1)
+        if float(distances.min()) > _NEAR * float(size):
             return None
-        number = int(away.argmin())
+        number = int(distances.argmin())
         return first if number == first.number else find_in_photographs([photograph], [image], finder, number)[0]
     except NoFaceError:
         return None

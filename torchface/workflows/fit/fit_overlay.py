@@ -40,12 +40,12 @@ def overlay(fit: ImageFit, view: int, image: Tensor, found: Tensor) -> Tensor:
 
 
 def _clay(mesh: Mesh) -> Mesh:
-    """The bare form: what the photographs gave would hide where the form is off."""
+    """The bare form: what the photographs gave would hide where the form is wrong."""
     return Mesh(mesh.vertices, mesh.faces)
 
 
 def _cut(camera: Camera, found: Tensor) -> tuple[Camera, Tensor]:
-    """The camera of a square piece round the landmarks, and where that lies: left, top, pixels of it a pixel (3,)."""
+    """The camera of a square piece around the landmarks, and where that lies: left, top, pixels of it a pixel (3,)."""
     seen = found[torch.isfinite(found).all(-1)]
     low, high = seen.amin(0), seen.amax(0)
     side = float((high - low).max()) * (1 + 2 * _MARGIN)

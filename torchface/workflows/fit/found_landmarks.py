@@ -1,4 +1,4 @@
-"""Landmarks of photographs that nobody has annotated, and what there is to say about them."""
+"""Landmarks of photographs that nobody has annotated, and remarks on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DEFAULT_LANDMARKS = "face_landmarks"
 UNSURE = 0.2
 """Landmarks of lower confidence are left out of a fit."""
 
-_FEWEST = 40
+_MIN_CONFIDENT = 40
 _PARTS = {"jaw": slice(0, 17), "brows": slice(17, 27), "nose": slice(27, 36), "eyes": slice(36, 48)} | {
     "mouth": slice(48, 68)
 }
@@ -46,14 +46,14 @@ class FoundLandmarks:
     size: tuple[int, int]
 
     @property
-    def trusted(self) -> Tensor:
-        """The landmarks (68,2) float64, NaN where they are unsure or out of the picture.
+    def confident(self) -> Tensor:
+        """The landmarks (68,2) float64, NaN where they are unsure or outside the image.
 
-        All are kept where most are unsure: then nothing better is known.
+        All are kept where most are unsure: then there is nothing better.
         """
         points = self.face.landmarks.double()
         unsure = self.face.confidence < UNSURE
-        if int((~unsure).sum()) < _FEWEST:
+        if int((~unsure).sum()) < _MIN_CONFIDENT:
             unsure = torch.zeros_like(unsure)
         outside = ((points < -0.5) | (points > points.new_tensor(self.size) - 0.5)).any(1)
         return torch.where((unsure | outside)[:, None], torch.nan, points)
@@ -62,7 +62,7 @@ class FoundLandmarks:
         """For people to read."""
         box, confidence = self.face.box.round().int().tolist(), self.face.confidence
         weakest = min(_PARTS, key=lambda part: float(confidence[_PARTS[part]].mean()))
-        unsure = int(self.trusted.isnan().any(1).sum())
+        unsure = int(self.confident.isnan().any(1).sum())
         lines = [
             f"{self.photograph.name}: landmarks found by {self.model} in the face at ({box[0]}, {box[1]}), {box[2]} "
             f"pixels wide; confidence {float(confidence.mean()):.2f}, lowest at the {weakest} with "
@@ -116,7 +116,7 @@ def find_in_photographs(
     """
     trees = load_landmark_model(model)
     found = []
-    for path, image in zip(photographs, images, strict=True):  # a photograph a turn: they differ in size
+    for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
         faces = find_faces(pixels)
         try:

@@ -35,7 +35,7 @@ class FittedHead:
     Args:
         rig: the person's.
         fit: see ``ImageFit``.
-        pictures: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
+        overlays: the files written, one a photograph: it, the fit over it, landmarks found (green) and fitted (red).
         transfer_summary: on triangles without area; empty where there are none.
         found: the landmarks that no file gave; empty where files gave them.
         remarks: what speaks against the fit.
@@ -43,7 +43,7 @@ class FittedHead:
 
     rig: BlendshapeRig
     fit: ImageFit
-    pictures: tuple[Path, ...]
+    overlays: tuple[Path, ...]
     transfer_summary: str
     found: tuple[FoundLandmarks, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -97,11 +97,11 @@ def fit_photographs(
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
         template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
             topology is the model's.
-        focal: length in pixels where it is known.
-        settings: how landmarks are trusted.
+        focal: length in pixels, if given.
+        settings: the noise of landmarks.
         face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
         texture_size: texels a side; 0 makes no texture.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         landmark_model: finds landmarks where no file gives them; by name or folder.
         names: of the written shapes; see ``rig_names.renamed``.
         part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
@@ -112,7 +112,7 @@ def fit_photographs(
         AlignmentError: photographs show different people.
         NoFaceError: landmarks are to be found where no face is.
         FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
-        NameMismatchError: landmarks do not tell which photograph or face they are of.
+        NameMismatchError: landmarks do not show which photograph or face they are of.
         TorchfaceError: landmarks or model are of no use; see ``fit_images``.
     """
     progress = progress or silent
@@ -127,7 +127,7 @@ def fit_photographs(
     else:
         progress(f"finding the landmarks of {len(photographs)} photographs")
         found = find_in_photographs(photographs, images, landmark_model, face)
-        marks = torch.stack([one.trusted for one in found])
+        marks = torch.stack([one.confident for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
 
     def bare(points: Tensor, rows: list[int]) -> ImageFit:
@@ -155,12 +155,12 @@ def fit_photographs(
     transferred = transfer_with_report(rig, worn, progress=progress)
     progress("writing the rig and the overlays")
     save_rig(renamed(transferred.rig, names), out)
-    pictures = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
-    for i, (path, image) in enumerate(zip(pictures, images, strict=True)):  # a photograph a turn
+    overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
+    for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
         save_picture(overlay(fit, i, image, marks[i]), path)
-    for picture, camera, (width, height), error in zip(pictures, fit.cameras, sizes, fit.errors.tolist(), strict=True):
+    for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
         calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
-        save_calibration(calibration, picture.with_suffix(".toml"))
-    for picture, one in zip(pictures, found, strict=False):  # to be corrected and given as --landmarks
-        save_pts(one.face.landmarks, picture.with_suffix(".pts"))
-    return FittedHead(transferred.rig, fit, pictures, transferred.report.summary(), tuple(found), tuple(remarks))
+        save_calibration(calibration, path.with_suffix(".toml"))
+    for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
+        save_pts(one.face.landmarks, path.with_suffix(".pts"))
+    return FittedHead(transferred.rig, fit, overlays, transferred.report.summary(), tuple(found), tuple(remarks))

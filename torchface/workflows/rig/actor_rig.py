@@ -43,10 +43,10 @@ from torchface.workflows.rig.expression_scans import LAYOUT, Expression, express
 from torchface.workflows.rig.penetration_report import Penetration, penetration
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 
-PICTURE = "_registration.png"
-"""Ends the name of the picture that lies beside a rig."""
-_FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much says half as much about the head's place
-# Registered scans are noisier than shapes are a person's own, and what they show is known roughly.
+FIGURE_ENDING = "_registration.png"
+"""Ends the name of the figure that lies beside a rig."""
+_FOLLOWS = 1.0  # millimetres; a vertex that an expression moves by this much counts half as much for the head's place
+# Registered scans are noisier than shapes are a person's own, and what they show is only roughly given.
 _SCANNED = RiggingSchedule(beta=(0.5, 0.1), gamma=(25.0, 25.0))
 
 
@@ -60,7 +60,7 @@ class RigOptions:
         pose: what the neutral scan shows in the template's shapes, such as closed eyes; the actor's neutral is opened
             again by deformation transfer.
         detector: of landmarks, by name or folder, for scans without landmarks.
-        model: of heads in the template's topology, by name or folder; the neutral's registration starts from it.
+        model: of heads in the template's topology, by name or folder; the neutral's registration is initialised by it.
         texture_size: of the actor's texture, texels a side.
         detail_size: of each normal map, texels a side.
         names: of the written shapes; see ``rig_names.renamed``.
@@ -88,7 +88,7 @@ class ActorReport:
         example_names: the examples used, in the order of ``examples.errors``.
         maps: the baked normal maps by name, the neutral's first.
         skipped: lines on scans that could not be used.
-        picture: of the registration: scan, face, distances and lines.
+        figure: of the registration: scan, face, distances and lines.
         penetration: how far teeth, gums and eyes stand out of the skin.
     """
 
@@ -99,7 +99,7 @@ class ActorReport:
     example_names: tuple[str, ...]
     maps: dict[str, NormalMap]
     skipped: tuple[str, ...]
-    picture: Path
+    figure: Path
     penetration: Penetration | None = None
 
     def lines(self) -> list[str]:
@@ -107,7 +107,7 @@ class ActorReport:
         record = self.neutral.record
         lines = [f"neutral: laid on the scan by {record.start}; {record.figures()}"]
         lines += [f"  note: {note}" for note in record.notes]
-        lines.append(f"  picture: {self.picture}")
+        lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
         lines += [] if self.penetration is None else [self.penetration.line()]
@@ -115,7 +115,7 @@ class ActorReport:
             errors = self.examples.errors
             lines.append(
                 f"examples: {len(self.example_names)}, from {float(errors[0].mean()):.2f} mm (transferred shapes) to "
-                f"{float(errors[-1].mean()):.2f} mm root mean square; the shapes turned by up to "
+                f"{float(errors[-1].mean()):.2f} mm root mean square; the shapes rotated by up to "
                 f"{float(self.examples.angles.max()):.0f}°"
             )
             lines += [
@@ -126,7 +126,7 @@ class ActorReport:
             lines.append(f"normal maps: {len(self.maps)}")
             lines += [
                 f"  {name}: {baked.statistics.hit_share:.0%} of the texels found the scan, median "
-                f"{baked.statistics.median_distance:.2f} mm away"
+                f"{baked.statistics.median_distance:.2f} mm apart"
                 for name, baked in self.maps.items()
             ]
         return lines + [f"skipped: {line}" for line in self.skipped]
@@ -144,7 +144,7 @@ def rig_actor(
 ) -> ActorReport:
     """Registers the neutral scan, transfers the shapes, learns from examples, bakes normal maps, writes the rig.
 
-    Beside the rig lies a picture of the registration, ``NAME_registration.png``: the scan, the face, its distances to
+    Beside the rig lies a figure of the registration, ``NAME_registration.png``: the scan, the face, its distances to
     the scan, its mesh.
 
     Args:
@@ -157,7 +157,7 @@ def rig_actor(
         detail: a folder of high-resolution scans, named for the one shape that each shows at full strength, and
             ``neutral``.
         options: how the files are read and what is made of them.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
@@ -194,8 +194,8 @@ def rig_actor(
     progress("writing the rig")
     save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
     progress("drawing the registration")
-    picture = out.with_name(f"{out.stem}{PICTURE}")
-    save_picture(registration_sheet(load_mesh(scan, options.unit), registration), picture)
+    figure = out.with_name(f"{out.stem}{FIGURE_ENDING}")
+    save_picture(registration_sheet(load_mesh(scan, options.unit), registration), figure)
     names = {label: baked for label, (_, baked) in maps.items()}
     return ActorReport(
         actor,
@@ -205,7 +205,7 @@ def rig_actor(
         used,
         names,
         tuple(job.skipped),
-        picture,
+        figure,
         penetration(actor, parts),
     )
 
@@ -282,7 +282,7 @@ class _Actor:
 
 
 def _upright(registration: Registration, template: Mesh) -> Mesh:
-    """The registered face, turned and moved to where the template looks, in its own size."""
+    """The registered face, rotated and translated to the template's pose, in its own size."""
     return in_place_of(registration.mesh, template, registration.matched.double())
 
 

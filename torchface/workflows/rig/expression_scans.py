@@ -36,7 +36,7 @@ class Expression:
 
 
 def weights_row(weights: dict[str, float], names: Sequence[str], where: str) -> Tensor:
-    """Weights (N,) of a rig's shapes from some of them by name, in any spelling that ``shape_names`` knows.
+    """Weights (N,) of a rig's shapes from some of them by name, in any spelling that ``shape_names`` reads.
 
     Raises:
         NameMismatchError: a name that means no shape of the rig.
@@ -59,11 +59,11 @@ def weights_row(weights: dict[str, float], names: Sequence[str], where: str) -> 
 def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
     """The expression scans of a folder, in the order of ``weights.csv``, or sorted by name.
 
-    Without ``weights.csv`` each file's name says what it shows: shapes joined by ``+``, each with ``=WEIGHT`` where
+    Without ``weights.csv`` each file's name gives what it shows: shapes joined by ``+``, each with ``=WEIGHT`` where
     that is not 1. A file named ``neutral`` is left out.
 
     Args:
-        folder: scans, and ``weights.csv`` where the names do not say it.
+        folder: scans, and ``weights.csv`` where the names do not give it.
         names: the rig's shapes.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a rig's report says of teeth, gums and eyes that stand out of the skin."""
+"""A rig's report of teeth, gums and eyes that stand out of the skin."""
 
 from __future__ import annotations
 
