@@ -87,7 +87,7 @@ def check(fit: LightFit, light: PointLight, centre: Tensor) -> None:
 def test_planted_lights_come_back(rig: BlendshapeRig) -> None:
     generator = torch.Generator().manual_seed(0)
     cameras, weights = turning_cameras(rig, 400, 20.0, generator, STAGE), performed(rig, 400, generator)
-    for t in torch.randint(400, (4,), generator=generator).tolist():
+    for t in torch.randint(400, (2,), generator=generator).tolist():
         mesh = rig.neutral.with_vertices(rig(weights[t : t + 1])[0])
         centre = middle(mesh, cameras[t])
         light = planted(centre, generator)
@@ -105,13 +105,12 @@ def test_planted_lights_come_back_on_a_scanned_head(ict_folder: Path) -> None:
     blotches = torch.rand(1, 3, 24, 24, generator=generator)
     texture = torch.nn.functional.interpolate(0.35 + 0.5 * blotches, (256, 256), mode="bicubic")[0].clamp(0, 1)
     cameras = turning_cameras(rig, 100, 20.0, generator, STAGE)
-    for t in (10, 60):
-        weights = 0.4 * torch.rand(1, len(rig.names), generator=generator)
-        mesh = replace(rig.neutral, vertices=rig(weights)[0], texture=texture)
-        centre = middle(mesh, cameras[t])
-        light = planted(centre, generator)
-        frame = photograph(mesh, cameras[t], light, t)
-        check(estimate_light(frame, mesh.vertices, mesh.faces, vertex_albedo(mesh), cameras[t]), light, centre)
+    weights = 0.4 * torch.rand(1, len(rig.names), generator=generator)
+    mesh, camera = replace(rig.neutral, vertices=rig(weights)[0], texture=texture), cameras[60]
+    centre = middle(mesh, camera)
+    light = planted(centre, generator)
+    frame = photograph(mesh, camera, light, 60)
+    check(estimate_light(frame, mesh.vertices, mesh.faces, vertex_albedo(mesh), camera), light, centre)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 SLIP = StageFlaws(slip_translation=8, slip_rotation=3)
 
 
-def filmed(performance: Performance, flaws: StageFlaws | None = None, take: int = 0, every: int = 8) -> Take:
+def filmed(performance: Performance, flaws: StageFlaws | None = None, take: int = 0, every: int = 16) -> Take:
     rig, attachment, takes = performance
     generator = torch.Generator().manual_seed(0)
     return record(rig, attachment, takes[take][::every], generator, flaws or StageFlaws(), fps=60.0 / every).take
@@ -38,7 +38,7 @@ def guess(rig: BlendshapeRig, attachment: Attachment, seed: int = 1, least: floa
 def calm_fit(performance: Performance) -> AttachmentFit:
     rig, attachment, takes = performance
     calm = (rig, attachment, [0.4 * takes[0]])
-    return fit_attachment(rig, filmed(calm), guess(rig, attachment))
+    return fit_attachment(rig, filmed(calm, every=8), guess(rig, attachment))
 
 
 def test_a_calm_take_gives_the_sites_and_names_the_shapes_that_it_leaves_open(

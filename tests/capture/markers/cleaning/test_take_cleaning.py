@@ -91,7 +91,7 @@ def test_a_dirty_take_of_the_performer(performance: Performance) -> None:
 
 @pytest.mark.real
 def test_a_dirty_real_take(real_capture: Performance) -> None:
-    check_dirty_take(real_capture, 2, 1900)
+    check_dirty_take(real_capture, 2, 1200)
 
 
 def spoiled(take: Take) -> Take:
