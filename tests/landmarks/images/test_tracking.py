@@ -70,14 +70,14 @@ def errors(found: Tensor, truth: Tensor) -> Tensor:
 
 def test_every_frame_is_tracked_near_the_truth(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
     frames, truth = film
-    told: list[tuple[int, int]] = []
-    track = track_landmarks(frames, LandmarkTracker(trees), lambda *numbers: told.append(numbers))
+    calls: list[tuple[str, int, int]] = []
+    track = track_landmarks(frames, LandmarkTracker(trees), lambda *progress: calls.append(progress))
     assert track.names == tuple(str(number) for number in range(68))
     assert track.confidence is not None
     off = errors(track.values, truth)
     assert off.mean() < 0.035
     assert off[:, 17:].mean() < 0.025
-    assert told == [(t + 1, 12) for t in range(12)]
+    assert calls == [("tracking landmarks", t + 1, 12) for t in range(12)]
     assert ((track.confidence > 0) & (track.confidence <= 1)).all()
     sure = track.confidence > track.confidence.median()
     assert off[sure].mean() < 0.7 * off[~sure].mean()  # confidence tells which landmarks are off
