@@ -58,7 +58,7 @@ def merge_equal_rows(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.
         For each row the number of its value, (C,), and for each value its first row, (V,).
     """
     rows = np.ascontiguousarray(rows + rows.dtype.type(0))  # so that -0 equals 0 bit by bit
-    bits = rows.view(np.int32).reshape(len(rows), -1)
+    bits: NDArray[Any] = rows.view(np.int32).reshape(len(rows), -1)
     if bits.shape[1] > _MAX_SORTED_COLUMNS:
         wide = rows.view([("", np.void, rows.shape[1] * rows.itemsize)]).reshape(-1)
         bits = np.unique(wide, return_inverse=True)[1].reshape(-1, 1)
