@@ -28,7 +28,7 @@ from torchface.capture.retargeting import retarget_take, shape_map
 from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.video import video_solver as frame_solve
 from torchface.capture.video.face_points import FacePoints
-from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.capture.video.state_estimate import Expectation, StateEstimate
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.geometry.rotations import rotation_matrix
@@ -426,7 +426,7 @@ def test_speed(faces: Faces, monkeypatch: pytest.MonkeyPatch) -> None:
         ("shape prior", solver.prior, "energy"),
         ("dynamics prior", solver.dynamics, "forward"),
         ("its covariance, one frame on", solver, "predicted"),
-        ("its covariance, one frame on", Belief, "expectation"),
+        ("its covariance, one frame on", StateEstimate, "expectation"),
         ("its covariance, after the frame", Expectation, "updated"),
         ("what it expects", Expectation, "quadratic"),
         ("quadratic programs in the box", frame_solve, "solve_from_active_set"),

@@ -21,7 +21,7 @@ from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, U
 from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model, export_video_solver
-from torchface.onnx.video_graph_export import filmed
+from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
@@ -72,7 +72,7 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     person = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "browInnerUp"])
     camera = assumed_calibration(640, 480)
     export_video_solver(person, camera, path / "video_solver.onnx")
-    marks = filmed(VideoSolver(person, None, camera.intrinsics), 5)[1]
+    marks = synthetic_landmarks(VideoSolver(person, None, camera.intrinsics), 5)[1]
     inputs = {"neutral": people[0], "image": images[0], "markers": markers, "landmarks": marks}
     for name, values in inputs.items():
         array = values.numpy().astype(np.float32)

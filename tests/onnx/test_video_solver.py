@@ -24,7 +24,7 @@ from torchface.onnx import VideoGraph, VideoReport, export_video_solver
 from torchface.onnx import video_graph_export as video_export
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS, symmetric_inverse
-from torchface.onnx.video_graph_export import filmed
+from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -41,7 +41,7 @@ def rig() -> BlendshapeRig:
 
 @pytest.fixture(scope="module")
 def takes(rig: BlendshapeRig) -> list[Tensor]:
-    return [filmed(VideoSolver(rig, None, K), 200, seed)[0] for seed in (1, 2)]
+    return [synthetic_landmarks(VideoSolver(rig, None, K), 200, seed)[0] for seed in (1, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_planted_weights_are_recovered_frame_after_frame(
     memory = dynamics if remembers else None
     settings = VideoSettings(sparsity=0.0, ridge=1e-9, pixel_noise=0.01, steps=6)
     solver = VideoSolver(rig, None, K, None, memory, settings)
-    weights, landmarks = filmed(solver, 30)
+    weights, landmarks = synthetic_landmarks(solver, 30)
     assert bool(torch.isnan(landmarks).any())
     found = torch.stack([frame["weights"] for frame in played(VideoGraph(solver), landmarks)])
     assert float((found - weights).square().mean().sqrt()) < 2e-3
@@ -102,15 +102,15 @@ def test_planted_weights_are_recovered_frame_after_frame(
 def test_it_is_the_exact_solve_and_its_memory(rig: BlendshapeRig, takes: list[Tensor], dynamics: DynamicsPrior) -> None:
     """With steps enough, weights, pose and covariance are those of ``VideoSolver`` after many frames."""
     solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), dynamics, VideoSettings(tolerance=1e-8))
-    _, landmarks = filmed(solver, 12)
+    _, landmarks = synthetic_landmarks(solver, 12)
     landmarks[5] = torch.nan
     states, _ = solver.states(landmarks)
     for frame, state in zip(played(VideoGraph(solver), landmarks), states, strict=True):
         torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
         torch.testing.assert_close(frame["rotation"].double(), state.rotation, atol=1e-4, rtol=0)
         torch.testing.assert_close(frame["translation"].double(), state.translation, atol=2e-2, rtol=0)
-        assert state.belief is not None
-        spread = state.belief.covariance[0]
+        assert state.estimate is not None
+        spread = state.estimate.covariance[0]
         size = spread.diagonal().sqrt()
         torch.testing.assert_close(
             frame["covariance"] / size / size[:, None], spread / size / size[:, None], atol=1e-3, rtol=0
@@ -158,7 +158,7 @@ def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig)
     names = [o.name for o in session.get_outputs()]
     none = {i.name: np.full(i.shape, np.nan, np.float32) for i in session.get_inputs() if i.name[:9] == "previous_"}
     trust = np.ones(68, np.float32)
-    _, landmarks = filmed(VideoSolver(rig, None, K), 2, seed=3)
+    _, landmarks = synthetic_landmarks(VideoSolver(rig, None, K), 2, seed=3)
     empty = np.full((68, 2), np.nan, np.float32)
     empty[:5] = landmarks[0, :5].nan_to_num(100.0)
     first = dict(zip(names, session.run(names, {"landmarks": empty, "confidence": trust, **none}), strict=True))

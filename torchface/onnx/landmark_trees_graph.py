@@ -1,4 +1,4 @@
-"""Landmark trees as ONNX: one grey picture and boxes of faces in it to landmarks."""
+"""Landmark trees as ONNX: one grey image and boxes of faces in it to landmarks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 
 PixelType = Literal["uint8", "float32"]
-"""What the picture's values are: 0 to 255, or [0,1]."""
+"""What the image's values are: 0 to 255, or [0,1]."""
 
 _PARITY = 0.1  # pixels; a rounding error may read the pixel beside, which moves a face by some hundredths
 
@@ -47,7 +47,7 @@ def export_landmark_trees(
         model: what to export.
         path: the file to write.
         facts: further metadata, such as licence and data.
-        pixels: of the picture.
+        pixels: of the image.
 
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
@@ -96,12 +96,12 @@ def landmark_trees_model(
     for cascade in range(model.sizes["cascades"]):
         anchors, offsets = model.anchors[cascade], model.offsets[cascade]
         x, y = offsets.unbind(1)
-        turned = torch.stack([torch.cat([x, y]), torch.cat([-y, x])])
+        rotated = torch.stack([torch.cat([x, y]), torch.cat([-y, x])])
         similarity = op("MatMul", shapes, "to_similarity")
         places = op(
             "Add",
             op("Gather", shapes, build.stored(f"anchors{cascade}", torch.cat([2 * anchors, 2 * anchors + 1])), axis=1),
-            op("MatMul", similarity, constant(f"offsets{cascade}", turned)),
+            op("MatMul", similarity, constant(f"offsets{cascade}", rotated)),
         )
         places = op("Reshape", op("Round", places), "two_rows")
         places = op("Cast", op("Min", op("Max", places, "zero"), limits), to=TensorProto.INT64)
@@ -109,9 +109,9 @@ def landmark_trees_model(
         grey = op("Gather", values, address)
         if pixels == "uint8":
             grey = op("Cast", grey, to=TensorProto.FLOAT)
-        apart = op("Sub", grey, op("ReduceMean", grey, axes=[1], keepdims=1))
-        spread = op("Sqrt", op("ReduceMean", op("Mul", apart, apart), axes=[1], keepdims=1))
-        coefficients = _leaves(build, model, cascade, op("Div", grey, op("Max", spread, "faintest")))
+        centred = op("Sub", grey, op("ReduceMean", grey, axes=[1], keepdims=1))
+        deviation = op("Sqrt", op("ReduceMean", op("Mul", centred, centred), axes=[1], keepdims=1))
+        coefficients = _leaves(build, model, cascade, op("Div", grey, op("Max", deviation, "faintest")))
         steps = model.bases[cascade].view(-1, count, 2)
         across = torch.stack([-steps[..., 1], steps[..., 0]], -1)
         both = torch.cat([steps.flatten(1), across.flatten(1)], dim=1)

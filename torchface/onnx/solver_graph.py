@@ -18,7 +18,7 @@ STEPS_WITH_GAPS = 96
 # Numbers below this share of the largest on the diagonal of H would overflow its scaling.
 _SMALLEST_DIAGONAL = 1e-6
 # Newton's iteration starts from this over a norm of A; below 2 it converges.
-NEWTON_START = 1.5
+NEWTON_SCALE = 1.5
 # Shares of the steps after which f is formed again from what the markers' distances are by then: early, so that what
 # the first, rough f left behind in slow modes is gone at the end.
 _FORMED_AGAIN = (0.09, 0.27)
@@ -56,7 +56,7 @@ class SolverGraph(nn.Module):
 
     rest: Tensor
     rows: Tensor
-    price: Tensor
+    l1_penalty: Tensor
     step: Tensor
     double_step: Tensor
     offset: Tensor
@@ -75,7 +75,7 @@ class SolverGraph(nn.Module):
         rest, basis = solver.rest.double(), solver.basis.double()
         scale = 1.0
         if solver.alignment is not None:
-            # s R (b' - t) = b - (s R t + shift): the difference is taken in marker space, its turn goes into the rows.
+            # s R (b' - t) = b - (s R t + shift): the difference is in marker space, its rotation in the rows.
             rest = solver.alignment.inverse().apply(rest[None])[0]
             scale = float(solver.alignment.scale[0])
             basis = scale * (solver.alignment.rotation[0].to(basis).T @ basis)
@@ -89,13 +89,13 @@ class SolverGraph(nn.Module):
         factors = prepare_splitting(H, rho)
         self.smallest_diagonal = _SMALLEST_DIAGONAL * float(H.diagonal().max())
         # Each iteration doubles the digits once the smallest eigenvalue, rho over a norm of at most N, has come to 1.
-        self.newton_steps = math.ceil(math.log2(16 * min(_norm(H) * 2, len(H)) / (NEWTON_START * rho)))
+        self.newton_steps = math.ceil(math.log2(16 * min(_norm(H) * 2, len(H)) / (NEWTON_SCALE * rho)))
         double_step = 2 * factors.step
         double_step.diagonal().add_(2 - RELAXATION)
         for name, value in (
             ("rest", rest),
             ("rows", rows),
-            ("price", torch.full_like(H[0], self.sparsity)),
+            ("l1_penalty", torch.full_like(H[0], self.sparsity)),
             ("step", factors.step),
             ("double_step", double_step),
             ("offset", factors.offset),
@@ -138,7 +138,7 @@ class SolverGraph(nn.Module):
     def _constant(self, offset: Tensor, w: Tensor) -> Tensor:
         """:math:`c` from the gradient at w."""
         distance = torch.addmm(offset, w, self.rows.T, alpha=self.gram_scale)
-        gradient = torch.addmm(self.price, distance, self.rows) + self.double_ridge * w
+        gradient = torch.addmm(self.l1_penalty, distance, self.rows) + self.double_ridge * w
         return torch.addmm(torch.addmm((RELAXATION - 1) * w, w, -self.step), gradient, self.offset)
 
     def _with_gaps(
@@ -147,20 +147,20 @@ class SolverGraph(nn.Module):
         """Frames with an H of their own: markers (B,M,1) are missing, or weights are pulled (B,N) to targets (B,N)."""
         identity = torch.eye(len(self.names), dtype=z.dtype, device=z.device)
         seen = 1 - missing.to(offset)  # (B,M,1)
-        share = seen.mean(1, keepdim=True)  # (B,1,1)
-        known = torch.where(missing, 0.0, offset).flatten(1)[:, None]  # (B,1,3M)
+        visible = seen.mean(1, keepdim=True)  # (B,1,1)
+        seen_offset = torch.where(missing, 0.0, offset).flatten(1)[:, None]  # (B,1,3M)
         seen = seen.expand_as(offset).flatten(1)[:, None]
         kept = seen.transpose(1, 2) * self.rows  # (B,3M,N)
         ridge = z.new_full((1, 1, len(self.names)), self.double_ridge)
-        price = self.price
+        penalty = self.l1_penalty
         if pull is not None and target is not None:
-            ridge, price = ridge + pull[:, None], price - (pull * target)[:, None]
-        H = self.gram_scale * (kept.transpose(1, 2) @ self.rows) + (ridge * identity) * share
+            ridge, penalty = ridge + pull[:, None], penalty - (pull * target)[:, None]
+        H = self.gram_scale * (kept.transpose(1, 2) @ self.rows) + (ridge * identity) * visible
         diagonal = (H * identity).sum(1, keepdim=True)  # (B,1,N)
         diagonal = diagonal.clamp(min=self.smallest_diagonal)
         scale = diagonal.rsqrt()
         A = H * scale * scale.transpose(1, 2) + self.rho * identity
-        X = NEWTON_START * identity / A.square().sum((1, 2), keepdim=True).sqrt()
+        X = NEWTON_SCALE * identity / A.square().sum((1, 2), keepdim=True).sqrt()
         for _ in range(self.newton_steps):
             X = X @ (2 * identity - A @ X)
         offset = -RELAXATION * (X * scale * scale.transpose(1, 2))
@@ -169,8 +169,8 @@ class SolverGraph(nn.Module):
         z = v = z[:, None]
         for steps in stretches(self.steps_with_gaps):
             w = z
-            distance = (known + self.gram_scale * (w @ self.rows.T)) * seen
-            gradient = distance @ self.rows + share * (price + ridge * w)
+            distance = (seen_offset + self.gram_scale * (w @ self.rows.T)) * seen
+            gradient = distance @ self.rows + visible * (penalty + ridge * w)
             constant = gradient @ offset + w @ minus_step + (RELAXATION - 1) * w
             for _ in range(steps):
                 v = constant + v @ minus_step + z @ double_step
@@ -180,7 +180,7 @@ class SolverGraph(nn.Module):
 
 def stretches(steps: int) -> list[int]:
     """The steps between one forming of f and the next."""
-    marks = [0, *(round(share * steps) for share in _FORMED_AGAIN), steps]
+    marks = [0, *(round(fraction * steps) for fraction in _FORMED_AGAIN), steps]
     return [after - before for before, after in pairwise(marks)]
 
 

@@ -10,7 +10,7 @@ import torch
 from torchface import __version__
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.hybrid_graph import HybridGraph
-from torchface.onnx.solver_graph import NEWTON_START, SolverGraph, stretches
+from torchface.onnx.solver_graph import NEWTON_SCALE, SolverGraph, stretches
 from torchface.optim.splitting import RELAXATION
 
 
@@ -27,7 +27,7 @@ def solver_model(graph: SolverGraph, facts: Mapping[str, object] | None = None) 
     build.constant("minus_step", -graph.step)
     build.constant("zero", 0.0)
     build.constant("one", 1.0)
-    build.constant("price", graph.price)
+    build.constant("l1_penalty", graph.l1_penalty)
     build.constant("double_ridge", float(graph.double_ridge))
     build.constant("relaxation_less_one", RELAXATION - 1)
     build.constant("row", (-1, 3 * markers))
@@ -73,7 +73,7 @@ def _complete_branch(parent: GraphBuilder, graph: SolverGraph, offset: str, star
     z = v = start
     for steps in stretches(graph.steps):
         distance = build.op("Gemm", z, "rows", offset, transB=1, alpha=graph.gram_scale)
-        gradient = build.op("Gemm", distance, "rows", "price")
+        gradient = build.op("Gemm", distance, "rows", "l1_penalty")
         gradient = build.op("Add", gradient, build.op("Mul", z, "double_ridge"))
         constant = _constant(build, z, gradient)
         for _ in range(steps):
@@ -105,7 +105,7 @@ def _gaps_branch(
         ("rho", float(graph.rho)),
         ("minus_relaxation", -RELAXATION),
         ("relaxation_rest", 2 - RELAXATION),
-        ("newton_start", NEWTON_START),
+        ("newton_start", NEWTON_SCALE),
         ("smallest", float(graph.smallest_diagonal)),
         ("identity", torch.eye(shapes)),
         ("wide", (-1, 1, 3 * len(graph.labels))),
@@ -120,17 +120,17 @@ def _gaps_branch(
         return op("Transpose", matrix, perm=[0, 2, 1])
 
     hidden = op("Cast", gone, to=onnx.TensorProto.BOOL)
-    known = op("Reshape", op("Where", hidden, "zero", offset), "wide")
+    seen_offset = op("Reshape", op("Where", hidden, "zero", offset), "wide")
     seen = op("Sub", "one", gone)
-    share = op("ReduceMean", seen, axes=[1], keepdims=1)
+    visible = op("ReduceMean", seen, axes=[1], keepdims=1)
     seen = op("Reshape", op("Expand", seen, "three"), "wide")
     basis = op("Transpose", "rows", perm=[1, 0])
     H = op("Mul", op("MatMul", op("Mul", seen, basis), "rows"), "gram_scale")
-    ridge, first_price = "double_ridge", "price"
+    ridge, first_penalty = "double_ridge", "l1_penalty"
     if pull is not None and target is not None:
         ridge = op("Reshape", op("Add", pull, "double_ridge"), "vector")
-        first_price = op("Sub", "price", op("Reshape", op("Mul", pull, target), "vector"))
-    H = op("Add", H, op("Mul", op("Mul", ridge, "identity"), share))
+        first_penalty = op("Sub", "l1_penalty", op("Reshape", op("Mul", pull, target), "vector"))
+    H = op("Add", H, op("Mul", op("Mul", ridge, "identity"), visible))
     diagonal = op("ReduceMax", op("Mul", H, "identity"), axes=[1], keepdims=1)
     diagonal = op("Max", diagonal, "smallest")
     scale = op("Div", "one", op("Sqrt", diagonal))
@@ -146,9 +146,9 @@ def _gaps_branch(
     double_step = op("Sub", op("Mul", "relaxation_rest", "identity"), op("Mul", "two", minus_step))
     z = v = op("Reshape", start, "vector")
     for steps in stretches(graph.steps_with_gaps):
-        distance = op("Add", known, op("Mul", op("MatMul", z, basis), "gram_scale"))
-        price = op("Mul", share, op("Add", first_price, op("Mul", z, ridge)))
-        gradient = op("Add", op("MatMul", op("Mul", distance, seen), "rows"), price)
+        distance = op("Add", seen_offset, op("Mul", op("MatMul", z, basis), "gram_scale"))
+        penalty = op("Mul", visible, op("Add", first_penalty, op("Mul", z, ridge)))
+        gradient = op("Add", op("MatMul", op("Mul", distance, seen), "rows"), penalty)
         back = op("Add", op("MatMul", z, minus_step), op("Mul", z, "relaxation_less_one"))
         constant = op("Add", op("MatMul", gradient, inverse), back)
         for _ in range(steps):

@@ -1,4 +1,4 @@
-"""A UV landmark detector's bank of filters as ONNX: pictures to landmarks, in a fixed number of steps."""
+"""A UV landmark detector's bank of filters as ONNX: images to landmarks, in a fixed number of steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.exported_model import exported_model
 from torchface.rendering.gaussian_blur import unsharp
 
-ROUNDS = 5
+MEAN_SHIFT_STEPS = 5
 _PARITY = {"pixels": 0.5, "confidence": 0.02}
 _UNITS = {"pixels": "pixels", "confidence": "of 1"}
 
@@ -44,7 +44,7 @@ class LandmarkBank(nn.Module):
     places: Tensor
     prior_mean: Tensor
     axes: Tensor
-    spread: Tensor
+    variances: Tensor
     noise: Tensor
 
     def __init__(self, detector: UVLandmarkDetector) -> None:
@@ -64,8 +64,8 @@ class LandmarkBank(nn.Module):
         line = hog.positions(torch.arange(self.side)).float()
         places = torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2)
         offset = places[None] - detector.prior_mean[:, None]
-        spread, axes = torch.linalg.eigh(detector.prior_covariance.double())
-        squared = ((offset.double() @ axes) ** 2 / spread[:, None]).sum(-1)
+        variances, axes = torch.linalg.eigh(detector.prior_covariance.double())
+        squared = ((offset.double() @ axes) ** 2 / variances[:, None]).sum(-1)
         self.register_buffer("near", (torch.exp(-0.5 * squared) * (squared < FARTHEST**2)).float())
         reach = int(settings.bandwidth // hog.stride)
         across = torch.arange(-reach, reach + 1) * float(hog.stride)
@@ -74,7 +74,7 @@ class LandmarkBank(nn.Module):
         self.register_buffer("places", places)
         self.register_buffer("prior_mean", detector.prior_mean)
         self.register_buffer("axes", axes.float())
-        self.register_buffer("spread", spread.float())
+        self.register_buffer("variances", variances.float())
         self.register_buffer("noise", detector.noise.view(count, 1))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,20 +98,20 @@ class LandmarkBank(nn.Module):
         square = votes.view(-1, 1, self.side, self.side)
         density = conv2d(pad(square, (self.disc.shape[-1] // 2,) * 4), self.disc).view_as(votes)
         centre = self.places[(density * self.near).argmax(-1)]
-        for _ in range(ROUNDS):
+        for _ in range(MEAN_SHIFT_STEPS):
             inside = self._inside(votes, centre)
             centre = (inside @ self.places) / inside.sum(-1, keepdim=True).clamp(min=1)
         size = self._inside(votes, centre).sum(-1, keepdim=True)
-        believed = (density * self.near).amax(-1, keepdim=True) > 0
-        share = size / (self.images * settings.matches) * believed.float()
+        near_prior = (density * self.near).amax(-1, keepdim=True) > 0
+        fraction = size / (self.images * settings.matches) * near_prior.float()
         along = ((centre - self.prior_mean)[..., None, :] @ self.axes)[..., 0, :]
-        kept = along * (self.spread * share / (self.spread * share + self.noise))
-        return self.prior_mean + (self.axes @ kept[..., None])[..., 0], share[..., 0]
+        kept = along * (self.variances * fraction / (self.variances * fraction + self.noise))
+        return self.prior_mean + (self.axes @ kept[..., None])[..., 0], fraction[..., 0]
 
     def _inside(self, votes: Tensor, centre: Tensor) -> Tensor:
         """The votes (B,L,P) within a bandwidth of centres (B,L,2)."""
-        away = (self.places - centre[..., None, :]).square().sum(-1)
-        return votes * (away <= self.settings.bandwidth**2).float()
+        squared_distance = (self.places - centre[..., None, :]).square().sum(-1)
+        return votes * (squared_distance <= self.settings.bandwidth**2).float()
 
     def _more_likely_good(self, scores: Tensor) -> Tensor:
         clipped = torch.minimum(scores, self.good[None, ..., :1])

@@ -11,7 +11,14 @@ from torch.func import functional_call
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.capture.video.face_points import LANDMARKS
 from torchface.capture.video.reprojection import HeadState
-from torchface.capture.video.solver_components import LOOSE_PLACE, LOOSE_STEP, LOOSE_TURN, LOOSE_WEIGHT, SHIFT, TURN
+from torchface.capture.video.solver_components import (
+    DEFAULT_WEIGHT_STEP,
+    INITIAL_ROTATION,
+    INITIAL_TRANSLATION,
+    INITIAL_WEIGHT,
+    ROTATION_STEP,
+    TRANSLATION_STEP,
+)
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.onnx.gauss_newton_step import GaussNewtonStep
@@ -62,13 +69,13 @@ class VideoGraph(nn.Module):
         self.dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = copy.deepcopy(solver.dynamics)
         self.window = 1 if self.dynamics is None else self.dynamics.window
         self.step = GaussNewtonStep(solver)
-        deviations = [LOOSE_WEIGHT] * count + [LOOSE_TURN] * 3 + [LOOSE_PLACE] * 3
+        deviations = [INITIAL_WEIGHT] * count + [INITIAL_ROTATION] * 3 + [INITIAL_TRANSLATION] * 3
         for name, value in {
             "landmark_weights": solver.landmark_weights.double(),
             "to_rays": torch.linalg.inv(solver.intrinsics.double()).T.contiguous(),
-            "initial_information": solver.loose.double().diag(),
+            "initial_information": solver.initial_information.double().diag(),
             "initial_covariance": torch.tensor(deviations, dtype=torch.float64).square().diag(),
-            "motion_variance": torch.tensor([TURN**2] * 3 + [SHIFT**2] * 3, dtype=torch.float64),
+            "motion_variance": torch.tensor([ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3, dtype=torch.float64),
         }.items():
             self.register_buffer(name, value)
 
@@ -190,7 +197,7 @@ class VideoGraph(nn.Module):
         filled = torch.where(gaps, 0.0, window)
         ahead, variance = self.dynamics(filled.to(self.dynamics.center.dtype)[None])
         steps = torch.where(full, ahead[0].double() - filled[-1], 0.0)
-        variance = torch.where(full, variance[0].double() / self.settings.dynamics_strength, LOOSE_STEP**2)
+        variance = torch.where(full, variance[0].double() / self.settings.dynamics_strength, DEFAULT_WEIGHT_STEP**2)
         mean = torch.where(first, 0.0, state["mean"] + nn.functional.pad(steps, (0, 6)))[None]
         noise = torch.cat([variance, self.motion_variance]) * self.step.identity
         covariance = torch.where(first, self.initial_covariance, state["covariance"] + noise)

@@ -29,13 +29,13 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Track
 
 FRAMES = 100
-_MOST_FRAMES = 300  # of a video that it is checked with
-_FEWEST = 6
+_MAX_FRAMES = 300  # of a video that it is checked with
+_MIN_LANDMARKS = 6
 _PARITY = 1e-4
 _UNSEEN = 0.05  # of the landmarks it is checked with
-_TREMBLE = 1.0  # pixels: what is left of models' errors from frame to frame, most of which stay
+_MAX_NOISE = 1.0  # pixels: what is left of models' errors from frame to frame, most of which stay
 _UPRIGHT = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-_PERIOD, _ACTIVE = 60.0, 0.3  # frames of a gesture, share of shapes that take part
+_PERIOD, _ACTIVE = 60.0, 0.3  # frames of a gesture, proportion of shapes that take part
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class VideoReport:
         gap, largest_gap: root mean square and largest difference of a weight to ``VideoSolver``, the graph leaning on
             its own states alone.
         error, exact_error: root mean square of the graph's weights, and of the exact solve's, to the true ones of a
-            made-up film; None of a video.
+            synthetic video; None of a video.
         milliseconds: of processor time a frame, by one thread of ONNX Runtime here.
     """
 
@@ -103,19 +103,19 @@ def export_video_solver(
     The graph takes ``landmarks`` (68,2), pixels, NaN where not seen, ``confidence`` (68,), and the state of the frame
     before, ``previous_`` and its name, all NaN for the first frame; it gives ``weights`` (N,), ``rotation`` (3,3),
     ``translation`` (3,), millimetres, rig to camera, and the rest of the state; see ``VideoGraph``. Pixels are of
-    pictures without distortion. The metadata holds ``shape_names``, ``state``, ``intrinsics``, ``distortion``,
+    images without distortion. The metadata holds ``shape_names``, ``state``, ``intrinsics``, ``distortion``,
     ``width``, ``height`` (JSON), ``units``, ``version`` and ``settings``, the fields of ``VideoSettings``.
 
     Args:
         rig: N shapes, with its 68 landmarks annotated.
-        camera: whose pictures the landmarks are found in.
+        camera: whose images the landmarks are found in.
         path: the file to write; it appears only when it is complete and checked.
         prior: which weights faces have.
         dynamics: how weights go on.
         settings: what the terms weigh; those of ``torchface track`` if absent.
         facts: further metadata, such as licence and data.
         video: landmarks that ``torchface track`` found in a video of this camera, pixels; the check runs on them,
-            without the lens' distortion and filtered as ``track`` does. A made-up film if absent.
+            without the lens' distortion and filtered as ``track`` does. A synthetic video if absent.
 
     Raises:
         NameMismatchError: a prior was learned for other shapes than the rig has.
@@ -127,12 +127,12 @@ def export_video_solver(
         raise ShapeError("rig: found no landmarks, expected the 68 of iBUG's order; see torchface annotate")
     settings = settings or VideoSettings.of_found_landmarks(dynamics is not None)
     solver = VideoSolver(rig, None, camera.intrinsics, prior, dynamics, settings)
-    film = None if video is None else film_of(video, camera)
-    return write_video_solver(solver, path, _camera_facts(camera) | dict(facts or {}), film)
+    frames_to_check = None if video is None else check_frames(video, camera)
+    return write_video_solver(solver, path, _camera_facts(camera) | dict(facts or {}), frames_to_check)
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class CheckFrames:
     """What a graph is checked with.
 
     Args:
@@ -146,11 +146,11 @@ class Film:
     weights: Tensor | None = None
 
 
-def film_of(video: Track, camera: CameraCalibration) -> Film:
+def check_frames(video: Track, camera: CameraCalibration) -> CheckFrames:
     """The first frames of a video from where a face is seen, as ``torchface track`` solves them.
 
     Args:
-        video: landmarks as found, (T,68,2), pixels of the camera's pictures.
+        video: landmarks as found, (T,68,2), pixels of the camera's images.
         camera: whose lens bends them.
 
     Raises:
@@ -160,24 +160,27 @@ def film_of(video: Track, camera: CameraCalibration) -> Film:
     if video.values.shape[1:] != (LANDMARKS, 2):
         raise ShapeError(f"video: found landmarks {tuple(video.values.shape)}, expected (T,{LANDMARKS},2)")
     landmarks = filter_landmarks(undistort(video.values.double(), camera)).float()
-    shown = (torch.isfinite(landmarks).all(2).sum(1) >= _FEWEST).nonzero()[:, 0]
+    shown = (torch.isfinite(landmarks).all(2).sum(1) >= _MIN_LANDMARKS).nonzero()[:, 0]
     if not len(shown):
         raise ValueRangeError(f"video: found no face in {len(landmarks)} frames, expected one to check the graph with")
-    kept = slice(int(shown[0]), int(shown[0]) + _MOST_FRAMES)
-    trust = torch.ones(landmarks.shape[:2]) if video.confidence is None else video.confidence.float()
-    return Film(landmarks[kept], trust[kept])
+    kept = slice(int(shown[0]), int(shown[0]) + _MAX_FRAMES)
+    confidence = torch.ones(landmarks.shape[:2]) if video.confidence is None else video.confidence.float()
+    return CheckFrames(landmarks[kept], confidence[kept])
 
 
 def write_video_solver(
-    solver: VideoSolver, path: str | Path, facts: Mapping[str, object] | None = None, film: Film | None = None
+    solver: VideoSolver,
+    path: str | Path,
+    facts: Mapping[str, object] | None = None,
+    frames_to_check: CheckFrames | None = None,
 ) -> VideoReport:
     """Writes a solver with its settings as ONNX, and checks it; see :func:`export_video_solver`."""
     solver = copy.deepcopy(solver).cpu()
     graph = VideoGraph(solver).eval()
-    if film is None:
-        weights, landmarks = filmed(solver, FRAMES)
-        film = Film(landmarks, torch.ones(landmarks.shape[:2]), weights)
-    landmarks = film.landmarks
+    if frames_to_check is None:
+        weights, landmarks = synthetic_landmarks(solver, FRAMES)
+        frames_to_check = CheckFrames(landmarks, torch.ones(landmarks.shape[:2]), weights)
+    landmarks = frames_to_check.landmarks
     names = ["landmarks", "confidence", *(f"previous_{name}" for name in graph.state)]
     model = exported_model(
         graph,
@@ -202,14 +205,14 @@ def write_video_solver(
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    run = _run(graph, session, names, film)
+    run = _run(graph, session, names, frames_to_check)
     if not run.parity <= _PARITY:
         raise ValueRangeError(
             f"{path}: ONNX Runtime's weights differ from PyTorch's by {run.parity:.2g}, expected {_PARITY:.2g} at most"
         )
     with torch.no_grad():
-        exact = solver(landmarks, confidence=film.confidence).weights
-    true = film.weights
+        exact = solver(landmarks, confidence=frames_to_check.confidence).weights
+    true = frames_to_check.weights
     apart = run.weights - exact
     write_file(path, content)
     return VideoReport(
@@ -228,20 +231,22 @@ def write_video_solver(
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A film through ONNX Runtime, (T,N); how far from PyTorch; processor time a frame."""
+    """Frames through ONNX Runtime, (T,N); how far from PyTorch; processor time a frame."""
 
     weights: Tensor
     parity: float
     milliseconds: float
 
 
-def _run(graph: VideoGraph, session: onnxruntime.InferenceSession, names: list[str], film: Film) -> _Run:
+def _run(
+    graph: VideoGraph, session: onnxruntime.InferenceSession, names: list[str], frames_to_check: CheckFrames
+) -> _Run:
     state = graph.start()
     weights, parity, spent = [], 0.0, 0.0
-    for marks, trust in zip(
-        film.landmarks, film.confidence, strict=True
+    for marks, confidence in zip(
+        frames_to_check.landmarks, frames_to_check.confidence, strict=True
     ):  # each frame takes the state of the one before
-        inputs = (marks, trust, *state)
+        inputs = (marks, confidence, *state)
         given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
         begun = time.process_time()
         found = session.run(list(graph.outputs), given)
@@ -254,14 +259,14 @@ def _run(graph: VideoGraph, session: onnxruntime.InferenceSession, names: list[s
         parity = max(parity, gap if gap == gap else float("inf"))
         weights.append(outputs["weights"])
         state = tuple(outputs[name] for name in graph.state)
-    return _Run(torch.stack(weights), parity, 1000 * spent / len(film.landmarks))
+    return _Run(torch.stack(weights), parity, 1000 * spent / len(frames_to_check.landmarks))
 
 
-def filmed(solver: VideoSolver, frames: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A made-up performance of a solver's face before its camera: weights (T,N), and landmarks (T,68,2), float32.
+def synthetic_landmarks(solver: VideoSolver, frames: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A synthetic performance of a solver's face before its camera: weights (T,N), and landmarks (T,68,2), float32.
 
-    Some shapes come and go, the head turns and shifts; landmarks have the solver's noise, a pixel at most, and some are
-    not seen.
+    Some shapes come and go, the head rotates and moves; landmarks have the solver's noise, at most a pixel, and some
+    are not seen.
     """
     generator = torch.Generator().manual_seed(seed)
     shapes, points = len(solver.names), solver.points
@@ -269,19 +274,19 @@ def filmed(solver: VideoSolver, frames: int, seed: int = 0) -> tuple[Tensor, Ten
     phase = torch.rand(4, shapes, generator=generator).double()
     wave = torch.sin(2 * torch.pi * (at / (_PERIOD * (0.7 + phase[0])) + phase[1]))
     weights = wave.clamp(min=0) * phase[2] * (phase[3] < _ACTIVE)
-    turn = torch.tensor([0.1, 0.3, 0.06]).double() * torch.sin(at / _PERIOD * torch.tensor([3.0, 4.0, 2.0]))
-    rotation = torch.tensor(_UPRIGHT).double() @ rotation_matrix(turn)
+    angles = torch.tensor([0.1, 0.3, 0.06]).double() * torch.sin(at / _PERIOD * torch.tensor([3.0, 4.0, 2.0]))
+    rotation = torch.tensor(_UPRIGHT).double() @ rotation_matrix(angles)
     rest = points.rest[:LANDMARKS]
     tall = float(rest[:, 1].max() - rest[:, 1].min())
     K = solver.intrinsics.double()
-    # The landmarks fill half the picture, whose height is about twice the centre's.
+    # The landmarks fill half the image, whose height is about twice the centre's.
     centre = torch.tensor([0.0, 0.0, float(K[1, 1]) * tall / max(float(K[1, 2]), 1.0)]).double()
     translation = centre + 0.1 * tall * torch.sin(at / 25 + torch.arange(3)) - rotation @ rest.mean(0)
     rows = points.chosen(weights, rotation, translation, K)
     placed = points.at(weights)[torch.arange(frames)[:, None], rows]
     image = (placed @ rotation.mT + translation[:, None]) @ K.T
     pixels = image[..., :2] / image[..., 2:]
-    noise = solver.noise(rotation, translation).clamp(max=_TREMBLE)[:, None, None]
+    noise = solver.noise(rotation, translation).clamp(max=_MAX_NOISE)[:, None, None]
     pixels = pixels + noise * torch.randn(pixels.shape, generator=generator).double()
     unseen = torch.rand(pixels.shape[:2], generator=generator) < _UNSEEN
     return weights.float(), torch.where(unseen[..., None], torch.nan, pixels).float()

@@ -34,7 +34,7 @@ from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix
-from torchface.onnx.video_graph_export import filmed
+from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
 from torchface.temporal import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 
@@ -252,7 +252,7 @@ def test_the_solver_and_all_it_holds(device: str) -> None:
         Walk(),  # type: ignore[arg-type]
         VideoSettings(relative_noise=0.01),
     )
-    landmarks = filmed(solver, 4)[1].double()
+    landmarks = synthetic_landmarks(solver, 4)[1].double()
     landmarks[2] = torch.nan
     expected = [solver(landmarks), solve_whole_take(solver, landmarks)]
     solver.to(device)

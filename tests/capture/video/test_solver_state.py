@@ -13,7 +13,7 @@ from torchface import zoo
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.onnx.video_graph_export import filmed
+from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
@@ -36,7 +36,7 @@ def other(rig: BlendshapeRig) -> BlendshapeRig:
 
 @pytest.fixture(scope="module")
 def takes(rig: BlendshapeRig) -> list[Tensor]:
-    return [filmed(VideoSolver(rig, None, K), 60, seed)[0] for seed in (1, 2)]
+    return [synthetic_landmarks(VideoSolver(rig, None, K), 60, seed)[0] for seed in (1, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def solver(rig: BlendshapeRig, takes: list[Tensor]) -> VideoSolver:
 
 @pytest.fixture(scope="module")
 def landmarks(solver: VideoSolver) -> Tensor:
-    return filmed(solver, 6)[1]
+    return synthetic_landmarks(solver, 6)[1]
 
 
 def weights(solver: VideoSolver, landmarks: Tensor) -> Tensor:

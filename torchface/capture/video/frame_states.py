@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchface.capture.video.reprojection import HeadState
-from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.capture.video.state_estimate import Expectation, StateEstimate
 from torchface.errors import ValueRangeError
 
 
@@ -37,13 +37,13 @@ class VideoState:
 
     Args:
         head: weights (1,N) and pose of the frame; None before the first.
-        belief: what landmarks and dynamics told until now; None before the first, and without a dynamics prior.
+        estimate: from landmarks and dynamics until now; None before the first, and without a dynamics prior.
         window: weights of the latest frames, the newest last, (1,J,N) with J growing up to the dynamics prior's window.
         solved: whether the frame showed at least six landmarks.
     """
 
     head: HeadState | None
-    belief: Belief | None
+    estimate: StateEstimate | None
     window: Tensor
     solved: bool = False
 

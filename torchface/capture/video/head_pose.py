@@ -113,7 +113,7 @@ class PoseTracker:
         Raises:
             ShapeError: not 68 landmarks.
         """
-        # Operations are many and small; what tensors keep for derivatives is a fifth of their price.
+        # Operations are many and small; what tensors keep for derivatives is a fifth of their cost.
         with torch.inference_mode():
             self._filter.to(landmarks.device).predict()
             before = self._filter.likeliest()
@@ -215,7 +215,7 @@ def track_pose(
         intrinsics: K, (3,3).
         confidence: from 0, (T,68); equal if absent.
         settings: see :class:`PoseSettings`.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         ``HeadPoses(rotation (T,3,3), translation (T,3), errors (T,), found (T,))``; gaps up to ``longest_gap`` frames

@@ -9,7 +9,7 @@ from torchface.temporal import AdaptiveFilter, AdaptiveSettings, adaptive_filter
 
 # Pixels: landmarks of a face some 100 to 600 pixels high. Lids and lips move more abruptly than a head does.
 LANDMARK_SETTINGS = AdaptiveSettings(measurement=(0.2, 0.6, 1.5, 4.0), jerk=(0.003, 0.01, 0.033, 0.11, 0.36, 1.2, 4.0))
-"""What landmarks are filtered with unless told otherwise."""
+"""What landmarks are filtered with by default."""
 
 
 class LandmarkFilter:

@@ -19,7 +19,7 @@ _STARTS, _KEPT, _APART = 100, 3, 30.0  # directions tried, refined, and degrees 
 _FEW = 700  # vertices that are enough to tell a good direction from a bad one
 _USUAL = 1000.0  # millimetres at which lamps are looked for first
 _NEAREST = 250.0  # millimetres; nearer, a lamp would be in the picture, and soft light would pass for such a one
-_MOST_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
+_MAX_GLOSS = 0.3  # beside the lamp's strength; more would be a mirror, and could pass for light from the front
 _SHININESS = 16.0  # Blinn's exponent; skin under a soft lamp
 _NARROWING = (1.0, 0.5)
 _ROUNDS, _ROUNDS_NEAR, _STEPS, _DONE = 10, 3, 20, 1e-4
@@ -73,7 +73,7 @@ class LampFit:
     @property
     def gloss(self) -> Tensor:
         """Strength of its highlights, (3,)."""
-        return _MOST_GLOSS * self.factors[2]
+        return _MAX_GLOSS * self.factors[2]
 
 
 def find_lamp(seen: SeenSkin) -> LampFit:
@@ -157,7 +157,7 @@ def _with_factors(seen: SeenSkin, lamp: Lamp, width: float | None = None, factor
     lit = seen.lit_by(lamp.position(seen.centre)).double()
     reflected = _reflected(seen, lamp)
     diffuse, gloss = seen.albedo * (lit * reflected.falling)[:, None], (lit * reflected.gloss)[:, None].expand(-1, 3)
-    columns = torch.stack([seen.albedo, diffuse, diffuse + _MOST_GLOSS * gloss])
+    columns = torch.stack([seen.albedo, diffuse, diffuse + _MAX_GLOSS * gloss])
     coded = to_srgb(seen.colors)
     if factors is None:
         factors = _factors(columns, seen.colors, seen.area[:, None] * seen.valid / _slope(seen.colors).square())

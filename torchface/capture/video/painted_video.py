@@ -44,7 +44,7 @@ def overlay_video(
         path: of the video; ``.avi`` and ``.mkv`` are lossless.
         fps: frames a second.
         calibration: of a lens that bends the frames.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: meshes, cameras and frames differ in number or size.

@@ -58,7 +58,7 @@ class PoseFilterSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Belief:
+class _Estimates:
     """What a frame is believed to be, by each model: poses, velocities and accelerations, and how certain they are.
 
     Args:
@@ -105,7 +105,7 @@ class PoseFilter:
             -1, 18, 18
         )
         self._steps = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, settings.fading]], dtype=torch.float64)
-        self.belief: _Belief | None = None
+        self.estimate: _Estimates | None = None
         self.began = False
         """Whether the last frame began anew, whatever was before."""
         self._unseen = self._odd = 0
@@ -115,18 +115,18 @@ class PoseFilter:
         if self._steps.device != device:
             for name in ("scores", "_variance", "_drift", "_steps"):
                 setattr(self, name, getattr(self, name).to(device))
-            if self.belief is not None:
-                self.belief = _Belief(*(part.to(device) for part in vars(self.belief).values()))
+            if self.estimate is not None:
+                self.estimate = _Estimates(*(part.to(device) for part in vars(self.estimate).values()))
         return self
 
     def predict(self) -> None:
         """Goes one frame on."""
-        if self.belief is None:
+        if self.estimate is None:
             return
-        b = self.belief
+        b = self.estimate
         velocity, acceleration = b.rate.unbind(1)
         step = velocity + 0.5 * acceleration
-        self.belief = _Belief(
+        self.estimate = _Estimates(
             rotation_matrix(step[:, :3]) @ b.rotation,
             b.place + step[:, 3:],
             torch.stack([velocity + acceleration, self.settings.fading * acceleration], dim=1),
@@ -144,10 +144,10 @@ class PoseFilter:
             self._missed()
             return
         noise = self._variance[:, None, None] * covariance
-        if self.belief is None:
+        if self.estimate is None:
             self._begin(rotation, translation, noise)
             return
-        b = self.belief
+        b = self.estimate
         off = torch.cat([rotation_vector(rotation @ b.rotation.transpose(1, 2)), translation - b.place], dim=1)
         spread = torch.linalg.cholesky(_symmetric(b.covariance[:, :6, :6] + noise))
         whitened = torch.linalg.solve_triangular(spread, off[..., None], upper=False)
@@ -165,7 +165,7 @@ class PoseFilter:
         # The gain is W L⁻¹ with S = L Lᵀ, and what is learned of the covariance W Wᵀ: symmetric whatever is rounded.
         learned = torch.linalg.solve_triangular(spread, b.covariance[:, :6], upper=False).transpose(1, 2)
         change = (learned @ whitened)[..., 0]
-        self.belief = _Belief(
+        self.estimate = _Estimates(
             _orthonormal(rotation_matrix(change[:, :3]) @ b.rotation),
             b.place + change[:, 3:6],
             b.rate + change[:, 6:].reshape(-1, 2, 6),
@@ -174,19 +174,19 @@ class PoseFilter:
 
     def pose(self) -> tuple[Tensor, Tensor]:
         """Rotation (3,3) and translation (3,) as all models together have it; NaN where the head is lost."""
-        if self.belief is None:
+        if self.estimate is None:
             return self._steps.new_full((3, 3), torch.nan), self._steps.new_full((3,), torch.nan)
         share = self._shares()
-        best = self.belief.rotation[int(share.argmax())]
-        turns = rotation_vector(self.belief.rotation @ best.T)
-        return rotation_matrix(share @ turns) @ best, share @ self.belief.place
+        best = self.estimate.rotation[int(share.argmax())]
+        turns = rotation_vector(self.estimate.rotation @ best.T)
+        return rotation_matrix(share @ turns) @ best, share @ self.estimate.place
 
     def likeliest(self) -> tuple[Tensor, Tensor]:
         """Rotation (3,3) and translation (3,) of the model that has foretold best; NaN where the head is lost."""
-        if self.belief is None:
+        if self.estimate is None:
             return self.pose()
         best = int(self.scores.argmax())
-        return self.belief.rotation[best], self.belief.place[best]
+        return self.estimate.rotation[best], self.estimate.place[best]
 
     def _shares(self) -> Tensor:
         """How much each model counts, (M,)."""
@@ -207,7 +207,7 @@ class PoseFilter:
         covariance[:, range(6, 18), range(6, 18)] = known.repeat_interleave(3, dim=1).flatten().square()
         rotation = _orthonormal(rotation.double()).expand(models, 3, 3)
         rate = noise.new_zeros(models, 2, 6)
-        self.belief = _Belief(rotation, translation.double().expand(models, 3), rate, covariance)
+        self.estimate = _Estimates(rotation, translation.double().expand(models, 3), rate, covariance)
         self._unseen = self._odd = 0
         self.began = True
         if not len(self.scores):
@@ -216,7 +216,7 @@ class PoseFilter:
     def _missed(self) -> None:
         self._unseen += 1
         if self._unseen > self.settings.longest_gap:
-            self.belief = None
+            self.estimate = None
 
 
 def _orthonormal(rotations: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ def smooth_rigid_motion(
     for frame in zip(rotation, translation, covariance, strict=True):  # a frame needs the one before
         running.predict()
         running.correct(*frame)
-    if running.belief is None:
+    if running.estimate is None:
         return torch.full_like(rotation, torch.nan), torch.full_like(translation, torch.nan)
     combinations = list(itertools.product(settings.noise, settings.turning, settings.moving))
     noise, turning, moving = combinations[int(running.scores.argmax())]
@@ -258,9 +258,9 @@ def smooth_rigid_motion(
     ahead, here, began = [], [], []
     for frame in zip(rotation, translation, covariance, strict=True):
         running.predict()
-        ahead.append(running.belief)
+        ahead.append(running.estimate)
         running.correct(*frame)
-        here.append(running.belief)
+        here.append(running.estimate)
         began.append(running.began)
     kept = here[-1]
     smoothed = [kept]
@@ -268,17 +268,17 @@ def smooth_rigid_motion(
         kept = here[t] if began[t + 1] else _smoothed(here[t], ahead[t + 1], kept, running)
         smoothed.append(kept)
     turned, moved = rotation.double().clone(), translation.double().clone()
-    for t, belief in enumerate(reversed(smoothed)):
-        turned[t] = torch.nan if belief is None else belief.rotation[0]
-        moved[t] = torch.nan if belief is None else belief.place[0]
+    for t, estimate in enumerate(reversed(smoothed)):
+        turned[t] = torch.nan if estimate is None else estimate.rotation[0]
+        moved[t] = torch.nan if estimate is None else estimate.place[0]
     lost = _long_gaps(torch.isfinite(translation).all(1), settings.longest_gap)
     turned[lost], moved[lost] = torch.nan, torch.nan
     return turned, moved
 
 
 def _smoothed(
-    here: _Belief | None, ahead: _Belief | None, after: _Belief | None, running: PoseFilter
-) -> _Belief | None:
+    here: _Estimates | None, ahead: _Estimates | None, after: _Estimates | None, running: PoseFilter
+) -> _Estimates | None:
     """What a frame was, now that the one after is known; ``ahead`` is what was foretold of that one."""
     if here is None or ahead is None or after is None:
         return here
@@ -292,7 +292,7 @@ def _smoothed(
         dim=1,
     )
     change = (gain @ off[..., None])[..., 0]
-    return _Belief(
+    return _Estimates(
         _orthonormal(rotation_matrix(change[:, :3]) @ here.rotation),
         here.place + change[:, 3:6],
         here.rate + change[:, 6:].reshape(-1, 2, 6),

@@ -17,12 +17,12 @@ from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig
 
 CONTOUR_WEIGHT = 0.5
-TURN, SHIFT = 0.02, 4.0
+ROTATION_STEP, TRANSLATION_STEP = 0.02, 4.0
 """How far a head moves from frame to frame: standard deviations in radians and millimetres."""
-LOOSE_TURN, LOOSE_PLACE = 0.5, 500.0
-"""What is known of a pose before any landmark is seen: turns to half a radian, places to half a metre."""
-LOOSE_WEIGHT, LOOSE_STEP = 1.0, 0.1
-"""Of a weight before anything is seen, and from frame to frame until the dynamics prior's window is full."""
+INITIAL_ROTATION, INITIAL_TRANSLATION = 0.5, 500.0
+"""Standard deviations of a pose before any landmark is seen, radians and millimetres."""
+INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
+"""Standard deviations of a weight before anything is seen, and of its steps until the dynamics window is full."""
 
 _POINTS = ("rest", "basis", "rows", "valid", "side")
 _PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
@@ -30,7 +30,7 @@ _DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
     "dynamics_prior": DynamicsPrior,
     "adapted_dynamics_prior": AdaptedDynamicsPrior,
 }
-_MOST_SHAPES, _MOST_POINTS = 2**12, 2**20
+_MAX_SHAPES, _MAX_POINTS = 2**12, 2**20
 
 
 class VideoSolverParts(nn.Module):
@@ -46,8 +46,8 @@ class VideoSolverParts(nn.Module):
     lower: Tensor
     upper: Tensor
     motion_variance: Tensor
-    loose: Tensor
-    price: Tensor
+    initial_information: Tensor
+    l1_penalty: Tensor
     ridge: Tensor
 
     def __init__(
@@ -97,13 +97,13 @@ class VideoSolverParts(nn.Module):
         device = torch.device("cpu") if like.is_meta else like.device
         count = len(names)
         # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
-        weight = 0.0 if dynamics is None else LOOSE_WEIGHT**-2
+        weight = 0.0 if dynamics is None else INITIAL_WEIGHT**-2
         constants = {
             "lower": [0.0] * count + [-torch.inf] * 6,
             "upper": [1.0] * count + [torch.inf] * 6,
-            "motion_variance": [TURN**2] * 3 + [SHIFT**2] * 3,
-            "loose": [weight] * count + [LOOSE_TURN**-2] * 3 + [LOOSE_PLACE**-2] * 3,
-            "price": [settings.sparsity] * count + [0.0] * 6,
+            "motion_variance": [ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3,
+            "initial_information": [weight] * count + [INITIAL_ROTATION**-2] * 3 + [INITIAL_TRANSLATION**-2] * 3,
+            "l1_penalty": [settings.sparsity] * count + [0.0] * 6,
             "ridge": [2 * settings.ridge] * count + [0.0] * 6,
         }
         for name, numbers in constants.items():
@@ -150,10 +150,10 @@ class VideoSolverParts(nn.Module):
             raise NameMismatchError(f"names: found {names!r:.80}, expected a list of distinct names")
         values = Value("video solver", "", config)
         count, curve = values["points"].whole(1), values["curve"].whole(1)
-        if not 0 < len(names) <= _MOST_SHAPES or not LANDMARKS <= count <= _MOST_POINTS or curve > count:
+        if not 0 < len(names) <= _MAX_SHAPES or not LANDMARKS <= count <= _MAX_POINTS or curve > count:
             raise FileFormatError(
                 f"video solver: found {len(names)} shapes, {count} points and curves of {curve}, expected 1 to "
-                f"{_MOST_SHAPES} shapes, {LANDMARKS} to {_MOST_POINTS} points and no longer curves"
+                f"{_MAX_SHAPES} shapes, {LANDMARKS} to {_MAX_POINTS} points and no longer curves"
             )
         settings = values["settings"].plain_table()
         prior, dynamics = _made(config.get("prior"), _PRIORS), _made(config.get("dynamics"), _DYNAMICS)

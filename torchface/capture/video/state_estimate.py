@@ -1,4 +1,4 @@
-"""What is known of weights and head pose from one frame to the next, with how surely."""
+"""Estimates of weights and head pose, with their covariance, from one frame to the next."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchface.capture.video.reprojection import HeadState
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class StateEstimate:
     r"""A Gaussian over B faces' weights and poses, from landmarks and dynamics alone.
 
     The prior of which weights faces have and the weights' bounds are left out: they hold in every frame anew, and were
@@ -20,13 +20,13 @@ class Belief:
 
     Args:
         mean: weights (B,N) and pose.
-        covariance: of weights, turn and shift in the camera's frame, (B,N+6,N+6).
+        covariance: of weights, rotation and translation in the camera's frame, (B,N+6,N+6).
     """
 
     mean: HeadState
     covariance: Tensor
 
-    def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> Belief:
+    def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> StateEstimate:
         """One frame on.
 
         Args:
@@ -36,7 +36,7 @@ class Belief:
         """
         noise = torch.cat([variance, motion_variance.expand(len(variance), 6)], dim=1)
         mean = HeadState(self.mean.weights + steps, self.mean.rotation, self.mean.translation)
-        return Belief(mean, self.covariance + torch.diag_embed(noise))
+        return StateEstimate(mean, self.covariance + torch.diag_embed(noise))
 
     def expectation(self) -> Expectation:
         """As an energy."""
@@ -49,13 +49,13 @@ class Expectation:
 
     Args:
         mean: m, weights (B,N) and pose.
-        information: :math:`\Lambda`, of weights, turn and shift, (B,N+6,N+6).
+        information: :math:`\Lambda`, of weights, rotation and translation, (B,N+6,N+6).
     """
 
     mean: HeadState
     information: Tensor
 
-    def away(self, head: HeadState) -> Tensor:
+    def residual(self, head: HeadState) -> Tensor:
         """From the mean to a state, (B,N+6)."""
         motion = head.motion_from(self.mean.rotation, self.mean.translation)
         return torch.cat([head.weights - self.mean.weights, motion], dim=1)
@@ -66,7 +66,7 @@ class Expectation:
         beyond = torch.cat([-self.mean.weights, motion], dim=1)
         return Quadratic(self.information, (self.information @ beyond[..., None])[..., 0])
 
-    def updated(self, head: HeadState, seen: Quadratic) -> Belief:
+    def updated(self, head: HeadState, seen: Quadratic) -> StateEstimate:
         """After a frame whose landmarks were linearised at a state.
 
         Args:
@@ -79,4 +79,4 @@ class Expectation:
         both = seen + self.quadratic(head)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(both.H))
         least = -(covariance @ both.f[..., None])[..., 0]
-        return Belief(head.moved(least[:, :shapes], least[:, shapes:]), covariance)
+        return StateEstimate(head.moved(least[:, :shapes], least[:, shapes:]), covariance)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.capture.video.face_points import LANDMARKS
 from torchface.capture.video.frame_states import FrameTerms, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState
-from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.capture.video.state_estimate import Expectation, StateEstimate
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.errors import ValueRangeError
 
@@ -65,48 +65,49 @@ def interpolated(weights: Tensor, solved: Tensor) -> Tensor:
     after = torch.searchsorted(known, at).clamp(max=len(known) - 1)
     before = (torch.searchsorted(known, at, right=True) - 1).clamp(min=0)
     left, right = known[before], known[after]
-    share = ((at - left) / (right - left).clamp(min=1)).clamp(0, 1).to(weights)[:, None]
-    return torch.lerp(weights[left], weights[right], share)
+    fraction = ((at - left) / (right - left).clamp(min=1)).clamp(0, 1).to(weights)[:, None]
+    return torch.lerp(weights[left], weights[right], fraction)
 
 
 @dataclass(frozen=True, eq=False)
 class _Later:
-    """What all frames tell of one: how far from its own belief, (1,N+6), and how surely, (1,N+6,N+6)."""
+    """The estimate of a frame from all of them: the residual from its own, (1,N+6), and the covariance, (1,N+6,N+6)."""
 
-    away: Tensor
+    residual: Tensor
     covariance: Tensor
 
 
-def _smoothed(solver: VideoSolver, states: list[VideoState]) -> Belief:
-    """What all T frames tell of each, as one belief over T faces."""
-    beliefs = [state.belief for state in states if state.belief is not None]
-    later = [_Later(torch.zeros_like(beliefs[-1].covariance[..., 0]), beliefs[-1].covariance)]
+def _smoothed(solver: VideoSolver, states: list[VideoState]) -> StateEstimate:
+    """The estimates of T frames from all of them, as one over T faces."""
+    estimates = [state.estimate for state in states if state.estimate is not None]
+    later = [_Later(torch.zeros_like(estimates[-1].covariance[..., 0]), estimates[-1].covariance)]
     # Each frame needs what was found of the next.
-    for state, belief, following in zip(
-        reversed(states[:-1]), reversed(beliefs[:-1]), reversed(beliefs[1:]), strict=True
+    for state, estimate, following in zip(
+        reversed(states[:-1]), reversed(estimates[:-1]), reversed(estimates[1:]), strict=True
     ):
-        led_to = solver.predicted(state, belief)
-        gain = torch.linalg.solve(led_to.covariance, belief.covariance).transpose(1, 2)
+        led_to = solver.predicted(state, estimate)
+        gain = torch.linalg.solve(led_to.covariance, estimate.covariance).transpose(1, 2)
         ahead = later[-1]
-        lifted = following.mean.moved(following.mean.weights + ahead.away[:, :-6], ahead.away[:, -6:])
-        surprise = Expectation(led_to.mean, led_to.covariance).away(lifted)
-        away = (gain @ surprise[..., None])[..., 0]
-        covariance = belief.covariance + gain @ (ahead.covariance - led_to.covariance) @ gain.transpose(1, 2)
-        later.append(_Later(away, 0.5 * (covariance + covariance.transpose(1, 2))))
+        lifted = following.mean.moved(following.mean.weights + ahead.residual[:, :-6], ahead.residual[:, -6:])
+        surprise = Expectation(led_to.mean, led_to.covariance).residual(lifted)
+        residual = (gain @ surprise[..., None])[..., 0]
+        covariance = estimate.covariance + gain @ (ahead.covariance - led_to.covariance) @ gain.transpose(1, 2)
+        later.append(_Later(residual, 0.5 * (covariance + covariance.transpose(1, 2))))
     later.reverse()
-    away, covariance = (torch.cat([getattr(x, name) for x in later]) for name in ("away", "covariance"))
+    residual, covariance = (torch.cat([getattr(x, name) for x in later]) for name in ("residual", "covariance"))
     weights, rotation, translation = (
-        torch.cat([getattr(belief.mean, name) for belief in beliefs]) for name in ("weights", "rotation", "translation")
+        torch.cat([getattr(estimate.mean, name) for estimate in estimates])
+        for name in ("weights", "rotation", "translation")
     )
     mean = HeadState(weights, rotation, translation)
-    return Belief(mean.moved(weights + away[:, :-6], away[:, -6:]), covariance)
+    return StateEstimate(mean.moved(weights + residual[:, :-6], residual[:, -6:]), covariance)
 
 
-def _solved(solver: VideoSolver, states: list[VideoState], smoothed: Belief) -> HeadState:
+def _solved(solver: VideoSolver, states: list[VideoState], smoothed: StateEstimate) -> HeadState:
     """The frames' weights and poses under the prior; their landmarks are in what is expected already."""
     spread = smoothed.covariance
     identity = torch.eye(spread.shape[1], dtype=spread.dtype, device=spread.device)
-    expected = Belief(smoothed.mean, spread + _ROUNDING * identity).expectation()
+    expected = StateEstimate(smoothed.mean, spread + _ROUNDING * identity).expectation()
     count = len(states)
     like = smoothed.mean.weights
     none = like.new_zeros(count, LANDMARKS)

@@ -1,4 +1,4 @@
-"""Blendshape weights from landmarks in the pictures of one camera."""
+"""Blendshape weights from landmarks in the images of one camera."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torchface.capture.video.face_points import LANDMARKS
 from torchface.capture.video.fixed_point import attach_gradients
 from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState, linearise
-from torchface.capture.video.solver_components import LOOSE_STEP, VideoSolverParts, check_not_negative
-from torchface.capture.video.state_estimate import Belief, Expectation
+from torchface.capture.video.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
+from torchface.capture.video.state_estimate import Expectation, StateEstimate
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.warm_active_set import solve_from_active_set
 
-_FEWEST = 6
+_MIN_LANDMARKS = 6
 _SLIDING_STEPS = 3
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
 _NEWTON_STEPS = 50
@@ -40,7 +40,7 @@ class VideoSolver(VideoSolverParts):
     face is seen to end; their errors along the contour count less.
 
     The term before the last is the dynamics prior's: x are weights and pose, m where the last frames lead to and V the
-    variance of that. The thesis divides by V alone, as if the last frames' weights were true. They are known with a
+    variance of that. The thesis divides by V alone, as if the last frames' weights were true. They have a
     covariance P, which a Kalman filter of the landmarks carries on; it tells directions in which the landmarks show
     little, such as depth, from those that they show well, and so averages over the more frames the less one tells.
     Without a dynamics prior each frame is solved on its own.
@@ -49,9 +49,9 @@ class VideoSolver(VideoSolverParts):
     no more, unless ``pose_trust`` is positive: D is the distance from it in what the frame's landmarks tell of a pose.
 
     Args:
-        rig: N shapes, of the person in the picture.
+        rig: N shapes, of the person in the image.
         landmark_vertices: the 68 in iBUG's order, vertex ids; the rig's annotated ones if absent.
-        intrinsics: K, (3,3), pixels; of pictures without distortion.
+        intrinsics: K, (3,3), pixels; of images without distortion.
         prior: which weights faces have; its ``strength`` is :math:`\lambda`.
         dynamics: how weights go on.
         settings: what the terms weigh, and when steps end; :math:`\sigma` grows with the face where they say so.
@@ -87,12 +87,12 @@ class VideoSolver(VideoSolverParts):
             ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
         """
         states, enough = self.states(landmarks, rotation, translation, confidence)
-        weights, turned, moved = (
+        weights, rotations, translations = (
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
             for name in ("weights", "rotation", "translation")
         )
-        errors = self.reprojection_errors(landmarks, weights, turned, moved)
-        return VideoSolution(weights, turned, moved, errors, enough)
+        errors = self.reprojection_errors(landmarks, weights, rotations, translations)
+        return VideoSolution(weights, rotations, translations, errors, enough)
 
     def states(
         self,
@@ -106,10 +106,10 @@ class VideoSolver(VideoSolverParts):
         Frames before the first face have its state.
         """
         count = self._check(landmarks, rotation, translation, confidence)
-        enough = torch.isfinite(landmarks).all(-1).sum(1) >= _FEWEST
+        enough = torch.isfinite(landmarks).all(-1).sum(1) >= _MIN_LANDMARKS
         if not bool(enough.any()):
             raise ValueRangeError(
-                f"landmarks: found fewer than {_FEWEST} in each of {count} frames, expected a face in some"
+                f"landmarks: found fewer than {_MIN_LANDMARKS} in each of {count} frames, expected a face in some"
             )
         states, state = [], self.start()
         first = int(enough.nonzero()[0, 0])
@@ -152,10 +152,10 @@ class VideoSolver(VideoSolverParts):
         found = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
         seen = torch.isfinite(found).all(-1)
-        enough = int(seen.sum()) >= _FEWEST
+        enough = int(seen.sum()) >= _MIN_LANDMARKS
         if state.head is None and not enough:
             raise ValueRangeError(
-                f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_FEWEST} to begin with"
+                f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_MIN_LANDMARKS} to start"
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
             rotation, translation = self._pose_of(state, found)
@@ -170,7 +170,7 @@ class VideoSolver(VideoSolverParts):
         # After a gap the tracked pose is nearer than where the head was left.
         near = (
             expected.mean
-            if state.solved and state.belief is not None
+            if state.solved and state.estimate is not None
             else HeadState(expected.mean.weights, rotation, translation)
         )
         begin = expected.mean.weights if state.head is None else state.head.weights
@@ -183,36 +183,36 @@ class VideoSolver(VideoSolverParts):
         head = solved.head
         if self.dynamics is None:
             return VideoState(head, None, state.window, enough)
-        belief = expected.updated(head, self.seen(terms, head, solved.rows))
+        estimate = expected.updated(head, self.seen(terms, head, solved.rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
-        return VideoState(head, belief, window, enough)
+        return VideoState(head, estimate, window, enough)
 
     def _expected(self, state: VideoState, rotation: Tensor, translation: Tensor) -> Expectation:
-        """What the frames before tell of the next."""
-        belief = state.belief
-        if belief is None or self.dynamics is None:
+        """The prediction for the next frame from those before."""
+        estimate = state.estimate
+        if estimate is None or self.dynamics is None:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
-            return Expectation(mean, self.loose.double().diag()[None])
-        return self.predicted(state, belief).expectation()
+            return Expectation(mean, self.initial_information.double().diag()[None])
+        return self.predicted(state, estimate).expectation()
 
-    def predicted(self, state: VideoState, belief: Belief) -> Belief:
-        """What a frame's belief leads to in the next."""
+    def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:
+        """The prediction for the next frame from a frame's estimate."""
         if self.dynamics is None or state.window.shape[1] < self.dynamics.window:
-            steps = torch.zeros_like(belief.mean.weights)
-            variance = torch.full_like(steps, LOOSE_STEP**2)
+            steps = torch.zeros_like(estimate.mean.weights)
+            variance = torch.full_like(steps, DEFAULT_WEIGHT_STEP**2)
         else:
             mean, variance = self.dynamics(state.window.to(self.dynamics.center.dtype))
             steps, variance = mean.double() - state.window[:, -1], variance.double() / self.settings.dynamics_strength
-        return belief.predicted(steps, variance, self.motion_variance.double())
+        return estimate.predicted(steps, variance, self.motion_variance.double())
 
     def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
         """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
-        # Steps are many and small; what tensors keep for derivatives is a fifth of their price.
+        # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
         with torch.inference_mode():
             head, rows = start, self._chosen(start)
-            for turn in range(self.settings.steps):
+            for iteration in range(self.settings.steps):
                 # Which points the contour's landmarks are is settled first; later it could go back and forth.
-                if 0 < turn < _SLIDING_STEPS:
+                if 0 < iteration < _SLIDING_STEPS:
                     rows = self._chosen(head)
                 before, head = head, self._advanced(terms, head, rows)
                 if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
@@ -243,23 +243,23 @@ class VideoSolver(VideoSolverParts):
 
     def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
         """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
-        price = Quadratic(self.ridge.double().diag(), self.price.double()[None])
-        known = self.seen(terms, head, rows) + terms.expected.quadratic(head) + price
-        return known if self.prior is None else known + _beside_motion(self.prior.energy(head.weights))
+        penalty = Quadratic(self.ridge.double().diag(), self.l1_penalty.double()[None])
+        total = self.seen(terms, head, rows) + terms.expected.quadratic(head) + penalty
+        return total if self.prior is None else total + _beside_motion(self.prior.energy(head.weights))
 
     def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
-        """What landmarks and tracked poses tell, linearised at a state, over weights and motion from there, (B,N+6)."""
+        """Landmarks and tracked poses, linearised at a state, over weights and motion from there, (B,N+6)."""
         K, slide = self.intrinsics.double(), self.settings.contour_slide
         at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
-        told = at.quadratic(head.weights)
+        data = at.quadratic(head.weights)
         if self.settings.pose_trust == 0:
-            return told
+            return data
         shapes = len(self.names)
         by_motion = at.jacobian[..., shapes:].flatten(1, 2)
         precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
-        away = head.motion_from(terms.rotation, terms.translation)
+        residual = head.motion_from(terms.rotation, terms.translation)
         H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
-        return told + Quadratic(H, torch.nn.functional.pad((precision @ away[..., None])[..., 0], (shapes, 0)))
+        return data + Quadratic(H, torch.nn.functional.pad((precision @ residual[..., None])[..., 0], (shapes, 0)))
 
     def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
         """The converged state as a differentiable function of the terms."""
