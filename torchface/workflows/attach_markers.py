@@ -21,7 +21,7 @@ from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.viz.figures.site_views import error_rounds, site_views
+from torchface.viz.figures.site_views import errors_by_iteration, site_views
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, read_range_of_motion
 
 _SHOWN_NAMES = 8
@@ -184,5 +184,5 @@ def attach(
     make_folder(out.parent)
     fit.attachment.save(out)
     if picture is not None:
-        save_picture(sheet([site_views(loaded.neutral, before, after), error_rounds(fit.errors)], 1), picture)
+        save_picture(sheet([site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)], 1), picture)
     return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))

@@ -57,7 +57,7 @@ def facing(mesh: Mesh, points: Tensor, yaw: float) -> Tensor:
     return (normals @ toward > 0) & ~hidden
 
 
-def error_rounds(errors: Tensor) -> Tensor:
+def errors_by_iteration(errors: Tensor) -> Tensor:
     """Each marker's error after each iteration (R,M), millimetres, with mean and worst; (3,H,W)."""
     figure = Figure(figsize=(10, 3), dpi=100, layout="constrained")
     axes = figure.subplots()
