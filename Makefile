@@ -20,7 +20,7 @@ $(VENV)/.installed-%: $(STAMP)
 
 # Two processes of one thread each; what is costly to make once (a filmed performer, a browser) stays in one of them.
 test: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadgroup
+	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s

@@ -30,8 +30,6 @@ settings.register_profile("dev", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
-TOGETHER = ("capture/action_units", "viz/browser")
-"""Folders whose files share what costs seconds to make once a process: a filmed performer, a browser."""
 LONGEST = (
     "capture/action_units",
     "viz/browser",
@@ -46,17 +44,14 @@ LONGEST = (
 """Where the longest tests lie, which go first: then the processes of a run end together."""
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Orders the tests and says which stay in one process; those on real data are skipped where there is none."""
-    ranks: dict[str, int] = {}
-    for item in items:
+    """Puts the longest tests first; those on real data are skipped where there is none."""
+
+    def rank(item: pytest.Item) -> int:
         path = item.path.relative_to(REPOSITORY).as_posix()
-        group = next((folder for folder in TOGETHER if path.startswith(f"tests/{folder}/")), path)
-        item.add_marker(pytest.mark.xdist_group(group))
-        starts = [number for number, folder in enumerate(LONGEST) if path.startswith(f"tests/{folder}/")]
-        ranks[item.nodeid] = min(starts, default=len(LONGEST))
-    items.sort(key=lambda item: ranks[item.nodeid])
+        return next((i for i, folder in enumerate(LONGEST) if path.startswith(f"tests/{folder}/")), len(LONGEST))
+
+    items.sort(key=rank)
     if DATA.is_dir():
         return
     skip = pytest.mark.skip(reason=f"real data not found at {DATA}; set TORCHFACE_DATA to run this test")
