@@ -14,7 +14,7 @@ from torchface.files.documents import read_json, write_json
 from torchface.mesh import Mesh
 
 _FORMAT = "torchface.attachment/1"
-_LARGEST_FILE = 64 * 2**20
+_MAX_FILE = 64 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class Attachment:
         Raises:
             FileFormatError: the file is missing, too large, not JSON, or lacks a field.
         """
-        document = read_json(path, _FORMAT, _LARGEST_FILE)
+        document = read_json(path, _FORMAT, _MAX_FILE)
         triangles = document["triangles"].tensor(None, dtype=torch.int64, expected="a list of triangles")
         residual, fingerprint = document["residual"], document["fingerprint"]
         try:

@@ -119,16 +119,16 @@ def compare(
         rest = people.without(i)
         source = rest.mean_rig() if template is None else template.select(people.names)
         neutral = people.template.with_vertices(people.neutrals[i])
-        told = torch.stack(
+        predictions = torch.stack(
             [
                 transfer_deformation(source, neutral).deltas,
                 rest.offsets.mean(0),
                 fit(rest).offsets(people.neutrals[i : i + 1])[0],
             ]
         )
-        squared[i] = (told - people.offsets[i]).double().square().sum((-1, -2)).T
+        squared[i] = (predictions - people.offsets[i]).double().square().sum((-1, -2)).T
         if i < keep:
-            predicted[i] = told
+            predicted[i] = predictions
         progress("predicting each person from the others", i + 1, len(people.who))
     return Comparison(squared, people.names, predicted)
 
@@ -137,13 +137,13 @@ def picture(people: People, comparison: Comparison, expression: int = 0) -> Tens
     """Figure 49: a row a person: what each method makes of the neutral, painted with the distance to the truth."""
     rows = []
     worst = max(
-        float((told[:2, expression] - people.offsets[i, expression]).norm(dim=-1).max())
-        for i, told in comparison.predicted.items()
+        float((predictions[:2, expression] - people.offsets[i, expression]).norm(dim=-1).max())
+        for i, predictions in comparison.predicted.items()
     )
-    for i, told in comparison.predicted.items():
+    for i, predictions in comparison.predicted.items():
         neutral = people.template.with_vertices(people.neutrals[i])
         camera = frame_face(neutral, 20.0, width=300, height=360)
-        for method, offsets in zip(METHODS, told[:, expression], strict=True):
+        for method, offsets in zip(METHODS, predictions[:, expression], strict=True):
             away = (offsets - people.offsets[i, expression]).norm(dim=-1)
             face = neutral.with_vertices(neutral.vertices + offsets)
             shown = render(face, camera, heat_colors(away, worst), samples=2)

@@ -1,7 +1,7 @@
 """``python -m train.landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in pictures.
 
 A folder of iBUG's kind holds pictures with a ``.pts`` beside each; a dlib ``.xml`` names its pictures itself.
-``--performers 2000`` learns from so many rendered pictures of made-up people, alone or besides the data.
+``--performers 2000`` learns from so many rendered pictures of synthetic people, alone or besides the data.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, f
 from train.runner import metric_lines, run
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
-_LARGEST_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
+_MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
 _PART = 60  # pictures that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
 
@@ -40,7 +40,7 @@ class Settings:
 
     Args:
         data: Folders of pictures with .pts files, or dlib .xml files.
-        performers: So many rendered pictures of made-up people.
+        performers: So many rendered pictures of synthetic people.
         out: Folder for the model and its card.
         held_out: Faces of the data, the last ones, or rendered pictures of other people, that are kept for the test.
         seed: Draws people, poses and lights.
@@ -168,7 +168,7 @@ def rendered_faces(
     progress: Progress | None = None,
     workers: int = 1,
 ) -> Faces:
-    """Pictures of made-up people; how many processes render them does not change them."""
+    """Pictures of synthetic people; how many processes render them does not change them."""
     progress = progress or silent
     parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]
     progress = progress or silent
@@ -221,7 +221,7 @@ def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
     end = (box[:2] + (1 + _AROUND) * box[2:]).ceil().clamp(min=1).minimum(torch.tensor([float(wide), float(high)]))
     end = torch.maximum(end, low + 1)
     (x, y), (right, bottom) = low.long().tolist(), end.long().tolist()
-    part, zoom = grey[y:bottom, x:right], min(1.0, _LARGEST_BOX / float(box[2]))
+    part, zoom = grey[y:bottom, x:right], min(1.0, _MAX_BOX / float(box[2]))
     landmarks = landmarks - low
     if zoom < 1:
         size = [max(1, round(side * zoom)) for side in part.shape]

@@ -26,7 +26,7 @@ from train.head_templates import ict_head_model, load_template
 from train.runner import metric_lines, run
 
 _TESTED_PERFORMERS = 20
-_MANY, _FOLDS, _FEWEST_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
+_MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
 _MEASURED = 500  # heads; leaving one out takes an eigensystem of so many for each
 _MEASURES = (
     "; generalisation leaves one head out at a time; specificity is how far its random heads lie from the nearest it "
@@ -136,7 +136,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
         quality = model_quality(SampleRange(learn, 0, some), numbers, generator=generator)
     metrics = measured(model, quality, test, test_colors)
     folds = 0
-    if not gathered.held_out and count >= _FEWEST_FOLDS:
+    if not gathered.held_out and count >= _MIN_FOLDS:
         folds = min(count, _FOLDS)
         progress(f"leaving heads out in {folds} turns")
         metrics |= cross_validated(learn, folds, settings.components)
@@ -150,10 +150,10 @@ def _ict(settings: Settings, folder: Path, progress: Progress) -> Trained:
     """The model of ICT-FaceKit's own modes: nothing is learned, so nothing is held out."""
     progress("reading the modes and the expressions")
     model = ict_head_model(folder, settings.part, settings.components)
-    spread = model.shape.modes.square().sum((0, 2)).sqrt()
+    deviations = model.shape.modes.square().sum((0, 2)).sqrt()
     metrics = {
         "shape components": float(model.shape.count),
-        "heads from the mean, root mean square mm": float(spread.mean()),
+        "heads from the mean, root mean square mm": float(deviations.mean()),
     }
     save(model, settings, metrics, 0, 0, 0)
     draw(model, settings.pictures or settings.out / "pictures", settings.seed, None, None, None, progress)

@@ -14,7 +14,7 @@ from torchface.optim.sparse import SparseCholesky
 _LINK = 0.577  # cotangent of 60°: the weight of an edge between equilateral triangles
 _FORM_FADES, _COLORS_FADE = 80.0, 40.0
 _LEAST_AREA = 1e-3
-_FEWEST = 4
+_MIN_COUNT = 4
 
 
 def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor, shown: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def completed_form(rest: Tensor, current: Tensor, faces: Tensor, unseen: Tensor,
 
     Source: Botsch and Sorkine 2008 (thin plates over a mesh).
     """
-    if not unseen.any() or int(shown.sum()) < _FEWEST:
+    if not unseen.any() or int(shown.sum()) < _MIN_COUNT:
         return current
     laid = similarity_transform(rest[shown][None], current[shown][None]).apply(rest)[0]
     stiffness, area = _membrane(laid, faces)

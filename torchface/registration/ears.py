@@ -15,7 +15,7 @@ _REACH, _ASIDE, _BEFORE = 0.5, 0.12, 0.05
 _THIN = 0.1
 _LIFT = 0.05
 _MARGIN = 0.08
-_FEWEST = 20
+_MIN_COUNT = 20
 
 
 def find_ears(template: Mesh) -> list[Tensor]:
@@ -55,7 +55,7 @@ def find_ears(template: Mesh) -> list[Tensor]:
         if sheet.any():
             gap, _ = cKDTree(vertices[sheet].numpy()).query(vertices[ids].numpy())
             ear[ids] = torch.from_numpy(gap) < _MARGIN * width
-        if int(ear.sum()) >= _FEWEST:
+        if int(ear.sum()) >= _MIN_COUNT:
             ears.append(ear)
     return ears
 

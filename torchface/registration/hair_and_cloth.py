@@ -1,4 +1,4 @@
-"""What hides a person's skin on a scan: hair and cloth, told by their colour, and ears that came out in pieces."""
+"""What hides a person's skin on a scan: hair and cloth, known by their colour, and ears that came out in pieces."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SPREADS = 4.0
 _SMOOTHING = 3
 _NEAR = 4.0
 _WHOLE_EAR = 0.6
-_FEWEST = 20
+_MIN_COUNT = 20
 
 
 class Cover:
@@ -94,13 +94,13 @@ class Cover:
         red, green, blue = light.unbind(1)
         look = torch.stack([light.mean(1).log(), (red / green).log(), (blue / green).log()], dim=1)
         sample = look[self.features[self._exposed] & (found.distance < 3 * _NEAR)]
-        if len(sample) < _FEWEST:
+        if len(sample) < _MIN_COUNT:
             return self._none
         middle = sample.median(0).values
-        spread = _SPREADS * 1.4826 * (sample - middle).abs().median(0).values
+        scale = _SPREADS * 1.4826 * (sample - middle).abs().median(0).values
         off = look - middle
-        hue = (off[:, 1:] / torch.maximum(spread[1:], off.new_tensor(_OTHER_HUE))).norm(dim=1)
-        other = (off[:, 0] < -spread[0].clamp(min=_DARKEST)) | (off[:, 0] > spread[0].clamp(min=_BRIGHTEST)) | (hue > 1)
+        hue = (off[:, 1:] / torch.maximum(scale[1:], off.new_tensor(_OTHER_HUE))).norm(dim=1)
+        other = (off[:, 0] < -scale[0].clamp(min=_DARKEST)) | (off[:, 0] > scale[0].clamp(min=_BRIGHTEST)) | (hue > 1)
         share = torch.zeros(len(self._none), dtype=torch.float64)
         share[self._exposed] = other.double()
         seen = torch.zeros_like(share)

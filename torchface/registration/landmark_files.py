@@ -16,7 +16,7 @@ from torchface.registration.scan_preparation import Landmarks
 
 ENDINGS = (".ljson", ".json", ".pts")
 _METRES = (".glb", ".gltf")
-_LARGEST_FILE = 16 * 2**20
+_MAX_FILE = 16 * 2**20
 
 
 def landmark_file(folder: Path, scan: Path) -> Path | None:
@@ -65,5 +65,5 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
 def _is_correspondences(path: Path) -> bool:
     if path.suffix.lower() != ".json":
         return False
-    document = read_json(path, max_bytes=_LARGEST_FILE).found
+    document = read_json(path, max_bytes=_MAX_FILE).found
     return isinstance(document, dict) and "format" in document

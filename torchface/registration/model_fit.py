@@ -19,9 +19,9 @@ _SAMPLES = 3000
 _REACHES = (30.0, 25.0, 20.0, 16.0, 13.0, 10.0, 8.0, 7.0, 6.0, 5.0, 5.0, 5.0, 5.0, 5.0)
 _CORRELATED = 20.0
 _OUTLYING, _LEAST_OUTLYING = 3.0, 0.5
-_LEAST_NOISE, _MOST_NOISE = 0.1, 5.0
+_LEAST_NOISE, _MAX_NOISE = 0.1, 5.0
 _LEAST_LANDMARK_NOISE = 1.5
-_LARGEST_COEFFICIENT = 4.0
+_MAX_COEFFICIENT = 4.0
 _RIDGE = 1e-6
 
 
@@ -132,7 +132,7 @@ def fit_to_scan(
     area *= len(exposed) / len(start)
     pose = similarity_transform(mean[None], start[None])
     coefficients = torch.zeros(len(modes), dtype=torch.float64)
-    noise = _MOST_NOISE
+    noise = _MAX_NOISE
     for reach in _REACHES:
         local = mean + torch.tensordot(coefficients, modes, 1)
         current = pose.apply(local)[0]
@@ -140,7 +140,7 @@ def fit_to_scan(
         left = ((found.points - current[chosen]) * found.normals).sum(-1)
         used = found.weights > 0
         if bool(used.any()):
-            noise = min(max(1.4826 * float(left[used].abs().median()), _LEAST_NOISE), _MOST_NOISE)
+            noise = min(max(1.4826 * float(left[used].abs().median()), _LEAST_NOISE), _MAX_NOISE)
         # Hair and collars stand off the head: what misses by more than the rest counts little.
         weights = found.weights * (1 + (left / max(_OUTLYING * noise, _LEAST_OUTLYING)).square()).pow(-2)
         share = area / _CORRELATED**2 / len(chosen) / noise**2
@@ -158,7 +158,7 @@ def fit_to_scan(
         prior[:7] = _RIDGE * matrix.diagonal()[:7] + 1e-12
         downhill[7:] -= coefficients
         step = torch.linalg.solve(matrix + torch.diag(prior), downhill)
-        coefficients = (coefficients + step[7:]).clamp(-_LARGEST_COEFFICIENT, _LARGEST_COEFFICIENT)
+        coefficients = (coefficients + step[7:]).clamp(-_MAX_COEFFICIENT, _MAX_COEFFICIENT)
         pose = _moved(pose, step[:7], centre)
     return ModelFit(pose.apply(mean + torch.tensordot(coefficients, modes, 1))[0], coefficients, pose, noise)
 

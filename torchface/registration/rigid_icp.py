@@ -16,7 +16,7 @@ from torchface.geometry.similarity import Similarity
 _SEED = 0
 _ROTATIONS = 400
 _LANDMARK_WEIGHT = 20.0
-_SMALLEST_SCALE, _LARGEST_SCALE = 0.8, 1.25
+_MIN_SCALE, _MAX_SCALE = 0.8, 1.25
 _DAMPING = 1e-6
 _LEAST_FIT = 0.35
 _SCAN_POINTS = 20_000
@@ -98,7 +98,7 @@ def rigid_icp(
     Source: Chen, Medioni 1992 (across the surface); Rusinkiewicz, Levoy 2001; thesis 3.2.3, figure 16.
     """
     s, rotation, translation = start.scale.double(), start.rotation.double(), start.translation.double()
-    lowest, highest = s * _SMALLEST_SCALE, s * _LARGEST_SCALE
+    lowest, highest = s * _MIN_SCALE, s * _MAX_SCALE
     for reach in reaches:
         pose = Similarity(s, rotation, translation)
         moved, targets, normals, weights = _planes(samples, scan, pose, reach)
@@ -201,5 +201,5 @@ def _rotations(count: int) -> Tensor:
         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    spread = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
-    return torch.cat([torch.eye(3, dtype=torch.float64)[None], spread])
+    rotations = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    return torch.cat([torch.eye(3, dtype=torch.float64)[None], rotations])

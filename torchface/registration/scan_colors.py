@@ -20,7 +20,7 @@ from torchface.rendering.raycast import RayCaster
 
 _REACH = 5.0
 _BLEND = 10.0
-_LARGEST_ANGLE = 75.0
+_MAX_ANGLE = 75.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ def _along_normals(source: ScanColors, points: Tensor, normals: Tensor) -> tuple
     for way in (normals, -normals):
         hits = caster.cast(points, way)
         there = interpolate(surface, source.faces[hits.triangle.clamp(min=0)], hits.barycentric.double())
-        alike = (there * normals).sum(-1) > math.cos(math.radians(_LARGEST_ANGLE)) * there.norm(dim=-1)
+        alike = (there * normals).sum(-1) > math.cos(math.radians(_MAX_ANGLE)) * there.norm(dim=-1)
         better = (hits.triangle >= 0) & alike & (hits.distance < best)
         best = torch.where(better, hits.distance, best)
         triangle = torch.where(better, hits.triangle, triangle)

@@ -147,16 +147,16 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
     off = torch.zeros_like(present)
     off[present] = scan.nearest(points[present]).distance > _OFF_SURFACE
     keep = present & ~off
-    told = [f"{int((~present).sum())} are NaN"] * bool((~present).any())
-    told += [f"{int(off.sum())} lie more than {_OFF_SURFACE:g} mm off the scan's surface"] * bool(off.any())
+    reasons = [f"{int((~present).sum())} are NaN"] * bool((~present).any())
+    reasons += [f"{int(off.sum())} lie more than {_OFF_SURFACE:g} mm off the scan's surface"] * bool(off.any())
     if int(keep.sum()) < 3:
-        why = f" ({', '.join(told)})" if told else ""
+        why = f" ({', '.join(reasons)})" if reasons else ""
         raise ShapeError(f"landmarks: found {int(keep.sum())} that can be used of {len(ids)}{why}, expected at least 3")
     ids, points = ids[keep], points[keep]
     own = template.vertices.detach().cpu().double()[ids]
     for name, cloud in (("template", own), ("scan", points)):
-        spread = torch.linalg.svdvals(cloud - cloud.mean(0))
-        if float(spread[1]) <= _LINE * float(spread[0]):
+        singular_values = torch.linalg.svdvals(cloud - cloud.mean(0))
+        if float(singular_values[1]) <= _LINE * float(singular_values[0]):
             raise ValueRangeError(f"landmarks: those on the {name} lie on a line, expected a triangle of them")
     pose = similarity_transform(own[None], points[None])
     error = float((pose.apply(own)[0] - points).square().sum(-1).mean().sqrt())
@@ -166,5 +166,5 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
             f"landmarks: the best similarity leaves {error:.1f} mm (root mean square) between the template's and the "
             f"scan's, which are {size:.0f} mm across; expected both in the same order"
         )
-    note = f"of {len(keep)} landmarks {' and '.join(told)}; they were left out" if told else ""
+    note = f"of {len(keep)} landmarks {' and '.join(reasons)}; they were left out" if reasons else ""
     return (ids, points), pose, note

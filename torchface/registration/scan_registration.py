@@ -46,8 +46,8 @@ _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _NEAR = 3.0
 _FAR = 10.0
 _SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lies close to the scan
-_MOST_COMPLETIONS = 6
-_FEWEST_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
+_MAX_COMPLETIONS = 6
+_MIN_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
 Detector = Callable[[Mesh, Mesh, Similarity], Landmarks | None]
 """Finds landmarks by itself: given the template laid on the scan, the scan, and the similarity from the one's own
@@ -152,10 +152,10 @@ def register(
     nearest = _nearest(start.surface, deformer.current)
     matched = cover.without_islands(_matched(deformer, start.surface, nearest, schedule))
     met = float(matched[deformer.exposed].double().mean())
-    if met < _FEWEST_MET:
+    if met < _MIN_MET:
         raise AlignmentError(
             f"scan: found only {met:.0%} of the bent template's surface on the scan, expected at least "
-            f"{_FEWEST_MET:.0%}; do the landmarks belong to this scan, and does it show what the template shows?"
+            f"{_MIN_MET:.0%}; do the landmarks belong to this scan, and does it show what the template shows?"
         )
     unseen = ~cover.features & ~matched
     if unseen.any():
@@ -309,7 +309,7 @@ def _completed(
     of an ear all.
     """
     before, rest, faces = deformer.current, template.vertices.detach().cpu().double(), deformer.faces
-    for _ in range(_MOST_COMPLETIONS):
+    for _ in range(_MAX_COMPLETIONS):
         shown = deformer.outward & ~unseen
         deformer.lay(completed_form(rest, before, faces, unseen, shown))
         folded = faces[deformer.folded_triangles()].flatten()

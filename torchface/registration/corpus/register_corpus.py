@@ -79,7 +79,7 @@ def register_corpus(
 ) -> CorpusReport:
     """Registers scans one by one into a folder: ``NAME.glb`` and a record ``NAME.json`` for each, and ``summary.csv``.
 
-    A scan that cannot be registered is told in report, record and table, and the others go on. Results are complete
+    A scan that cannot be registered is named in report, record and table, and the others go on. Results are complete
     files and a record comes after its result: a run that was killed, started again, takes what is finished and goes
     on with the rest. A scan is registered anew when its files (those beside it of the same name included), its
     landmarks, the template or the settings have changed, or its record has been deleted; one that failed for

@@ -46,7 +46,7 @@ class CorpusJob:
     model: LinearShape | None = None
 
     def run(self, task: CorpusTask) -> CorpusEntry:
-        """Registers a scan and writes result and record; whatever is wrong with the scan is told, not raised."""
+        """Registers a scan and writes result and record; whatever is wrong with the scan is reported, not raised."""
         begin = time.perf_counter()
         entry = CorpusEntry(task.name, task.scan)
         try:

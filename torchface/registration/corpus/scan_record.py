@@ -1,4 +1,4 @@
-"""What is told of one scan of a corpus: in memory, as a JSON record beside the result, as a row of a table."""
+"""What is known of one scan of a corpus: in memory, as a JSON record beside the result, as a row of a table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchface.files.whole_files import write_file
 from torchface.registration.nonrigid.stage_record import RegistrationRecord
 
 _FORMAT = "torchface.registered-scan/1"
-_LARGEST_RECORD = 16 * 2**20
+_MAX_RECORD = 16 * 2**20
 _STEP, _NOT_SHOWN = 0.01, 65535
 _COLUMNS = (
     "name", "status", "median_mm", "matched", "start", "start_mm", "landmarks", "seconds", "scan", "result", "remarks",
@@ -142,7 +142,7 @@ def finished_entry(task: CorpusTask, folder: Path) -> CorpusEntry | None:
     """What an earlier run made of the same scan; None where it made nothing, or anything has changed since."""
     path = record_path(folder, task.name)
     try:
-        return _entry(read_json(path, _FORMAT, _LARGEST_RECORD), task, folder) if path.is_file() else None
+        return _entry(read_json(path, _FORMAT, _MAX_RECORD), task, folder) if path.is_file() else None
     # A record that somebody has damaged is as good as none: the scan is registered again.
     except (FileFormatError, OSError):
         return None
@@ -178,7 +178,7 @@ def read_distances(folder: Path, name: str) -> Tensor | None:
     """The distance of each vertex of a result to its scan, (V,) millimetres, NaN where the scan does not show it; None
     where the record tells none."""
     try:
-        packed = read_json(record_path(folder, name), max_bytes=_LARGEST_RECORD)["distances"].text()
+        packed = read_json(record_path(folder, name), max_bytes=_MAX_RECORD)["distances"].text()
         steps = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<u2")
     except (FileFormatError, ValueError):
         return None

@@ -30,7 +30,7 @@ from torchface.registration.nonrigid.unfolding import turned_over, unfolded
 from torchface.rendering.raycast import RayCaster
 
 _AREA_OF_ONE = 10.0
-_MOST_ATTEMPTS = 8
+_MAX_ATTEMPTS = 8
 _SLIVER = 0.1
 
 
@@ -101,7 +101,7 @@ class Deformer:
         if stage.samples is not None:
             vertices = evenly_spread(self.rest, vertices, stage.samples)
         record = self._attempt(stage, number, space, vertices)
-        for circle in range(1, _MOST_ATTEMPTS):  # in widening circles, until nothing turns over
+        for circle in range(1, _MAX_ATTEMPTS):  # in widening circles, until nothing turns over
             folded = self.folded_triangles() & ~self._sliver
             if not folded.any():
                 break
@@ -163,7 +163,7 @@ class Deformer:
         self.lay(unfolded(self.rest, self.current, self.faces))
 
     def lay(self, vertices: Tensor) -> None:
-        """Puts the vertices (V,3) where they are told to be."""
+        """Sets the positions of the vertices (V,3)."""
         maps = self.maps.copy()
         maps[3::4] = vertices.numpy()
         self.maps = maps

@@ -69,15 +69,15 @@ class LandmarkPull:
     def disagreement(self, current: Tensor) -> list[str]:
         """A note of what the landmarks contradict, with the vertices (V,3) as the surface has left them; else none."""
         off = self.distance(current)
-        told = []
+        remarks = []
         for what, rows in (("along the jaw", self.contour), ("inside the face", ~self.contour)):
             wrong = rows & (off > _REMARKABLE)
             if wrong.any():
-                told.append(
+                remarks.append(
                     f"{int(wrong.sum())} of {int(rows.sum())} {what} by {float(off[wrong].mean()):.1f} mm on average, "
                     f"at worst {float(off[wrong].max()):.1f} mm"
                 )
-        if not told:
+        if not remarks:
             return []
         let_go = "; those along the jaw were let go" if (self.contour & (off > _DISAGREES)).any() else ""
-        return [f"landmarks disagree with the surface: {' and '.join(told)}{let_go}"]
+        return [f"landmarks disagree with the surface: {' and '.join(remarks)}{let_go}"]

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 _RIDGE = 1e-11
 _TOLERANCE = 1e-2
-_MOST_ITERATIONS = 200
+_MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ def conjugate_gradients(
     better = precondition(residual)
     direction = better
     size = first = float((residual * better).sum())
-    for _ in range(_MOST_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         if size <= tolerance**2 * first or size <= 0:
             break
         image = apply(direction)

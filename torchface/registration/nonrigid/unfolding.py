@@ -9,7 +9,7 @@ from torchface.geometry.meshes.deformation import degenerate_triangles
 from torchface.geometry.meshes.operators import components, triangle_cross
 from torchface.geometry.similarity import similarity_transform
 
-_MOST_CIRCLES = 6
+_MAX_CIRCLES = 6
 _AROUND = 2
 _STIFF = 0.2
 _FLAT = 1e-9  # the area over the square of the longest edge that is rounding alone
@@ -38,7 +38,7 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
         faces: (F,3) int64.
     """
     best, fewest = current, int(turned_over(rest, current, faces).sum())
-    for circle in range(_MOST_CIRCLES):
+    for circle in range(_MAX_CIRCLES):
         folded = turned_over(rest, best, faces)
         if not folded.any():
             break
