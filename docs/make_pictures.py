@@ -19,7 +19,7 @@ from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.face_paint import face_paint
-from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
 from torchface.viz.figures.registration_views import registration_sheet
@@ -108,7 +108,7 @@ def relight_picture() -> torch.Tensor:
     )
     stage = LightStageSettings(width=600, height=360, samples=3, noise=0.006, span=300.0)
     with tempfile.TemporaryDirectory() as folder:
-        film = film_under_light(
+        film = render_lit_video(
             Path(folder) / "film.avi", rig, weights, lamp, 12.0, torch.Generator().manual_seed(2), stage
         )
         frame = next(iter(open_video(film.video.path).color_frames()))

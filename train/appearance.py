@@ -1,6 +1,6 @@
 """``python -m train.appearance --data DIR --out models/NAME``: an actor's appearance, to refine landmarks by.
 
-The folder holds pictures with a ``.pts`` beside each, as ``torchface annotate`` saves them.
+The folder holds images with a ``.pts`` beside each, as ``torchface annotate`` saves them.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Settings:
     """What the recipe does.
 
     Args:
-        data: Folder of pictures with iBUG's 68 landmarks as .pts beside each.
-        out: Folder for the model, its card and its pictures.
+        data: Folder of images with iBUG's 68 landmarks as .pts beside each.
+        out: Folder for the model, its card and its images.
         folds: How many trial models are measured, each on the share of the frames that it has not seen; at most one a
             frame; 0 measures nothing.
         seed: Draws the starts that left-out frames are refined from.
@@ -78,7 +78,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
             rows = torch.arange(len(frames)) % folds == fold
             learn = [frame for frame, left_out in zip(frames, rows.tolist(), strict=True) if not left_out]
             trial = AppearanceModel.fit([frame.image for frame in learn], landmarks[~rows], settings.model)
-            for row in torch.nonzero(rows)[:, 0].tolist():  # pictures differ in size
+            for row in torch.nonzero(rows)[:, 0].tolist():  # images differ in size
                 found[row] = trial(frames[row].image[None], start[row : row + 1])[0]
             progress("measuring on left-out frames", fold + 1, folds)
         before, after = relative_errors(start, landmarks), relative_errors(found, landmarks)

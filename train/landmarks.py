@@ -1,7 +1,7 @@
-"""``python -m train.landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in pictures.
+"""``python -m train.landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in images.
 
-A folder of iBUG's kind holds pictures with a ``.pts`` beside each; a dlib ``.xml`` names its pictures itself.
-``--performers 2000`` learns from so many rendered pictures of synthetic people, alone or besides the data.
+A folder of iBUG's kind holds images with a ``.pts`` beside each; a dlib ``.xml`` names its images itself.
+``--performers 2000`` learns from so many rendered images of synthetic people, alone or besides the data.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import box_around, relative_errors
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, face_pictures
+from torchface.synthetic.stages.portraits import FaceImage, PictureSettings, face_images
 from train.runner import metric_lines, run
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
-_PART = 60  # pictures that a process renders at once
+_PART = 60  # images that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
 
 
@@ -39,15 +39,15 @@ class Settings:
     """What the recipe does.
 
     Args:
-        data: Folders of pictures with .pts files, or dlib .xml files.
-        performers: So many rendered pictures of synthetic people.
+        data: Folders of images with .pts files, or dlib .xml files.
+        performers: So many rendered images of synthetic people.
         out: Folder for the model and its card.
-        held_out: Faces of the data, the last ones, or rendered pictures of other people, that are kept for the test.
+        held_out: Faces of the data, the last ones, or rendered images of other people, that are kept for the test.
         seed: Draws people, poses and lights.
         licence: Under which the model may be used; MIT for performers alone, else that of the data, if absent.
         workers: Processes that render.
         trees: How trees are grown.
-        pictures: What is rendered how widely.
+        images: What is rendered how widely.
     """
 
     data: tuple[Path, ...] = ()
@@ -63,7 +63,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """Grey pictures uint8 (H,W), boxes (M,4) and landmarks (M,68,2) in their pixels."""
+    """Grey images uint8 (H,W), boxes (M,4) and landmarks (M,68,2) in their pixels."""
 
     images: list[Tensor]
     boxes: Tensor
@@ -135,7 +135,7 @@ def load_faces(path: Path) -> Faces:
     """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
 
     Raises:
-        FileFormatError: neither of both, no annotated face in it, or a picture is missing.
+        FileFormatError: neither of both, no annotated face in it, or an image is missing.
     """
     found: list[tuple[Path, Tensor]] = []
     if path.suffix.lower() == ".xml":
@@ -146,7 +146,7 @@ def load_faces(path: Path) -> Faces:
         for file in sorted(path.rglob("*.pts")):
             pictures = [file.with_suffix(ending) for ending in _ENDINGS if file.with_suffix(ending).is_file()]
             if not pictures:
-                raise FileFormatError(f"{file}: found no picture of the same name, expected one beside it")
+                raise FileFormatError(f"{file}: found no image of the same name, expected one beside it")
             found.append((pictures[0], load_landmark_points(file).ibug()))
     else:
         raise FileFormatError(f"{path}: found no folder and no .xml, expected iBUG's .pts files or dlib's XML")
@@ -156,7 +156,7 @@ def load_faces(path: Path) -> Faces:
     faces = NO_FACES
     for picture, points in found:
         if picture not in known:
-            known = {picture: grey_images(load_image(picture)[None])[0, 0]}  # faces of a picture come in a row
+            known = {picture: grey_images(load_image(picture)[None])[0, 0]}  # faces of an image come in a row
         faces = faces + _cropped(known[picture], points.float())
     return faces
 
@@ -168,13 +168,13 @@ def rendered_faces(
     progress: Progress | None = None,
     workers: int = 1,
 ) -> Faces:
-    """Pictures of synthetic people; how many processes render them does not change them."""
+    """Images of synthetic people; how many processes render them does not change them."""
     progress = progress or silent
     parts = [(seed, settings, start, min(_PART, count - start)) for start in range(0, count, _PART)]
     progress = progress or silent
-    pictures: list[FacePicture] = []
+    pictures: list[FaceImage] = []
     with ExitStack() as stack:
-        rendered: Iterable[list[FacePicture]] = map(_rendered_part, parts)
+        rendered: Iterable[list[FaceImage]] = map(_rendered_part, parts)
         if workers > 1:
             # Spawned: what a process inherits of torch's threads may not survive a fork.
             pool = ProcessPoolExecutor(workers, get_context("spawn"))
@@ -191,9 +191,9 @@ def rendered_faces(
     )
 
 
-def _rendered_part(part: tuple[int, PictureSettings | None, int, int]) -> list[FacePicture]:
+def _rendered_part(part: tuple[int, PictureSettings | None, int, int]) -> list[FaceImage]:
     seed, settings, first, count = part
-    return list(face_pictures(count, seed, settings, first=first))
+    return list(face_images(count, seed, settings, first=first))
 
 
 def evaluate(model: LandmarkTrees, faces: Faces) -> Tensor:
@@ -206,15 +206,15 @@ def evaluate(model: LandmarkTrees, faces: Faces) -> Tensor:
 
 
 def _beside(path: Path, name: str) -> Path:
-    """A picture that an XML names; one outside of its folder is refused."""
+    """An image that an XML names; one outside of its folder is refused."""
     picture = path.parent / name
     if not picture.resolve().is_relative_to(path.parent.resolve()):
-        raise FileFormatError(f"{path}: found the picture {name!r:.80}, expected one in the same folder")
+        raise FileFormatError(f"{path}: found the image {name!r:.80}, expected one in the same folder")
     return picture
 
 
 def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
-    """A face cut out of a picture (H,W) in [0,1], smaller where it is very large."""
+    """A face cut out of an image (H,W) in [0,1], smaller where it is very large."""
     box = box_around(landmarks)
     high, wide = grey.shape
     low = (box[:2] - _AROUND * box[2:]).floor().clamp(min=0).minimum(torch.tensor([wide - 1.0, high - 1.0]))
@@ -234,7 +234,7 @@ def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
 
 def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) -> None:
     effective = asdict(settings) | {"data": [path.name for path in settings.data], "out": settings.out.name}
-    own = f"{settings.performers} rendered pictures of the embedded performer; no person's face."
+    own = f"{settings.performers} rendered images of the embedded performer; no person's face."
     given = f"{count - settings.performers} faces of {', '.join(path.name for path in settings.data)}"
     data = own if not settings.data else (f"{given}, {own}" if settings.performers else f"{given}.")
     flags = [f"--data {' '.join(path.name for path in settings.data)}"] if settings.data else []
@@ -258,7 +258,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
         metrics=metrics,
         recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
         card=(
-            "iBUG's 68 landmarks of faces in grey pictures, from boxes as OpenCV's Haar cascade gives them or "
+            "iBUG's 68 landmarks of faces in grey images, from boxes as OpenCV's Haar cascade gives them or "
             "`torchface.landmarks.images.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
             f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
             + (

@@ -13,7 +13,7 @@ import torch
 
 from torchface import Mesh, TorchfaceError, load_mesh, zoo
 from torchface.landmarks import (
-    TWELVE,
+    UV_LANDMARK_NAMES,
     CylinderLayout,
     DetectorSettings,
     FaceFrame,
@@ -44,12 +44,12 @@ class Settings:
         scans: Folder of scans (.obj, .ply, .stl, .glb), in any pose, in millimetres.
         annotations: JSON with the landmarks of each scan by file name.
         performers: Learn from scans of so many embedded performers instead of a folder's.
-        out: Folder for the model, its card and its pictures.
+        out: Folder for the model, its card and its images.
         appearance: What the detector looks at: the scans' colours, or their form.
         held_out: How many scans, the last by name, are kept for the test; or how many more performers are drawn for it.
             None if absent, and 20 performers.
         seed: Draws performers, and what their scanner does to them.
-        size: Pixels a side of the unwrapped pictures.
+        size: Pixels a side of the unwrapped images.
         licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
         detector: How landmarks are matched.
     """
@@ -58,7 +58,7 @@ class Settings:
     annotations: Path | None = None
     performers: int = 0
     out: Path = Path("models/uv_landmarks")
-    appearance: Literal["texture", "relief"] = "texture"
+    appearance: Literal["texture", "curvature"] = "texture"
     held_out: int | None = None
     seed: int = 7
     size: int = 1024
@@ -107,14 +107,14 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
 
 def fit(
     scans: list[AnnotatedScan],
-    appearance: Literal["texture", "relief"] = "texture",
+    appearance: Literal["texture", "curvature"] = "texture",
     size: int = 1024,
     detector: DetectorSettings | None = None,
     progress: Progress | None = None,
 ) -> UVLandmarkDetector:
     """Learns the face frame, unwraps every scan as it will be found again, learns the filters and the lines."""
     progress = progress or silent
-    points = torch.stack([scan.truth.twelve() for scan in scans])
+    points = torch.stack([scan.truth.ordered() for scan in scans])
     progress("learning the face frame")
     frame = FaceFrame.fit([scan.mesh for scan in scans], points)
     layout = CylinderLayout().resized(size)
@@ -130,7 +130,7 @@ def fit(
     return UVLandmarkDetector.fit(
         torch.stack(images),
         torch.stack(pixels).float(),
-        TWELVE,
+        UV_LANDMARK_NAMES,
         appearance,
         detector,
         frame,

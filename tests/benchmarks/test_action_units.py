@@ -36,7 +36,7 @@ from torchface.landmarks.scans.hog import HogLayout, cell_map
 from torchface.onnx import export_action_units
 from torchface.synthetic import draw_identities
 from torchface.synthetic.stages.action_performance import ACTION_UNITS
-from torchface.synthetic.stages.camera_stage import film_session
+from torchface.synthetic.stages.camera_stage import record_session
 
 FILMS = Path(__file__).resolve().parents[2] / "out" / "action_unit_films"
 NAMES = group_regions(GROUPS)
@@ -57,7 +57,7 @@ def film(number: int) -> Film:
     truth = FILMS / f"p{number}.safetensors"
     if not truth.is_file():
         identity = draw_identities(5, torch.Generator().manual_seed(11))[number]
-        session = film_session(FILMS, f"p{number}", identity, torch.Generator().manual_seed(100 + number))
+        session = record_session(FILMS, f"p{number}", identity, torch.Generator().manual_seed(100 + number))
         save_file({"intensities": session.performance.intensities}, truth)
     planted = load_file(truth)["intensities"][:, [ACTION_UNITS.index(unit) for unit in UNITS]]
     return Film(FILMS / f"p{number}.avi", load_action_labels(FILMS / f"p{number}.toml"), planted)

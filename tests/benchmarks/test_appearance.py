@@ -28,7 +28,12 @@ from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.ibug import box_around
 from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.portrait_video import EXPRESSIONS, expression_weights, film_portrait, mixed_expressions
+from torchface.synthetic.stages.portrait_video import (
+    EXPRESSIONS,
+    expression_weights,
+    mixed_expressions,
+    render_portrait_video,
+)
 
 LEARNED, TESTED, ACTORS = len(EXPRESSIONS), 45, (3, 4, 5)
 BOUND = 0.6
@@ -60,7 +65,7 @@ def scenes() -> list[Scene]:
         rig = performer(draw_identities(1, generator)[0])
         learned = expression_weights(rig.names, list(EXPRESSIONS.values()))
         weights = torch.cat([learned, mixed_expressions(rig.names, TESTED, generator)])
-        film = film_portrait(rig, weights, generator)
+        film = render_portrait_video(rig, weights, generator)
         truth = film.landmarks[LEARNED:]
         with torch.no_grad():
             start = trees(film.frames[LEARNED:, None].float() / 255, box_around(truth))
@@ -87,7 +92,7 @@ def optical_flow(scene: Scene) -> Tensor:
         nearest = int((laid - start).norm(dim=2).mean(1).argmin())
         middle = known[nearest].mean(0)
         pose = planar_pose(known[nearest] - middle, start[None])
-        turn, centre = pose.turn[0], torch.view_as_real(pose.shift)[0]
+        turn, centre = pose.rotation[0], torch.view_as_real(pose.translation)[0]
         matrix = np.array([[turn.real, -turn.imag, 0], [turn.imag, turn.real, 0]])
         matrix[:, 2] = centre.numpy() - matrix[:, :2] @ middle.numpy()
         height, width = image.shape

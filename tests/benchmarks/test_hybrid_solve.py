@@ -26,7 +26,7 @@ from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_picture, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.action_performance import MOVES, PerformanceSettings
-from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, StageSettings, film_session, stage_markers
+from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
 from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
 from torchface.synthetic.stages.marker_stage import StageFlaws
 
@@ -88,7 +88,7 @@ def film(name: str, number: int, seed: int, attachment: Attachment | None, setti
     truth, sites = folder / f"{name}.safetensors", folder / f"{name}.json"
     if not truth.is_file():
         generator = torch.Generator().manual_seed(seed)
-        session = film_session(folder, name, identity(number), generator, settings, attachment=attachment)
+        session = record_session(folder, name, identity(number), generator, settings, attachment=attachment)
         session.attachment.save(sites)
         save_file({"weights": session.performance.weights}, truth)
     return Film(

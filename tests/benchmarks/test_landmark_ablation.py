@@ -17,7 +17,13 @@ from torch import Tensor
 
 from torchface import Mesh, zoo
 from torchface.errors import NameMismatchError
-from torchface.landmarks import TWELVE, AutomaticLandmarks, LandmarkPairs, UVLandmarkDetector, contour_correspondences
+from torchface.landmarks import (
+    UV_LANDMARK_NAMES,
+    AutomaticLandmarks,
+    LandmarkPairs,
+    UVLandmarkDetector,
+    contour_correspondences,
+)
 from torchface.registration import register
 from torchface.registration.scan_preparation import Landmarks
 from torchface.rendering.compositing import headed, save_picture, sheet
@@ -78,7 +84,7 @@ def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
     for seed in range(300, 300 + SCANS):
         made = case(seed)
         pairs = contour_correspondences(detector, template, made.scan.mesh).above(SURE)
-        ways: dict[str, Landmarks | None] = {"none": None, "twelve": some(pairs, TWELVE)}
+        ways: dict[str, Landmarks | None] = {"none": None, "twelve": some(pairs, UV_LANDMARK_NAMES)}
         ways["twelve, lines"] = (pairs.vertices, pairs.points)
         for name, landmarks in ways.items():
             found = register(template, made.scan.mesh, landmarks, texture_size=0).mesh.vertices.double()

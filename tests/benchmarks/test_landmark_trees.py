@@ -23,7 +23,7 @@ from torchface.onnx import export_model
 from train.landmarks import Faces, evaluate, load_faces, rendered_faces
 
 LEARN, TEST = 300, 150
-SETTINGS = TreeSettings(cascades=8, trees=60, depth=5, oversampling=10, turn=0, gamma=0, noise=0)
+SETTINGS = TreeSettings(cascades=8, trees=60, depth=5, oversampling=10, rotation=0, gamma=0, noise=0)
 # dlib counts whole pixels, in what it learns and in what it says: large pictures make that no handicap.
 LARGER = 3
 
@@ -44,8 +44,8 @@ def enlarged(faces: Faces) -> Faces:
 def jittered(faces: Faces, seed: int) -> Faces:
     """Boxes moved and sized as a detector does, and as training does."""
     drawn = torch.randn(len(faces), 3, generator=torch.Generator().manual_seed(seed)).clamp(-2.5, 2.5)
-    side = faces.boxes[:, 2:] * (SETTINGS.zoom * drawn[:, 2:]).exp()
-    middle = faces.boxes[:, :2] + faces.boxes[:, 2:] * (0.5 + SETTINGS.shift * drawn[:, :2])
+    side = faces.boxes[:, 2:] * (SETTINGS.scale * drawn[:, 2:]).exp()
+    middle = faces.boxes[:, :2] + faces.boxes[:, 2:] * (0.5 + SETTINGS.translation * drawn[:, :2])
     return replace(faces, boxes=torch.cat([middle - side / 2, side], dim=1).round())
 
 
@@ -122,7 +122,7 @@ def learned_by_dlib(dlib, learn: Faces, own_oversampling: bool):  # type: ignore
     options.num_threads, options.be_verbose, options.random_seed = 1, False, "0"
     each = SETTINGS.oversampling // 2  # starts a picture, and as many of its mirror image
     options.oversampling_amount = each if own_oversampling else 1
-    options.oversampling_translation_jitter = SETTINGS.shift if own_oversampling else 0.0
+    options.oversampling_translation_jitter = SETTINGS.translation if own_oversampling else 0.0
     images, detections = [], []
     for side in (learn, mirrored(learn)):
         boxes = [side.boxes] if own_oversampling else [jittered(side, 10 + turn).boxes for turn in range(each)]

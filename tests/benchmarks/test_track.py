@@ -13,7 +13,7 @@ from torchface.io.camera_files import save_calibration
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.rendering.point_light import PointLight
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.evaluate.evaluate_result import EvaluationSettings, evaluate
 from torchface.workflows.track.track_video import TrackSettings, track_video
@@ -36,7 +36,7 @@ def filmed(folder: Path, seed: int) -> None:
     weights = actor.weights_from(track)
     light = PointLight(torch.full((3,), 0.35), torch.full((3,), 0.7), torch.tensor([-500.0, -700.0, 100.0]))
     settings = LightStageSettings(width=WIDTH, height=HEIGHT, samples=1)
-    film = film_under_light(folder / "film.mp4", actor, weights, light, FPS, generator, settings)
+    film = render_lit_video(folder / "film.mp4", actor, weights, light, FPS, generator, settings)
     save_rig(actor, folder / "rig.glb")
     save_weights_csv(Take(FPS, weights=Track(actor.names, weights[..., None])), folder / "true.csv")
     intrinsics = film.cameras[0].intrinsics

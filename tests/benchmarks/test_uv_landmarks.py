@@ -13,7 +13,13 @@ import torch
 from torchface import load_mesh
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.landmarks import TWELVE, ScanAnnotation, UVLandmarkDetector, scan_landmarks, twelve_from_ibug
+from torchface.landmarks import (
+    UV_LANDMARK_NAMES,
+    ScanAnnotation,
+    UVLandmarkDetector,
+    scan_landmarks,
+    uv_landmarks_from_ibug,
+)
 from torchface.landmarks.scans.detector_evaluation import error_table, landmark_errors, picture
 from torchface.rendering.compositing import save_picture, sheet
 from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
@@ -29,10 +35,10 @@ def scans() -> list[AnnotatedScan]:
 
 @pytest.fixture(scope="module")
 def detectors(scans: list[AnnotatedScan]) -> dict[str, UVLandmarkDetector]:
-    return {"texture": fit(scans[:LEARN], "texture"), "relief": fit(scans[:LEARN], "relief")}
+    return {"texture": fit(scans[:LEARN], "texture"), "curvature": fit(scans[:LEARN], "curvature")}
 
 
-@pytest.mark.parametrize(("kind", "line_limit"), [("texture", 3.0), ("relief", None)])
+@pytest.mark.parametrize(("kind", "line_limit"), [("texture", 3.0), ("curvature", None)])
 def test_landmarks_of_scanned_performers(
     kind: str,
     line_limit: float | None,
@@ -51,7 +57,7 @@ def test_landmarks_of_scanned_performers(
     for what, value in table.items():
         print(f"  {what:32}{value:8.2f}")
     each = torch.stack([one.pixels for one in errors]).nanmean(0)
-    for name, value in zip(TWELVE, each.tolist(), strict=True):
+    for name, value in zip(UV_LANDMARK_NAMES, each.tolist(), strict=True):
         print(f"    {name:30}{value:8.2f}")
     save_picture(sheet(pictures[:6], 3), PICTURES / f"performers_{kind}.png")
     assert table["mean error, pixels"] <= 8.0
@@ -60,23 +66,25 @@ def test_landmarks_of_scanned_performers(
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("kind", ["texture", "relief"])
+@pytest.mark.parametrize("kind", ["texture", "curvature"])
 def test_landmarks_of_a_real_scan(kind: str, data: Path, detectors: dict[str, UVLandmarkDetector]) -> None:
     scan = load_mesh(data / "scans" / "james" / "james.obj")
-    twelve = twelve_from_ibug(load_landmark_points(data / "scans" / "james" / "james.ljson").ibug().double())
+    twelve = uv_landmarks_from_ibug(load_landmark_points(data / "scans" / "james" / "james.ljson").ibug().double())
     twelve = SurfaceIndex(scan.vertices, scan.faces).nearest(twelve).points  # cheeks, onto the skin
-    truth = ScanAnnotation(dict(zip(TWELVE, twelve, strict=True)))
-    if kind == "relief":
+    truth = ScanAnnotation(dict(zip(UV_LANDMARK_NAMES, twelve, strict=True)))
+    if kind == "curvature":
         scan = replace(scan, texture=None, uvs=None, uv_faces=None)
     found = scan_landmarks(detectors[kind], scan)
     errors = landmark_errors(found, scan, truth)
-    inner = torch.tensor(["cheek" not in name for name in TWELVE])
+    inner = torch.tensor(["cheek" not in name for name in UV_LANDMARK_NAMES])
     mean = float(errors.millimetres[inner].mean())
     usual, _ = found.head.surface_points(scan, detectors[kind].prior_mean)
     alone = float((usual.double() - twelve).norm(dim=-1)[inner].mean())
     print(f"\nreal scan, {kind} learned from scanned performers: {mean:.2f} mm over eyes, nose and mouth")
     print(f"    the face frame alone, without looking at the picture: {alone:.2f} mm")
-    for name, value, sure in zip(TWELVE, errors.millimetres.tolist(), found.confidence.tolist(), strict=True):
+    for name, value, sure in zip(
+        UV_LANDMARK_NAMES, errors.millimetres.tolist(), found.confidence.tolist(), strict=True
+    ):
         print(f"    {name:24}{value:8.2f} mm, confidence {sure:.3f}")
     save_picture(picture(found, truth), PICTURES / f"real_scan_{kind}.png")
     assert mean <= 6.0

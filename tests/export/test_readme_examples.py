@@ -56,7 +56,7 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     images = torch.rand(3, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
     places = torch.tensor([[20.0, 20.0], [40.0, 44.0]]) + noise(3, 2, 2)
     settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
-    detector = UVLandmarkDetector.fit(images, places, ("left", "right"), "relief", settings)
+    detector = UVLandmarkDetector.fit(images, places, ("left", "right"), "curvature", settings)
     coarse = torch.rand(1, 1, 12, 20)
     picture = (255 * torch.nn.functional.interpolate(coarse, (360, 640), mode="bilinear")[0, 0]).byte()
     box = torch.tensor([[220.0, 90, 180, 180]])

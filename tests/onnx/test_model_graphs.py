@@ -72,7 +72,7 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
 def detector() -> UVLandmarkDetector:
     images, places = pictures(6, 0)
     settings = DetectorSettings(hog=HogLayout(stride=4), responses=50)
-    return UVLandmarkDetector.fit(images, places, ("cross", "ring"), "relief", settings)
+    return UVLandmarkDetector.fit(images, places, ("cross", "ring"), "curvature", settings)
 
 
 def test_a_head_is_decoded(head: HeadModel, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_each_point_for_itself() -> None:
 def test_one_model_is_the_kalman_filter() -> None:
     values = noisy(motion(10.0, 40, 3), 1.0)
     values[10:14, 1] = torch.nan
-    alone = AdaptiveSettings((1.0,), (0.1,), longest_gap=2, fading=0.9)
+    alone = AdaptiveSettings((1.0,), (0.1,), longest_gap=2, damping=0.9)
     torch.testing.assert_close(
         adaptive_filter(values, alone), kalman_filter(values, KalmanSettings(1.0, 0.1, 2, 0.9)), equal_nan=True
     )
@@ -107,8 +107,8 @@ def test_bad_input() -> None:
         adaptive_filter(torch.full((2, 1, 1), torch.inf))
     with pytest.raises(ValueRangeError, match="rising"):
         AdaptiveSettings(jerk=(1.0, 0.1))
-    with pytest.raises(ValueRangeError, match=r"fading 1\.5"):
-        AdaptiveSettings(fading=1.5)
+    with pytest.raises(ValueRangeError, match=r"damping 1\.5"):
+        AdaptiveSettings(damping=1.5)
     with pytest.raises(ValueRangeError, match="calm 2"):
         AdaptiveSettings(calm=2.0)
     with pytest.raises(ValueRangeError, match="positive deviations"):

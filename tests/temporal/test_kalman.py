@@ -45,10 +45,10 @@ def lag(values: Tensor, truth: Tensor) -> float:
     return best - 5 + 0.5 * float((before - after) / (before - 2 * here + after))
 
 
-@pytest.mark.parametrize("fading", [1.0, 0.9])
-def test_the_last_filtered_frame_is_the_least_squares_solution(fading: float) -> None:
+@pytest.mark.parametrize("damping", [1.0, 0.9])
+def test_the_last_filtered_frame_is_the_least_squares_solution(damping: float) -> None:
     values = measured(head_motion(12, 2))
-    settings = KalmanSettings(1.5, 0.4, fading=fading)
+    settings = KalmanSettings(1.5, 0.4, damping=damping)
     transition, noise = KalmanFilter(1, settings)._transition, KalmanFilter(1, settings)._noise[0]
     frames = len(values)
     # All frames' states at once: measurements, transitions and what is known of the first, each over its deviation.
@@ -119,8 +119,8 @@ def test_any_pattern_of_gaps(frames: int, channels: int, seed: int) -> None:
 def test_bad_input() -> None:
     with pytest.raises(ValueRangeError, match="positive deviations"):
         KalmanSettings(0.0, 1.0)
-    with pytest.raises(ValueRangeError, match="different fading"):
-        KalmanFilter(2, [KalmanSettings(1, 1), KalmanSettings(1, 1, fading=0.5)])
+    with pytest.raises(ValueRangeError, match="different damping"):
+        KalmanFilter(2, [KalmanSettings(1, 1), KalmanSettings(1, 1, damping=0.5)])
     with pytest.raises(ShapeError, match="found 3 settings, expected one or 2"):
         KalmanFilter(2, [KalmanSettings(1, 1)] * 3)
     with pytest.raises(ShapeError, match="a frame at least"):

@@ -15,19 +15,19 @@ from torchface.capture import ActionUnitClassifier
 from torchface.errors import NameMismatchError, TorchfaceError
 from torchface.io.action_labels import Performed, save_action_labels
 from torchface.synthetic.stages.action_performance import ACTION_UNITS, PerformanceSettings
-from torchface.synthetic.stages.camera_stage import FilmedSession, StageSettings, film_session
+from torchface.synthetic.stages.camera_stage import RecordedSession, StageSettings, record_session
 from train import action_units as recipe
 from train.action_units import Settings, performed_groups, train
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> FilmedSession:
+def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     performance = PerformanceSettings(2, 0, (), fps=15.0, pace=1.2)
     settings = StageSettings(112, 150, markers=10, performance=performance)
-    return film_session(tmp_path_factory.mktemp("film"), "one", None, torch.Generator().manual_seed(4), settings)
+    return record_session(tmp_path_factory.mktemp("film"), "one", None, torch.Generator().manual_seed(4), settings)
 
 
-def test_a_video_and_its_labels_become_a_model(session: FilmedSession, tmp_path: Path) -> None:
+def test_a_video_and_its_labels_become_a_model(session: RecordedSession, tmp_path: Path) -> None:
     video, labels = (session.video.path,), (session.labels_path,)
     out = tmp_path / "units"
     trained = train(Settings(video, labels, video, labels, out, size=32, folds=2))
@@ -42,7 +42,7 @@ def test_a_video_and_its_labels_become_a_model(session: FilmedSession, tmp_path:
     assert all(torch.equal(a, b) for a, b in same)
 
 
-def test_what_is_not_performed_is_left_out_what_is_unknown_is_named(session: FilmedSession, tmp_path: Path) -> None:
+def test_what_is_not_performed_is_left_out_what_is_unknown_is_named(session: RecordedSession, tmp_path: Path) -> None:
     some = tuple(stretch for stretch in session.labels.performed if stretch.units in (("9",), ("4",), ("45",)))
     groups = performed_groups([replace(session.labels, performed=some)])
     assert {unit for group in groups for unit in group.units} == {"4", "9", "45"}

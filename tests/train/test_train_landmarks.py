@@ -14,7 +14,7 @@ from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import box_around
 from torchface.rendering.compositing import save_picture
-from torchface.synthetic.stages.portraits import FacePicture, PictureSettings, face_pictures
+from torchface.synthetic.stages.portraits import FaceImage, PictureSettings, face_images
 from train import landmarks as recipe
 from train.landmarks import Faces, Settings, evaluate, load_faces, rendered_faces, train
 
@@ -22,12 +22,12 @@ FEW = TreeSettings(cascades=3, trees=15, depth=3, features=80, test_splits=10, o
 
 
 @pytest.fixture(scope="module")
-def pictures() -> list[FacePicture]:
-    return list(face_pictures(9, 5, PictureSettings(yaw=8, each=9, smallest=100, largest=120)))
+def pictures() -> list[FaceImage]:
+    return list(face_images(9, 5, PictureSettings(yaw=8, each=9, smallest=100, largest=120)))
 
 
 @pytest.fixture(scope="module")
-def folder(pictures: list[FacePicture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(pictures: list[FaceImage], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pictures as iBUG keeps them, one in a folder below, and as dlib does."""
     path = tmp_path_factory.mktemp("faces")
     (path / "more").mkdir()
@@ -46,7 +46,7 @@ def folder(pictures: list[FacePicture], tmp_path_factory: pytest.TempPathFactory
     return path
 
 
-def placed_alike(faces: Faces, pictures: list[FacePicture]) -> Tensor:
+def placed_alike(faces: Faces, pictures: list[FaceImage]) -> Tensor:
     """How far landmarks lie from the pictures' own once the crop is undone, in grey and in place."""
     away = []
     for image, box, points, picture in zip(faces.images, faces.boxes, faces.landmarks, pictures, strict=True):
@@ -59,7 +59,7 @@ def placed_alike(faces: Faces, pictures: list[FacePicture]) -> Tensor:
     return torch.stack(away)
 
 
-def test_folders_and_dlib_files_give_the_same_faces(folder: Path, pictures: list[FacePicture]) -> None:
+def test_folders_and_dlib_files_give_the_same_faces(folder: Path, pictures: list[FaceImage]) -> None:
     assert placed_alike(load_faces(folder), pictures).max() < 1e-3
     assert placed_alike(load_faces(folder / "faces.xml"), pictures).max() < 1.0  # whole pixels
 
@@ -124,7 +124,7 @@ def test_performers_are_learned_from(tmp_path: Path) -> None:
     assert "--pictures.smallest 90" not in record.recipe  # the default
     assert "--pictures.largest 100" in record.recipe
     once = rendered_faces(3, 8, small)
-    twice = list(face_pictures(1, 8, small)) + list(face_pictures(1, 8, small, first=1))
+    twice = list(face_images(1, 8, small)) + list(face_images(1, 8, small, first=1))
     assert all(torch.equal(a, b) for a, b in zip(once.images, [picture.image for picture in twice], strict=False))
     assert torch.equal(once.landmarks[:2], torch.stack([picture.landmarks for picture in twice]))
 
@@ -139,7 +139,7 @@ def test_bad_input_is_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="no face with 68 landmarks"):
         load_faces(tmp_path)
     (tmp_path / "alone.pts").write_text((folder / "face0.pts").read_text())
-    with pytest.raises(FileFormatError, match=r"alone\.pts: found no picture"):
+    with pytest.raises(FileFormatError, match=r"alone\.pts: found no image"):
         load_faces(tmp_path)
     text = (folder / "faces.xml").read_text().replace("face0.png", "../face0.png")
     (tmp_path / "outside.xml").write_text(text)
@@ -147,9 +147,9 @@ def test_bad_input_is_named(folder: Path, tmp_path: Path) -> None:
         load_faces(tmp_path / "outside.xml")
 
 
-def test_landmarks_lie_in_box_and_picture(pictures: list[FacePicture]) -> None:
+def test_landmarks_lie_in_box_and_picture(pictures: list[FaceImage]) -> None:
     """Brows, nose, eyes and mouth lie in the box, and the jaw in the picture."""
-    for picture in face_pictures(4, 31, PictureSettings(yaw=5, pitch=3, smallest=200, largest=220)):
+    for picture in face_images(4, 31, PictureSettings(yaw=5, pitch=3, smallest=200, largest=220)):
         grey, points = picture.image.float(), picture.landmarks
         assert picture.image.dtype == torch.uint8
         x, y = points[[31, 35, 3, 13]].round().long().unbind(1)

@@ -28,7 +28,7 @@ from torchface.landmarks import (
 from torchface.landmarks.scans.detector_evaluation import landmark_errors
 from torchface.landmarks.scans.hog import HogLayout
 from torchface.landmarks.scans.landmark_pairs import template_features
-from torchface.landmarks.scans.twelve_landmarks import LINES
+from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.synthetic import draw_identities, neutral_head, performer
 from torchface.synthetic.stages.scan_photographs import Photography
 from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, write_scans

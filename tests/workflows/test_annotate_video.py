@@ -18,28 +18,33 @@ from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.annotated_frames import load_annotated_frames
 from torchface.landmarks.images.frame_choice import choose_frames
 from torchface.synthetic import performer
-from torchface.synthetic.stages.portrait_video import EXPRESSIONS, PortraitFilm, expression_weights, film_portrait
+from torchface.synthetic.stages.portrait_video import (
+    EXPRESSIONS,
+    PortraitVideo,
+    expression_weights,
+    render_portrait_video,
+)
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.workflows.annotate_video import PROPOSALS, prepare_annotation, write_proposals
 from train.appearance import Settings, train
 
 
 @pytest.fixture(scope="module")
-def film() -> PortraitFilm:
+def film() -> PortraitVideo:
     rig = performer()
     weights = expression_weights(rig.names, list(EXPRESSIONS.values())[:7])
-    return film_portrait(rig, torch.cat([weights, 0.5 * weights]), torch.Generator().manual_seed(1))
+    return render_portrait_video(rig, torch.cat([weights, 0.5 * weights]), torch.Generator().manual_seed(1))
 
 
 @pytest.fixture(scope="module")
-def video(film: PortraitFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def video(film: PortraitVideo, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(film.frames, tmp_path_factory.mktemp("film") / "actor.avi", 30.0).path
 
 
 class Tracker:
     """Landmarks that are a little off, and how often they were asked for."""
 
-    def __init__(self, film: PortraitFilm) -> None:
+    def __init__(self, film: PortraitVideo) -> None:
         self.landmarks, self.asked = film.landmarks + 1.5, 0
 
     def __call__(self, video: VideoFile) -> tuple[Tensor, Tensor | None]:
@@ -48,12 +53,12 @@ class Tracker:
 
 
 @pytest.fixture
-def tracker(film: PortraitFilm) -> Tracker:
+def tracker(film: PortraitVideo) -> Tracker:
     return Tracker(film)
 
 
 def test_proposals_are_the_frames_that_differ_and_wait_for_the_next_run(
-    film: PortraitFilm, video: Path, tracker: Tracker, tmp_path: Path
+    film: PortraitVideo, video: Path, tracker: Tracker, tmp_path: Path
 ) -> None:
     found = prepare_annotation(video, tmp_path, tracker, 5)
     chosen = choose_frames(tracker.landmarks, 5).tolist()
@@ -95,7 +100,7 @@ def test_what_was_saved_comes_back_and_is_kept(video: Path, tracker: Tracker, tm
 
 
 def test_folders_and_counts_that_do_not_fit_are_refused(
-    film: PortraitFilm, video: Path, tracker: Tracker, tmp_path: Path
+    film: PortraitVideo, video: Path, tracker: Tracker, tmp_path: Path
 ) -> None:
     prepare_annotation(video, tmp_path, tracker, 3)
     other = write_video(film.frames[:5], tmp_path / "other.avi", 30.0).path
@@ -162,7 +167,7 @@ def test_a_drag_takes_neighbours_along_and_is_one_step(video: Path, tracker: Tra
 
 
 def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
-    film: PortraitFilm, video: Path, tmp_path: Path
+    film: PortraitVideo, video: Path, tmp_path: Path
 ) -> None:
     exact = Tracker(film)
     exact.landmarks = film.landmarks
@@ -184,7 +189,7 @@ def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
 
 
 def test_the_command_writes_proposals_of_the_zoos_tracker(
-    film: PortraitFilm, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    film: PortraitVideo, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "frames"
     main(["annotate", str(video), "--out", str(out), "--count", "3", "--no-browser", "--quiet"])

@@ -1,4 +1,4 @@
-"""Landmarks on faces: in pictures, and on scans unwrapped into UV space."""
+"""Landmarks on faces: in images, and on scans unwrapped into UV space."""
 
 from torchface.landmarks.images.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.face_box import (
@@ -19,7 +19,7 @@ from torchface.landmarks.images.tracking import (
 )
 from torchface.landmarks.images.tree_training import TreeSettings
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
-from torchface.landmarks.scans.curvature_image import relief
+from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.scans.detector_files import load_detector, save_detector
 from torchface.landmarks.scans.detector_settings import DetectorSettings
@@ -27,11 +27,11 @@ from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs, contour_correspondences
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, appearance_image, line_image, scan_landmarks
-from torchface.landmarks.scans.twelve_landmarks import TWELVE, twelve_from_ibug
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector, UVLandmarks
+from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 
 __all__ = [
-    "TWELVE",
+    "UV_LANDMARK_NAMES",
     "AppearanceFit",
     "AppearanceModel",
     "AppearanceSettings",
@@ -57,6 +57,7 @@ __all__ = [
     "YuNetDetector",
     "appearance_image",
     "contour_correspondences",
+    "curvature_image",
     "find_face",
     "find_faces",
     "find_landmarks",
@@ -64,12 +65,11 @@ __all__ = [
     "line_image",
     "load_annotations",
     "load_detector",
-    "relief",
     "save_annotations",
     "save_detector",
     "scan_landmarks",
     "trace_contour",
     "track_landmarks",
-    "twelve_from_ibug",
     "unwrap",
+    "uv_landmarks_from_ibug",
 ]

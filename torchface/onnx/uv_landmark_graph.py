@@ -14,7 +14,7 @@ from torchface import __version__
 from torchface.errors import ShapeError
 from torchface.landmarks import UVLandmarkDetector
 from torchface.landmarks.scans.hog import cell_map
-from torchface.landmarks.scans.uv_detector import FARTHEST
+from torchface.landmarks.scans.uv_detector import MAX_DISTANCE
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.exported_model import exported_model
 from torchface.rendering.gaussian_blur import unsharp
@@ -66,7 +66,7 @@ class LandmarkBank(nn.Module):
         offset = places[None] - detector.prior_mean[:, None]
         variances, axes = torch.linalg.eigh(detector.prior_covariance.double())
         squared = ((offset.double() @ axes) ** 2 / variances[:, None]).sum(-1)
-        self.register_buffer("near", (torch.exp(-0.5 * squared) * (squared < FARTHEST**2)).float())
+        self.register_buffer("near", (torch.exp(-0.5 * squared) * (squared < MAX_DISTANCE**2)).float())
         reach = int(settings.bandwidth // hog.stride)
         across = torch.arange(-reach, reach + 1) * float(hog.stride)
         disc = (across[:, None] ** 2 + across**2 <= settings.bandwidth**2).float()

@@ -22,8 +22,8 @@ class Shown:
     """Points (Q,) in one photograph.
 
     Args:
-        cosine: between the normal and the way to the camera, (Q,); 0 where the point is hidden or outside the picture.
-        colors: of the picture there, (Q,3), bilinear.
+        cosine: between the normal and the way to the camera, (Q,); 0 where the point is hidden or outside the image.
+        colors: of the image there, (Q,3), bilinear.
     """
 
     cosine: Tensor
@@ -46,10 +46,10 @@ def shown_in(
         caster: the mesh that the points lie on, which hides some of them.
         points: millimetres.
         normals: unit.
-        calibration: of a lens that bends the picture; none if absent.
+        calibration: of a lens that bends the image; none if absent.
 
     Raises:
-        ShapeError: the picture is not of the camera's size.
+        ShapeError: the image is not of the camera's size.
     """
     if image.ndim != 3 or image.shape != (3, camera.height, camera.width):
         raise ShapeError(f"images: found {tuple(image.shape)}, expected (3,{camera.height},{camera.width})")

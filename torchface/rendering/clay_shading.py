@@ -1,4 +1,4 @@
-"""Pictures of a mesh by ray casting, lit so that form shows: key, fill and rim light, soft shadow in creases."""
+"""Images of a mesh by ray casting, lit so that form shows: key, fill and rim light, soft shadow in creases."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def render(
     samples: int = 2,
     normal_map: Tensor | None = None,
 ) -> Tensor:
-    """A picture of a mesh.
+    """An image of a mesh.
 
     Args:
         mesh: its texture is used where it has one, else its vertex colours, else clay.
@@ -103,7 +103,7 @@ def _albedo(mesh: Mesh, colors: Tensor | None, triangle: Tensor, barycentric: Te
         sampled = sample_texture(mesh.texture, uv)
         if mesh.colors is None:
             return sampled
-        # Charts of further tiles (UDIM) have no place in the one picture that a mesh has.
+        # Charts of further tiles (UDIM) have no place in the one image that a mesh has.
         beyond = ((uv < 0) | (uv > 1)).any(-1, keepdim=True)
         own = (mesh.colors[mesh.faces[triangle]].float() * barycentric[..., None]).sum(1)
         return torch.where(beyond, own.to(sampled), sampled)

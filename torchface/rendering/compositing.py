@@ -1,4 +1,4 @@
-"""Pictures put together: heat colours, captions, sheets of many, files."""
+"""Images put together: heat colours, captions, sheets of many, files."""
 
 from __future__ import annotations
 

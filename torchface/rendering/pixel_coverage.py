@@ -1,4 +1,4 @@
-"""Which pixels of a picture a mesh covers, with what of it, and by what share at its edges."""
+"""Which pixels of an image a mesh covers, with what of it, and by what share at its edges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NEAR = 1.0  # millimetres before the lens
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """S samples of a mesh in a picture: one at the centre of a pixel inside, several where the surface ends.
+    """S samples of a mesh in an image: one at the centre of a pixel inside, several where the surface ends.
 
     Args:
         pixel: row-major index of the pixel, (S,) int64.
@@ -32,7 +32,7 @@ class Footprint:
         points: in the camera's frame, (S,3), millimetres.
         normals: there, unit, smooth, (S,3).
         caster: the mesh in the camera's frame.
-        height, width: of the picture.
+        height, width: of the image.
     """
 
     pixel: Tensor
@@ -66,7 +66,7 @@ class Footprint:
         )
 
     def softened(self, values: Tensor, weights: Tensor | None = None, sigma: float = 1.0) -> Tensor:
-        """Values (S,C) of the samples, blurred over the picture, (S,C).
+        """Values (S,C) of the samples, blurred over the image, (S,C).
 
         Args:
             values: of each sample.
@@ -84,7 +84,7 @@ class Footprint:
         return blurred[:, :-1] / blurred[:, -1:].clamp(min=1e-6)
 
     def blended(self, picture: Tensor, over: Tensor, alpha: Tensor) -> Tensor:
-        """A picture (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, laid over it."""
+        """An image (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, laid over it."""
         flat = picture.reshape(3, -1).T
         weight = self.share.to(flat)[:, None]
         laid = torch.zeros(len(flat), 4, dtype=flat.dtype)
@@ -101,8 +101,8 @@ def footprint(
         vertices: (V,3), millimetres.
         faces: (F,3) int64; all of them hide what is behind them.
         shows: the triangles wanted, (F,) bool.
-        camera: of the picture.
-        calibration: of a lens that bends the picture; rays are bent with it, so that nothing has to be warped.
+        camera: of the image.
+        calibration: of a lens that bends the image; rays are bent with it, so that nothing has to be warped.
     """
     points = in_camera_frame(camera, vertices)
     caster = RayCaster(points, faces)
@@ -181,7 +181,7 @@ def _sampled(
 
 
 def _box(points: Tensor, camera: Camera, calibration: CameraCalibration | None) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom (one beyond) of the mesh in the picture."""
+    """Left, top, right, bottom (one beyond) of the mesh in the image."""
     if bool((points[:, 2] < _NEAR).any()):
         in_front = points[points[:, 2] >= _NEAR]
         return (0, 0, camera.width, camera.height) if len(in_front) else (0, 0, 0, 0)

@@ -13,7 +13,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 
-FARTHEST = 100_000.0
+MAX_DISTANCE = 100_000.0
 """Millimetres; a light 100 m away shines from one direction: the directional limit."""
 
 _OFF_THE_SKIN = 0.4  # millimetres; a ray that starts on the skin would hit it
@@ -23,7 +23,7 @@ _OFF_THE_SKIN = 0.4  # millimetres; a ray that starts on the skin would hit it
 class PointLight:
     r"""Light from one point and from everywhere, linear, standing still beside the camera.
 
-    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): a picture cannot tell a bright lamp
+    Light and surface meet only in products (:math:`I_a K_a` and :math:`I_p K_d`): an image cannot tell a bright lamp
     on dark skin from a dim one on bright skin. The coefficients K are therefore 1, and what is here are the products
     beside the albedo that was given. Distance does not dim the light.
 
@@ -56,7 +56,7 @@ class PointLight:
     @staticmethod
     def directional(ambient: Tensor, intensity: Tensor, direction: Tensor) -> PointLight:
         """A light so far away that it shines from one direction (3,), from the face toward the light."""
-        return PointLight(ambient, intensity, FARTHEST * torch.nn.functional.normalize(direction, dim=0))
+        return PointLight(ambient, intensity, MAX_DISTANCE * torch.nn.functional.normalize(direction, dim=0))
 
     def toward(self, points: Tensor) -> Tensor:
         """Unit vectors L from points (...,3) in the camera's frame to the lamp."""

@@ -1,4 +1,4 @@
-"""A painted texture on a filmed face in the light of the film, and a filmed face under another light."""
+"""A painted texture on a recorded face in the light of the video, and a recorded face under another light."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _NOT_SKIN = (
     "eyeball", "eye_socket", "eye_blend", "eye_occlusion", "eyelash", "lacrimal", "mouth_interior", "mouth_socket",
     "gums", "teeth", "tongue", "nostrils",
 )  # fmt: skip
-_MOST_GAIN = 10.0
+_MAX_GAIN = 10.0
 _FLOOR = 1e-3  # linear; light that lenses scatter, so that black has a quotient
 _BESIDE = 3.0  # pixels, standard deviation of a blur
-_LARGEST = 8192
+_MAX_SIDE = 8192
 
 
 def skin_faces(mesh: Mesh) -> Tensor:
@@ -55,7 +55,7 @@ class FacePaint:
 
     @staticmethod
     def of(mesh: Mesh, texture: Tensor) -> FacePaint:
-        """Paint of a picture in the mesh's texture coordinates.
+        """Paint of an image in the mesh's texture coordinates.
 
         Args:
             mesh: with texture coordinates.
@@ -69,10 +69,10 @@ class FacePaint:
         """
         if mesh.uvs is None or mesh.uv_faces is None:
             raise TopologyError("overlay: found a mesh without texture coordinates, expected some to paint by")
-        if texture.ndim != 3 or texture.shape[0] != 4 or not 1 <= min(texture.shape) <= max(texture.shape) <= _LARGEST:
+        if texture.ndim != 3 or texture.shape[0] != 4 or not 1 <= min(texture.shape) <= max(texture.shape) <= _MAX_SIDE:
             raise ShapeError(
                 f"texture: found {tuple(texture.shape)}, expected (4,h,w), red, green, blue and alpha, at most "
-                f"{_LARGEST} a side"
+                f"{_MAX_SIDE} a side"
             )
         values = texture.detach().cpu()
         values = values.float() / 255 if values.dtype == torch.uint8 else values.float()
@@ -195,7 +195,7 @@ def relight(
     clear = (1 - 4 * lit * (1 - lit)).clamp(min=0) ** 2 * (covered.share == 1)
     reflected = torch.lerp(covered.softened(reflected, clear + 1e-3, _BESIDE), reflected, clear[:, None])
     new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
-    new = torch.minimum(new.clamp(min=0), _MOST_GAIN * old)
+    new = torch.minimum(new.clamp(min=0), _MAX_GAIN * old)
     alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
     return _as(frame, picture, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
 
@@ -242,7 +242,7 @@ def _checked(frame: Tensor, vertices: Tensor, mesh: Mesh, camera: Camera) -> Ten
 
 
 def _as(frame: Tensor, picture: Tensor, linear: Tensor, pixel: Tensor) -> Tensor:
-    """The picture with the pixels changed that something was laid on, in the frame's kind; the others stay exactly."""
+    """The image with the pixels changed that something was laid on, in the frame's kind; the others stay exactly."""
     touched = pixel.unique()
     result = picture.reshape(3, -1).clone()
     result[:, touched] = to_srgb(linear.reshape(3, -1)[:, touched].clamp(0, 1))

@@ -19,7 +19,7 @@ class AdaptiveSettings:
     Args:
         measurement: deviations of the measurements, in their unit.
         jerk: deviations of what the acceleration changes by in a frame, rising.
-        fading: see :class:`KalmanSettings`.
+        damping: see :class:`KalmanSettings`.
         calm: share of each motion's credit that goes to the next calmer one: what is most likely still jitters more
             than eyes forgive, and a little calmer is hardly less exact.
         memory: frames after which a forecast counts 1/e.
@@ -28,7 +28,7 @@ class AdaptiveSettings:
 
     measurement: tuple[float, ...] = (0.2, 0.6, 1.5, 4.0)
     jerk: tuple[float, ...] = (0.003, 0.01, 0.033, 0.11, 0.36, 1.2)
-    fading: float = 0.92
+    damping: float = 0.92
     calm: float = 0.3
     memory: float = 30.0
     longest_gap: int = 10
@@ -49,14 +49,14 @@ class AdaptiveSettings:
     def combinations(self) -> list[KalmanSettings]:
         """Every measurement with every jerk, jerks running faster."""
         pairs = itertools.product(self.measurement, self.jerk)
-        return [KalmanSettings(noise, jerk, self.longest_gap, self.fading) for noise, jerk in pairs]
+        return [KalmanSettings(noise, jerk, self.longest_gap, self.damping) for noise, jerk in pairs]
 
 
 class AdaptiveFilter:
     r"""A causal filter for P points of D channels, as smooth as each point's noise and motion ask for.
 
     One :class:`KalmanFilter` runs for each combination of noise and motion, and each counts as much as it has
-    foretold the last frames of the point well:
+    predicted the last frames of the point well:
 
     .. math:: \hat x_t = \sum_m \omega_m \hat x_t^{(m)}, \qquad
         \omega_m \propto \prod_{s \le t} p(z_s \mid z_{<s}, m)^{(1 - 1/\tau)^{t-s}}
@@ -97,17 +97,17 @@ class AdaptiveFilter:
         running = self._filter.to(measured.device)
         running.predict()
         variance = running.covariance[:, 0, 0] + running.variance
-        off = every - running.state[:, 0]
-        certainty = -0.5 * (off.square() / variance + variance.log())
-        known = ~off.isnan()
+        residual = every - running.state[:, 0]
+        certainty = -0.5 * (residual.square() / variance + variance.log())
+        known = ~residual.isnan()
         gained = torch.where(known, certainty, 0.0).reshape(self._models, *self.shape).sum(-1)
         fade = torch.where(known.reshape(self._models, *self.shape).any(-1), 1 - 1 / self.settings.memory, 1.0)
         self.scores = fade * self.scores + gained
         running.correct(every)
         states = running.state[:, 0].reshape(self._models, *self.shape)
-        return (self._shares()[..., None] * states).sum(0)
+        return (self._model_weights()[..., None] * states).sum(0)
 
-    def _shares(self) -> Tensor:
+    def _model_weights(self) -> Tensor:
         """How much each model counts for each point, (M,P)."""
         likely = torch.softmax(self.scores, dim=0).reshape(-1, len(self.settings.jerk), self.shape[0])
         calmer = torch.cat([likely[:, 1:], torch.zeros_like(likely[:, :1])], dim=1)

@@ -13,7 +13,7 @@ from torchface.errors import ShapeError, ValueRangeError
 # Deviation of the first velocity and acceleration, in measurement deviations a frame: nothing is known of them.
 _FIRST_VELOCITY, _FIRST_ACCELERATION = 30.0, 30.0
 _RATIOS = torch.logspace(-3, 0.5, 22, dtype=torch.float64)
-_FEWEST_FRAMES = 8
+_MIN_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,14 @@ class KalmanSettings:
             smooth and slow, large quick and rough. See :func:`estimate_settings`.
         longest_gap: frames without measurements that the causal filter bridges by prediction; then it waits for the
             next one and starts anew.
-        fading: what is left of an acceleration after a frame; 1 is constant acceleration. What swings to and fro is
-            foretold better with a little less, and does not run away in gaps.
+        damping: what is left of an acceleration after a frame; 1 is constant acceleration. What swings to and fro is
+            predicted better with a little less, and does not run away in gaps.
     """
 
     measurement: float
     jerk: float
     longest_gap: int = 10
-    fading: float = 1.0
+    damping: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 < self.measurement < float("inf") and 0 < self.jerk < float("inf") and self.longest_gap >= 0):
@@ -41,8 +41,8 @@ class KalmanSettings:
                 f"Kalman filter: found measurement {self.measurement}, jerk {self.jerk}, longest_gap "
                 f"{self.longest_gap}, expected positive deviations and a gap from 0"
             )
-        if not 0 <= self.fading <= 1:
-            raise ValueRangeError(f"Kalman filter: found fading {self.fading}, expected 0 to 1")
+        if not 0 <= self.damping <= 1:
+            raise ValueRangeError(f"Kalman filter: found damping {self.damping}, expected 0 to 1")
 
 
 class KalmanFilter:
@@ -59,9 +59,9 @@ class KalmanFilter:
 
     Raises:
         ShapeError: another number of settings than of channels.
-        ValueRangeError: settings of different fading.
+        ValueRangeError: settings of different damping.
 
-    Source: Kalman 1960; Singer 1970 for fading; thesis 4.2.5.
+    Source: Kalman 1960; Singer 1970 for damping; thesis 4.2.5.
     """
 
     def __init__(self, channels: int, settings: KalmanSettings | Sequence[KalmanSettings]) -> None:
@@ -74,9 +74,9 @@ class KalmanFilter:
         self.state = torch.full((channels, 3), torch.nan, dtype=torch.float64)
         self.covariance = torch.zeros(channels, 3, 3, dtype=torch.float64)
         self._unseen = torch.zeros(channels, dtype=torch.int64)
-        if len({one.fading for one in each}) > 1:
-            raise ValueRangeError("Kalman filter: found settings of different fading, expected one for all channels")
-        self._transition, noise = _model(each[0].fading)
+        if len({one.damping for one in each}) > 1:
+            raise ValueRangeError("Kalman filter: found settings of different damping, expected one for all channels")
+        self._transition, noise = _model(each[0].damping)
         self._noise = noise * torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
 
     def to(self, device: torch.device) -> KalmanFilter:
@@ -203,8 +203,8 @@ def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) 
     curves = _checked(values)
     if not 0 < calm < float("inf"):
         raise ValueRangeError(f"estimate_settings: found calm {calm}, expected a positive share")
-    if len(curves) < _FEWEST_FRAMES:
-        raise ValueRangeError(f"estimate_settings: found {len(curves)} frames, expected at least {_FEWEST_FRAMES}")
+    if len(curves) < _MIN_FRAMES:
+        raise ValueRangeError(f"estimate_settings: found {len(curves)} frames, expected at least {_MIN_FRAMES}")
     channels, ratios = curves.shape[1], len(_RATIOS)
     # All ratios at once: each channel is filtered under every one.
     each = [KalmanSettings(1.0, ratio, len(curves)) for ratio in _RATIOS.tolist() for _ in range(channels)]
@@ -227,9 +227,9 @@ def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) 
     return KalmanSettings(deviation, calm * float(_RATIOS[best]) * deviation, longest_gap)
 
 
-def _model(fading: float) -> tuple[Tensor, Tensor]:
+def _model(damping: float) -> tuple[Tensor, Tensor]:
     """The transition, and the covariance that white jerk of deviation 1 adds in a frame."""
-    transition = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, fading]], dtype=torch.float64)
+    transition = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, damping]], dtype=torch.float64)
     noise = torch.tensor([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]], dtype=torch.float64)
     return transition, noise
 

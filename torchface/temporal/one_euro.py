@@ -71,17 +71,17 @@ class OneEuroFilter:
         known = ~(values.isnan() | self._value.isnan())
         step = torch.where(known, values - self._value, 0.0)
         surprise = torch.where(known, step * self.fps - self._speed, 0.0)
-        self._speed = self._speed + surprise * self._share(self.settings.speed_cutoff)
+        self._speed = self._speed + surprise * self._gain(self.settings.speed_cutoff)
         cutoff = self.settings.cutoff + self.settings.speed * self._speed.abs()
         first = torch.where(self._value.isnan(), values, self._value)
-        self._value = first + step * self._share(cutoff)
+        self._value = first + step * self._gain(cutoff)
         return self._value.clone()
 
     def reset(self) -> None:
         """Forgets the frames before, as at the start of another take."""
         self._value = self._speed = None
 
-    def _share(self, cutoff):  # type: ignore[no-untyped-def]
+    def _gain(self, cutoff):  # type: ignore[no-untyped-def]
         """What of a step is taken, of a number or of a tensor."""
         return 1 / (1 + self.fps / (2 * math.pi * cutoff))
 

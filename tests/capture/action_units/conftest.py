@@ -11,7 +11,7 @@ from torchface.capture.action_units import GROUPS, ActionUnitClassifier, RegionV
 from torchface.capture.action_units.classifier import group_regions
 from torchface.synthetic import draw_identities
 from torchface.synthetic.stages.action_performance import PerformanceSettings
-from torchface.synthetic.stages.camera_stage import FilmedSession, StageSettings, film_session
+from torchface.synthetic.stages.camera_stage import RecordedSession, StageSettings, record_session
 from torchface.synthetic.stages.helmet_camera import CameraFlaws
 
 SIZE = 40
@@ -23,28 +23,28 @@ def stage_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def session(stage_folder: Path) -> FilmedSession:
+def session(stage_folder: Path) -> RecordedSession:
     """Three repetitions of each unit, two of a combination, 20 frames a second."""
     performance = PerformanceSettings(3, 2, (("4", "9"),), fps=20.0, pace=1.3)
     flaws = CameraFlaws(loose_rotation=0.6, loose_translation=1.2)
     settings = StageSettings(128, 170, markers=20, flaws=flaws, performance=performance)
-    return film_session(stage_folder, "first", None, torch.Generator().manual_seed(1), settings)
+    return record_session(stage_folder, "first", None, torch.Generator().manual_seed(1), settings)
 
 
 @pytest.fixture(scope="session")
-def other(stage_folder: Path) -> FilmedSession:
+def other(stage_folder: Path) -> RecordedSession:
     """Another face, each unit once."""
     performance = PerformanceSettings(1, 1, (("4", "9"),), fps=20.0, pace=1.3)
     settings = StageSettings(128, 170, markers=20, performance=performance)
     identity = draw_identities(3, torch.Generator().manual_seed(5), scale=0.7)[1]
-    return film_session(stage_folder, "second", identity, torch.Generator().manual_seed(2), settings)
+    return record_session(stage_folder, "second", identity, torch.Generator().manual_seed(2), settings)
 
 
 @pytest.fixture(scope="session")
-def regions(session: FilmedSession) -> RegionVideo:
+def regions(session: RecordedSession) -> RegionVideo:
     return read_regions(session.video, session.labels, group_regions(GROUPS), size=SIZE)
 
 
 @pytest.fixture(scope="session")
-def classifier(regions: RegionVideo, session: FilmedSession) -> ActionUnitClassifier:
+def classifier(regions: RegionVideo, session: RecordedSession) -> ActionUnitClassifier:
     return ActionUnitClassifier.fit([regions], [session.labels])

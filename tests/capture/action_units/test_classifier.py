@@ -29,10 +29,10 @@ from torchface.capture.action_units.one_vs_one import OneVsOne
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
 from torchface.synthetic.stages.action_performance import MOVES
-from torchface.synthetic.stages.camera_stage import FilmedSession
+from torchface.synthetic.stages.camera_stage import RecordedSession
 
 
-def planted(session: FilmedSession, units: tuple[str, ...]) -> torch.Tensor:
+def planted(session: RecordedSession, units: tuple[str, ...]) -> torch.Tensor:
     performance = session.performance
     return performance.intensities[:, [performance.units.index(unit) for unit in units]]
 
@@ -89,7 +89,7 @@ def test_levels_follow_the_intensity_of_a_moving_stroke() -> None:
         intensity_levels(torch.zeros(60, 1, 4, 4), at_rest)
 
 
-def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, session: FilmedSession) -> None:
+def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, session: RecordedSession) -> None:
     for group in GROUPS:
         rows = [regions.names.index(name) for name in group.regions]
         known = label_group(regions.patterns[:, rows], [session.labels], group, TrainingSettings())
@@ -98,14 +98,14 @@ def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, sessio
             assert torch.corrcoef(torch.stack([labelled[:, a], truth[:, a]]))[0, 1] > 0.93, group.units[a]
 
 
-def test_cross_validated_accuracy(regions: RegionVideo, session: FilmedSession) -> None:
+def test_cross_validated_accuracy(regions: RegionVideo, session: RecordedSession) -> None:
     accuracy = cross_validation([regions], [session.labels], folds=3, split="repetitions")
     assert set(accuracy) == {group.name for group in GROUPS}
     assert sum(accuracy.values()) / len(accuracy) > 0.85  # the benchmark has five repetitions at 60 frames a second
 
 
 def test_planted_intensities_come_back(
-    classifier: ActionUnitClassifier, regions: RegionVideo, session: FilmedSession
+    classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:
     truth = planted(session, classifier.units)
     found = level_agreement(classify(classifier, regions), truth)
@@ -127,13 +127,15 @@ def test_planted_intensities_come_back(
     )
 
 
-def test_another_performer_is_understood(classifier: ActionUnitClassifier, other: FilmedSession) -> None:
+def test_another_performer_is_understood(classifier: ActionUnitClassifier, other: RecordedSession) -> None:
     video = read_regions(other.video, other.labels, classifier.regions, classifier.neutral, classifier.size)
     found = level_agreement(classify(classifier, video), planted(other, classifier.units))
     assert found["within_one"] > 0.8
 
 
-def test_two_performers_can_be_learned_from(regions: RegionVideo, session: FilmedSession, other: FilmedSession) -> None:
+def test_two_performers_can_be_learned_from(
+    regions: RegionVideo, session: RecordedSession, other: RecordedSession
+) -> None:
     groups = [
         RegionGroup("mouth", ("mouth",), ("18L",)),
         RegionGroup("between_brows", ("between_brows",), ("9",), ("4",)),
@@ -192,7 +194,7 @@ def test_a_config_that_cannot_be_is_refused(classifier: ActionUnitClassifier) ->
         classifier(torch.zeros(2, 3, 40, 40), torch.zeros(3, 40, 40))
 
 
-def test_what_is_never_performed_is_named(regions: RegionVideo, session: FilmedSession) -> None:
+def test_what_is_never_performed_is_named(regions: RegionVideo, session: RecordedSession) -> None:
     labels = session.labels
     without = replace(labels, performed=tuple(s for s in labels.performed if s.units != ("9",)))
     with pytest.raises(NameMismatchError, match="9 is never performed alone"):

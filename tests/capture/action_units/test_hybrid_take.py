@@ -8,14 +8,14 @@ from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver
 from torchface.capture.action_units import RegionVideo, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
 from torchface.synthetic.stages.action_performance import MOVES
-from torchface.synthetic.stages.camera_stage import FilmedSession, stage_markers
+from torchface.synthetic.stages.camera_stage import RecordedSession, stage_markers
 from torchface.synthetic.stages.marker_stage import record
 
 LED = ("4", "9", "6+43", "18L")
 
 
 def test_weights_that_markers_do_not_show(
-    classifier: ActionUnitClassifier, regions: RegionVideo, session: FilmedSession
+    classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:
     rig, names, true = session.rig, session.rig.names, session.performance.weights
     led = sorted({names.index(shape) for unit in LED for shape in MOVES[unit]})
@@ -39,7 +39,7 @@ def test_weights_that_markers_do_not_show(
 
 
 def test_where_the_classifier_leads(
-    classifier: ActionUnitClassifier, regions: RegionVideo, session: FilmedSession
+    classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:
     names, table = session.rig.names, load_shape_table("arkit")
     source = action_unit_curves(classifier, regions, session.labels, table, names, at_rest=False)

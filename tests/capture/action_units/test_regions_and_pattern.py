@@ -14,7 +14,7 @@ from torchface.capture.action_units.pattern_flow import aligned_grid, neutral_fl
 from torchface.capture.action_units.regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
-from torchface.synthetic.stages.camera_stage import FilmedSession
+from torchface.synthetic.stages.camera_stage import RecordedSession
 
 
 def test_a_region_of_its_own_size_is_a_cut() -> None:
@@ -70,7 +70,7 @@ def test_warps_are_small_smooth_and_the_same_again(regions: RegionVideo) -> None
     torch.testing.assert_close(local_warps(images, 0.0, torch.Generator().manual_seed(0)), images, atol=1e-5, rtol=0)
 
 
-def test_bad_input_is_named(session: FilmedSession, regions: RegionVideo, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_path) -> None:  # type: ignore[no-untyped-def]
     video, labels = session.video, session.labels
     outside = replace(labels, regions=dict(labels.regions, mouth=(60.0, 100.0, 130.0, 150.0)))
     with pytest.raises(ValueRangeError, match=r"region 'mouth' is .* inside the image of 128 x 170"):

@@ -9,11 +9,11 @@ import pytest
 from torchface import load_take, save_rig, zoo
 from torchface.capture.action_units import ActionUnitClassifier
 from torchface.cli import main
-from torchface.synthetic.stages.camera_stage import FilmedSession
+from torchface.synthetic.stages.camera_stage import RecordedSession
 
 
 def test_the_video_leads_what_markers_hardly_see(
-    other: FilmedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    other: RecordedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="filmed", metrics={}, recipe="none")
     save_rig(other.rig, tmp_path / "rig.glb")

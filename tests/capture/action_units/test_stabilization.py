@@ -10,12 +10,12 @@ import torch
 from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import AlignmentError, ShapeError
-from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, FilmedSession
+from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, RecordedSession
 from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
 from torchface.synthetic.stages.helmet_camera import HELMET_POINT, helmet_camera
 
 
-def test_points_are_followed_through_the_shake(session: FilmedSession) -> None:
+def test_points_are_followed_through_the_shake(session: RecordedSession) -> None:
     frames = torch.cat(list(session.video.chunks()))
     labels = session.labels
     tracker = PointTracker(frames[labels.neutral], torch.tensor(labels.helmet), torch.tensor(labels.markers))
@@ -63,7 +63,7 @@ def test_the_similarity_of_three_points_is_recovered() -> None:
         steady_transforms(reference, gap)
 
 
-def test_a_steady_picture_changes_less_at_rest(session: FilmedSession, regions: RegionVideo) -> None:
+def test_a_steady_picture_changes_less_at_rest(session: RecordedSession, regions: RegionVideo) -> None:
     from torchface.capture.action_units.pattern import pattern_levels
     from torchface.capture.action_units.regions import region_grid, sample_regions
 
@@ -78,7 +78,7 @@ def test_a_steady_picture_changes_less_at_rest(session: FilmedSession, regions: 
     assert wobble[0] < 0.75 * wobble[1]
 
 
-def test_nothing_to_follow_is_said(session: FilmedSession) -> None:
+def test_nothing_to_follow_is_said(session: RecordedSession) -> None:
     frame = session.video.frame(0)
     helmet, markers = torch.tensor(session.labels.helmet), torch.tensor(session.labels.markers)
     with pytest.raises(AlignmentError, match="inside the image"):

@@ -27,7 +27,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light, lit_picture, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, render_lit_video, turning_cameras
 from torchface.synthetic.stages.weight_curves import perform
 
 STAGE = LightStageSettings(width=200, height=200, samples=1)
@@ -202,7 +202,7 @@ def test_from_a_file_to_its_light(tmp_path: Path, rig: BlendshapeRig) -> None:
     """The first frame of a film tells the light of the others, while the head turns and speaks."""
     generator = torch.Generator().manual_seed(6)
     light = PointLight(torch.tensor([0.2, 0.2, 0.25]), torch.tensor([0.7, 0.6, 0.5]), torch.tensor([450.0, -350, 150]))
-    film = film_under_light(
+    film = render_lit_video(
         tmp_path / "lit.avi", rig, performed(rig, 60, generator)[::20], light, 1.0, generator, STAGE
     )
     video = open_video(film.video.path)

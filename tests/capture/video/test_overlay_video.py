@@ -15,22 +15,22 @@ from torchface.errors import ShapeError
 from torchface.io.video import open_video
 from torchface.rendering.point_light import PointLight
 from torchface.synthetic import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, LitFilm, film_under_light
+from torchface.synthetic.stages.light_stage import LightStageSettings, LitVideo, render_lit_video
 
 LIGHT = PointLight(torch.full((3,), 0.3), torch.full((3,), 0.6), torch.tensor([-500.0, -200, 0]))
 BLUE = torch.tensor([0.0, 0.0, 1.0, 1.0])[:, None, None].expand(4, 16, 16)
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> LitFilm:
+def film(tmp_path_factory: pytest.TempPathFactory) -> LitVideo:
     rig = performer(texture=True)
     folder = tmp_path_factory.mktemp("light")
     settings = LightStageSettings(width=96, height=80, samples=1)
     weights = 0.5 * torch.rand(5, len(rig.names), generator=torch.Generator().manual_seed(0))
-    return film_under_light(folder / "film.avi", rig, weights, LIGHT, 5.0, torch.Generator().manual_seed(1), settings)
+    return render_lit_video(folder / "film.avi", rig, weights, LIGHT, 5.0, torch.Generator().manual_seed(1), settings)
 
 
-def test_every_frame_with_a_face_is_painted(tmp_path: Path, film: LitFilm) -> None:
+def test_every_frame_with_a_face_is_painted(tmp_path: Path, film: LitVideo) -> None:
     told: list[tuple[int, int]] = []
     meshes = film.vertices.clone()
     meshes[3] = math.nan  # no face was found there
@@ -56,7 +56,7 @@ def test_every_frame_with_a_face_is_painted(tmp_path: Path, film: LitFilm) -> No
     assert told == [(i + 1, 5) for i in range(5)]
 
 
-def test_a_video_of_another_length_leaves_no_file(tmp_path: Path, film: LitFilm) -> None:
+def test_a_video_of_another_length_leaves_no_file(tmp_path: Path, film: LitVideo) -> None:
     mesh, chunks = film.rig.neutral, open_video(film.video.path).color_chunks
     six, cameras = torch.cat([film.vertices, film.vertices[:1]]), [*film.cameras, film.cameras[0]]
     with pytest.raises(ShapeError, match="found 5 frames for 6 meshes"):
@@ -68,7 +68,7 @@ def test_a_video_of_another_length_leaves_no_file(tmp_path: Path, film: LitFilm)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_frames_are_taken_as_they_come(tmp_path: Path, film: LitFilm) -> None:
+def test_frames_are_taken_as_they_come(tmp_path: Path, film: LitVideo) -> None:
     """Nothing is read ahead: a long video never lies in memory."""
     ahead, done = [0], [0]
 

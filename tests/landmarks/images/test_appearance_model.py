@@ -22,10 +22,10 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.portrait_video import (
     EXPRESSIONS,
-    PortraitFilm,
+    PortraitVideo,
     expression_weights,
-    film_portrait,
     mixed_expressions,
+    render_portrait_video,
 )
 
 TRAINED, TESTED = len(EXPRESSIONS), 10
@@ -37,15 +37,17 @@ def actor() -> BlendshapeRig:
 
 
 @pytest.fixture(scope="module")
-def film(actor: BlendshapeRig) -> PortraitFilm:
+def film(actor: BlendshapeRig) -> PortraitVideo:
     """Fifteen frames to learn from, and ten of other mixtures of the same extremes."""
     generator = torch.Generator().manual_seed(3)
     poses = expression_weights(actor.names, list(EXPRESSIONS.values()))
-    return film_portrait(actor, torch.cat([poses, mixed_expressions(actor.names, TESTED, generator)]), generator)
+    return render_portrait_video(
+        actor, torch.cat([poses, mixed_expressions(actor.names, TESTED, generator)]), generator
+    )
 
 
 @pytest.fixture(scope="module")
-def model(film: PortraitFilm) -> AppearanceModel:
+def model(film: PortraitVideo) -> AppearanceModel:
     return AppearanceModel.fit(list(film.frames[:TRAINED]), film.landmarks[:TRAINED])
 
 
@@ -53,7 +55,7 @@ def eyes_apart(landmarks: Tensor) -> Tensor:
     return (landmarks[:, 36] - landmarks[:, 45]).norm(dim=-1)
 
 
-def half_neutral(film: PortraitFilm, seed: int = 0) -> Tensor:
+def half_neutral(film: PortraitVideo, seed: int = 0) -> Tensor:
     """What a detector says that hardly knows extreme faces: half of the way to the face at rest, and off besides."""
     generator = torch.Generator().manual_seed(seed)
     truth, rest = film.landmarks[TRAINED:], film.landmarks[0] - film.landmarks[0].mean(0)
@@ -63,7 +65,7 @@ def half_neutral(film: PortraitFilm, seed: int = 0) -> Tensor:
     return drawn + unit * (shift + 0.02 * torch.randn(truth.shape, generator=generator))
 
 
-def images(film: PortraitFilm, rows: slice = slice(TRAINED, None)) -> Tensor:
+def images(film: PortraitVideo, rows: slice = slice(TRAINED, None)) -> Tensor:
     return film.frames[rows, None].float() / 255
 
 
@@ -71,7 +73,7 @@ def mean_error(found: Tensor, truth: Tensor) -> Tensor:
     return (found - truth).norm(dim=2).mean(1) / eyes_apart(truth)
 
 
-def test_extreme_faces_are_found_from_a_start_that_leans_to_rest(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_extreme_faces_are_found_from_a_start_that_leans_to_rest(film: PortraitVideo, model: AppearanceModel) -> None:
     truth, start = film.landmarks[TRAINED:], half_neutral(film)
     before = mean_error(start, truth)
     assert before.mean() > 0.05
@@ -79,10 +81,10 @@ def test_extreme_faces_are_found_from_a_start_that_leans_to_rest(film: PortraitF
     after = mean_error(fit.landmarks, truth)
     assert after.mean() < 0.25 * before.mean()
     assert (after < 0.6 * before).all()
-    assert (fit.error < fit.start_error).all()
+    assert (fit.error < fit.initial_error).all()
 
 
-def test_extreme_faces_have_at_most_six_tenths_of_the_trees_error(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_extreme_faces_have_at_most_six_tenths_of_the_trees_error(film: PortraitVideo, model: AppearanceModel) -> None:
     truth = film.landmarks[TRAINED:]
     trees = zoo.get_model("face_landmarks")
     with torch.no_grad():
@@ -91,7 +93,7 @@ def test_extreme_faces_have_at_most_six_tenths_of_the_trees_error(film: Portrait
     assert mean_error(fit.landmarks, truth).mean() <= 0.6 * mean_error(start, truth).mean()
 
 
-def test_the_error_tells_a_good_fit_from_a_bad_one(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_the_error_tells_a_good_fit_from_a_bad_one(film: PortraitVideo, model: AppearanceModel) -> None:
     truth = film.landmarks[TRAINED:]
     good = model.error(images(film), truth)
     assert 0.3 < good.mean() < 2.0  # new faces of the same person are as far from the model as left-out ones were
@@ -100,7 +102,7 @@ def test_the_error_tells_a_good_fit_from_a_bad_one(film: PortraitFilm, model: Ap
         assert (model.error(images(film), astray) > 1.3 * good).all()
 
 
-def test_faces_of_a_batch_are_fitted_as_each_alone(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_faces_of_a_batch_are_fitted_as_each_alone(film: PortraitVideo, model: AppearanceModel) -> None:
     start, pictures = half_neutral(film)[:3], images(film)[:3]
     start[2] = 3 * start[2]  # a face elsewhere and three times as large: other samples a pixel
     together = model.refine(pictures, start)
@@ -111,7 +113,7 @@ def test_faces_of_a_batch_are_fitted_as_each_alone(film: PortraitFilm, model: Ap
 
 
 def test_a_larger_and_turned_picture_has_its_landmarks_where_they_were(
-    film: PortraitFilm, model: AppearanceModel
+    film: PortraitVideo, model: AppearanceModel
 ) -> None:
     """Twice the pixels and upside down: the similarity belongs to the pose, not to the face."""
     pictures, start = images(film)[:4], half_neutral(film)[:4]
@@ -123,7 +125,7 @@ def test_a_larger_and_turned_picture_has_its_landmarks_where_they_were(
     assert apart.mean() < 0.15  # along the jaw, where nothing holds a landmark, single ones slide further
 
 
-def test_colour_and_light_do_not_matter(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_colour_and_light_do_not_matter(film: PortraitVideo, model: AppearanceModel) -> None:
     pictures, start = images(film)[:4], half_neutral(film)[:4]
     found = model(pictures, start)
     ramp = torch.linspace(0.55, 0.95, pictures.shape[3])
@@ -132,7 +134,7 @@ def test_colour_and_light_do_not_matter(film: PortraitFilm, model: AppearanceMod
 
 
 @pytest.fixture(scope="module")
-def planted(film: PortraitFilm) -> tuple[list[Tensor], Tensor, Tensor]:
+def planted(film: PortraitVideo) -> tuple[list[Tensor], Tensor, Tensor]:
     """One picture bent in two smooth ways by thin plates, which know nothing of triangles.
 
     Gives pictures, landmarks, and landmarks without the bending.
@@ -188,7 +190,7 @@ def joint_step(level, residual: TextureResidual, at: Tensor, state: Tensor, prec
     return rest[: len(precision)]
 
 
-def test_a_step_is_the_plain_simultaneous_algorithms_step(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_a_step_is_the_plain_simultaneous_algorithms_step(film: PortraitVideo, model: AppearanceModel) -> None:
     level = model.levels[0].double()
     try:
         generator = torch.Generator().manual_seed(1)
@@ -231,7 +233,7 @@ def test_both_algorithms_end_at_the_same_place(planted) -> None:
     assert (fast - truth[13]).norm(dim=2).mean() < 0.3
 
 
-def test_the_jacobian_tells_how_a_texture_changes(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_the_jacobian_tells_how_a_texture_changes(film: PortraitVideo, model: AppearanceModel) -> None:
     """Against differences of what is sampled when the mean shape's points are moved within a training face."""
     level, truth = model.levels[-1], film.landmarks[:1]
     crop = model.crop(images(film, slice(0, 1)), truth, float(level.scale))
@@ -249,7 +251,7 @@ def test_the_jacobian_tells_how_a_texture_changes(film: PortraitFilm, model: App
         assert 0.8 < float(told @ measured / measured.square().sum()) < 1.2
 
 
-def test_parts_far_apart_move_apart(film: PortraitFilm) -> None:
+def test_parts_far_apart_move_apart(film: PortraitVideo) -> None:
     """Brows and chin that moved together in training need not: a mode of brows alone is within what is believed."""
     shapes = film.landmarks[:TRAINED]
     raised = torch.zeros(68, 2)
@@ -265,7 +267,7 @@ def test_parts_far_apart_move_apart(film: PortraitFilm) -> None:
     assert believed[0] > 0.95 > believed[1]
 
 
-def test_models_come_back_from_files(film: PortraitFilm, model: AppearanceModel, tmp_path: Path) -> None:
+def test_models_come_back_from_files(film: PortraitVideo, model: AppearanceModel, tmp_path: Path) -> None:
     zoo.save_model(model, tmp_path / "actor", licence="MIT", data="a film", metrics={}, recipe="none")
     again = zoo.get_model(tmp_path / "actor")
     assert type(again) is AppearanceModel
@@ -292,7 +294,7 @@ def broken_mean(model: AppearanceModel) -> None:
 
 @pytest.mark.parametrize("break_it", [broken_corner, broken_deviation, broken_scale, broken_mean])
 def test_files_that_could_not_have_been_learned_are_refused(
-    film: PortraitFilm, break_it: Callable[[AppearanceModel], None], tmp_path: Path
+    film: PortraitVideo, break_it: Callable[[AppearanceModel], None], tmp_path: Path
 ) -> None:
     model = AppearanceModel.fit(list(film.frames[:4]), film.landmarks[:4])
     break_it(model)
@@ -301,7 +303,7 @@ def test_files_that_could_not_have_been_learned_are_refused(
         zoo.get_model(tmp_path / "actor")
 
 
-def test_a_start_beside_the_face_ends_at_something_finite(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_a_start_beside_the_face_ends_at_something_finite(film: PortraitVideo, model: AppearanceModel) -> None:
     """Noise, black, a start half outside: whatever comes out is where a face could be, and not better by mistake."""
     start = film.landmarks[TRAINED : TRAINED + 3]
     noise = torch.rand(3, 1, 300, 240, generator=torch.Generator().manual_seed(0))
@@ -313,20 +315,20 @@ def test_a_start_beside_the_face_ends_at_something_finite(film: PortraitFilm, mo
     assert (fit.error > 2.0).all()
 
 
-def test_a_face_that_is_lost_stays_lost(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_a_face_that_is_lost_stays_lost(film: PortraitVideo, model: AppearanceModel) -> None:
     start = half_neutral(film)[:3]
     whole = model.refine(images(film)[:3], start)
     start[1, 5] = torch.nan
     fit = model.refine(images(film)[:3], start)
     assert fit.landmarks[1].isnan().all()
     assert fit.error[1] == torch.inf
-    assert fit.start_error[1] == torch.inf
+    assert fit.initial_error[1] == torch.inf
     torch.testing.assert_close(fit.landmarks[[0, 2]], whole.landmarks[[0, 2]], atol=0.05, rtol=0)
     nothing = model.refine(images(film)[:1], torch.full((1, 68, 2), torch.nan))
     assert nothing.landmarks.isnan().all()
 
 
-def test_bad_input_is_refused_by_name(film: PortraitFilm, model: AppearanceModel) -> None:
+def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceModel) -> None:
     frames, points = list(film.frames[:4]), film.landmarks[:4]
     with pytest.raises(ShapeError, match="found 2, expected at least 3"):
         AppearanceModel.fit(frames[:2], points[:2])
@@ -352,7 +354,7 @@ def test_bad_input_is_refused_by_name(film: PortraitFilm, model: AppearanceModel
         AppearanceSettings(iterations=0)
 
 
-def test_sizes_of_training_images_may_differ(film: PortraitFilm) -> None:
+def test_sizes_of_training_images_may_differ(film: PortraitVideo) -> None:
     frames = [frame[: 300 - 2 * i, : 240 - i] for i, frame in enumerate(film.frames[:6])]
     frames[2] = frames[2].float()[None].expand(3, -1, -1) / 255
     model = AppearanceModel.fit(frames, film.landmarks[:6])

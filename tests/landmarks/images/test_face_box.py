@@ -95,7 +95,7 @@ def test_no_face_is_said() -> None:
     noise = torch.randint(0, 256, (3, 120, 160), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     assert len(find_faces(noise)) == 0
     assert len(find_faces(torch.zeros(8, 8, dtype=torch.uint8))) == 0
-    with pytest.raises(NoFaceError, match="picture of 160 x 120: found no face"):
+    with pytest.raises(NoFaceError, match="image of 160 x 120: found no face"):
         find_face(noise)
     with pytest.raises(ShapeError, match="expected uint8"):
         find_faces(noise / 255)

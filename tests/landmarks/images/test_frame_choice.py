@@ -100,7 +100,7 @@ def test_annotated_frames_come_back_from_their_folder(tmp_path: Path) -> None:
     (tmp_path / "new" / "c.png").write_bytes((tmp_path / "new" / "a.png").read_bytes())  # not annotated yet
     assert len(load_annotated_frames(tmp_path / "new")) == 2
     (tmp_path / "new" / "a.png").unlink()
-    with pytest.raises(FileFormatError, match="found no picture beside it"):
+    with pytest.raises(FileFormatError, match="found no image beside it"):
         load_annotated_frames(tmp_path / "new")
 
 

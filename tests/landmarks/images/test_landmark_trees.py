@@ -20,13 +20,13 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import MIRROR_68, box_around, relative_errors
-from torchface.landmarks.images.landmark_trees import FAINTEST, similarity_to, start_shapes
+from torchface.landmarks.images.landmark_trees import FAINTEST, initial_shapes, similarity_to
 from torchface.landmarks.images.tree_training import best_test
 from torchface.onnx import export_model
 from torchface.onnx.landmark_trees_graph import export_landmark_trees
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.topology import topology
-from torchface.synthetic.stages.portraits import face_pictures
+from torchface.synthetic.stages.portraits import face_images
 
 FEW = TreeSettings(cascades=4, trees=40, depth=4, features=120, test_splits=20, oversampling=10, components=10, noise=0)
 
@@ -88,7 +88,7 @@ def test_forward_is_the_plain_walk_down_every_tree() -> None:
     for row in range(3):
         expected = plainly(model, images[row, 0].double().numpy(), boxes[row].double().numpy())
         np.testing.assert_allclose(found[row], expected, atol=1e-3)
-    start = start_shapes(model.mean, boxes)
+    start = initial_shapes(model.mean, boxes)
     assert ((found - start).norm(dim=-1).amax(1) > 0.5).all()
     torch.testing.assert_close(model.refine(images, start), found)
 
@@ -156,7 +156,7 @@ def learned() -> LandmarkTrees:
 
 def test_landmarks_are_found_in_new_pictures(learned: LandmarkTrees) -> None:
     images, boxes, points = blobs(40, 1)
-    before = (start_shapes(learned.mean, boxes) - points).norm(dim=-1)
+    before = (initial_shapes(learned.mean, boxes) - points).norm(dim=-1)
     after = errors(learned, images, boxes, points)
     assert after.mean() < 0.45 * before.mean()
     jittered = boxes + 2.5 * torch.randn(40, 4, generator=torch.Generator().manual_seed(0))
@@ -185,7 +185,7 @@ def test_a_killed_training_goes_on_to_the_same_result(learned: LandmarkTrees, tm
     assert told == [(done, 160) for done in range(81, 161)]
     for name, value in learned.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name
-    with pytest.raises(FileFormatError, match="other pictures or settings"):
+    with pytest.raises(FileFormatError, match="other images or settings"):
         LandmarkTrees.fit(*blobs(60, 5), FEW, checkpoint=path)
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(FileFormatError, match=r"trees\.safetensors"):
@@ -257,7 +257,7 @@ def test_bad_input_is_named(learned: LandmarkTrees) -> None:
         LandmarkTrees.fit([images[0], images[1].float(), images[2]], boxes, points, FEW)
     with pytest.raises(ValueRangeError, match="box 2"):
         LandmarkTrees.fit(images, boxes * torch.tensor([[1.0], [1], [-1]]), points, FEW)
-    with pytest.raises(ValueRangeError, match="landmark 0: found in no picture"):
+    with pytest.raises(ValueRangeError, match="landmark 0: found in no image"):
         LandmarkTrees.fit(images, boxes, points * torch.nan, FEW)
     with pytest.raises(ValueRangeError, match="trees: found 0"):
         LandmarkTrees.fit(images, boxes, points, TreeSettings(trees=0))
@@ -275,7 +275,7 @@ def test_a_landmark_that_some_pictures_lack_is_learned_from_the_others() -> None
     model = LandmarkTrees.fit(images, boxes, points, FEW)
     new = blobs(40, 1)
     assert (
-        errors(model, *new)[:, 1].mean() < 0.7 * (start_shapes(model.mean, new[1]) - new[2]).norm(dim=-1)[:, 1].mean()
+        errors(model, *new)[:, 1].mean() < 0.7 * (initial_shapes(model.mean, new[1]) - new[2]).norm(dim=-1)[:, 1].mean()
     )
 
 
@@ -297,7 +297,7 @@ def test_the_box_goes_with_the_landmarks() -> None:
 
 def test_the_shipped_model_finds_made_up_faces() -> None:
     model, found, truth = zoo.get_model("face_landmarks"), [], []
-    for picture in face_pictures(18, 987):
+    for picture in face_images(18, 987):
         found.append(model(picture.image[None, None].float() / 255, picture.box[None])[0])
         truth.append(picture.landmarks)
     assert relative_errors(torch.stack(found), torch.stack(truth)).median() < 0.05

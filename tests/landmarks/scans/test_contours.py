@@ -47,7 +47,7 @@ def test_a_brighter_second_line_does_not_distract() -> None:
 
 def test_no_single_column_can_do_better() -> None:
     image, _ = planted(9.0, seed=3)
-    settings = TraceSettings(sags=(0.08,), sweeps=100)
+    settings = TraceSettings(sags=(0.08,), iterations=100)
     left, right = torch.tensor([60.0, 110.0]), torch.tensor([160.0, 104.0])
     found = trace_contour(image, left, right, settings)
     top = 104 - settings.border
@@ -57,10 +57,10 @@ def test_no_single_column_can_do_better() -> None:
     grey = grey - np.minimum(grey[np.maximum(rows - width, 0)], grey[np.minimum(rows + width, len(rows) - 1)])
     grey = (grey - grey.min()) / grey.std()
     path = (found.points[:, 1] - top).long().numpy()
-    course, spread = LineShape.arc(0.08, settings.spread).rows(left, right, COLUMNS)
+    course, deviation = LineShape.arc(0.08, settings.deviation).rows(left, right, COLUMNS)
     limit = grey[path, np.arange(101)].mean() + grey[path, np.arange(101)].std()
     for c in range(1, 100):
-        cost = settings.dark * grey[:, c] + settings.near * ((rows - float(course[c]) + top) / float(spread[c])) ** 2
+        cost = settings.dark * grey[:, c] + settings.near * ((rows - float(course[c]) + top) / float(deviation[c])) ** 2
         for n in (c - 1, c + 1):
             cost = cost + settings.similar * (grey[:, c] - grey[path[n], n]) ** 2
             cost = cost + settings.smooth * (rows - path[n]) ** 2
@@ -71,9 +71,9 @@ def test_no_single_column_can_do_better() -> None:
 def test_the_usual_course_is_learned_and_decides_between_two_lines() -> None:
     lines = [torch.stack([COLUMNS, planted(sag)[1]], dim=-1) for sag in (5.0, 6.0, 7.0)]
     shape = LineShape.fit(lines)
-    rows, spread = shape.rows(torch.tensor([60.0, 110.0]), torch.tensor([160.0, 104.0]), COLUMNS)
+    rows, deviation = shape.rows(torch.tensor([60.0, 110.0]), torch.tensor([160.0, 104.0]), COLUMNS)
     assert (rows - planted(6.0)[1]).abs().max() < 0.2
-    assert (spread >= 2.0 - 1e-6).all()
+    assert (deviation >= 2.0 - 1e-6).all()
     image, truth = planted(6.0)
     y = torch.arange(220.0)[:, None]
     image[0, :, 60:161] -= 0.45 * torch.exp(-0.5 * ((y - truth - 25) / 2.0) ** 2)  # darker, elsewhere

@@ -10,7 +10,7 @@ import trimesh
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.scans.curvature_image import relief
+from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
 from torchface.mesh import Mesh
 
@@ -87,11 +87,11 @@ def test_colours_follow_the_surface() -> None:
 def test_relief_of_a_sphere_is_flat_and_its_furrow_dark() -> None:
     layout = CylinderLayout(size=256, pitch=1.0, radius=90.0)
     middle = slice(100, 156)
-    smooth = relief(unwrap(ball(90.0), still(), layout), contrast=8.0)[0, middle, middle]
+    smooth = curvature_image(unwrap(ball(90.0), still(), layout), contrast=8.0)[0, middle, middle]
     # The grey of curvature 1/R, near the equator where the picture's axes stand perpendicular.
     expected = 0.5 + 0.5 * math.tanh(8.0 / 90.0)
     assert (smooth - expected).abs().max() < 0.02
-    furrowed = relief(unwrap(ball(90.0, groove=3.0), still(), layout), contrast=8.0)[0]
+    furrowed = curvature_image(unwrap(ball(90.0, groove=3.0), still(), layout), contrast=8.0)[0]
     rows = furrowed[:, middle].mean(1)
     assert rows[127:129].mean() < 0.2
     assert rows[120:136].argmin() in (7, 8)

@@ -12,7 +12,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.nose_search import nose_candidates
 from torchface.landmarks.scans.surface_sample import sample_surface
-from torchface.landmarks.scans.twelve_landmarks import MIRRORED, TWELVE, twelve_from_ibug
+from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 from torchface.synthetic import draw_identities, neutral_head
 
@@ -26,7 +26,7 @@ def posed(identity: Tensor, seed: int) -> Example:
     turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
     turn = turn * torch.linalg.det(turn)
     vertices = mesh.vertices.double() @ turn.T + 100 * torch.randn(3, generator=generator, dtype=torch.float64)
-    return mesh.with_vertices(vertices.float()), twelve_from_ibug(vertices[mesh.landmarks])
+    return mesh.with_vertices(vertices.float()), uv_landmarks_from_ibug(vertices[mesh.landmarks])
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_the_frame_stands_upright_and_symmetric(frame: FaceFrame) -> None:
     eyes, mouth = frame.landmarks[2:6].mean(0), frame.landmarks[8:10].mean(0)
     assert (eyes - mouth)[1] > 55
     assert (eyes - mouth)[[0, 2]].abs().max() < 2.0
-    assert frame.landmarks[TWELVE.index("nose"), 2] == frame.landmarks[:, 2].max()
+    assert frame.landmarks[UV_LANDMARK_NAMES.index("nose"), 2] == frame.landmarks[:, 2].max()
     mirrored = frame.landmarks[list(MIRRORED)] * torch.tensor([-1.0, 1.0, 1.0])
     assert (mirrored - frame.landmarks).abs().max() < 1.5
 
@@ -93,7 +93,7 @@ def test_a_scan_inside_out_and_with_crumbs_is_found(frame: FaceFrame, examples: 
 def test_the_nose_is_among_the_first_candidates(examples: list[Example]) -> None:
     for mesh, points in examples[:3]:
         found = nose_candidates(sample_surface(mesh))
-        distance = (found.points - points[TWELVE.index("nose")]).norm(dim=-1)
+        distance = (found.points - points[UV_LANDMARK_NAMES.index("nose")]).norm(dim=-1)
         assert int(distance.argmin()) < 25
         assert distance.min() < 9
 

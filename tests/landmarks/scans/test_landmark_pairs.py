@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchface.landmarks.scans.landmark_pairs import template_features
-from torchface.landmarks.scans.twelve_landmarks import LINES
+from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.synthetic import neutral_head
 
 

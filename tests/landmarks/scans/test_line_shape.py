@@ -1,4 +1,4 @@
-"""What a line looks like, learned: lines that are not dark, decoys that are, corners that are off."""
+"""The profile of a line, learned: lines that are not dark, decoys that are, corners that are off."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def lidded(seed: int, sag: float = 6.0, tone: float = 0.7) -> tuple[Tensor, Tens
     return image[None], torch.stack([COLUMNS, rows], dim=-1)
 
 
-def learned(looseness: float = 0.0, with_look: bool = True) -> LineShape:
+def learned(corner_deviation: float = 0.0, with_profile: bool = True) -> LineShape:
     images, lines = zip(*(lidded(seed, 4.0 + seed, 0.6 + 0.03 * seed) for seed in range(5)), strict=True)
-    return LineShape.fit(lines, images if with_look else None, looseness)
+    return LineShape.fit(lines, images if with_profile else None, corner_deviation)
 
 
 def test_a_line_that_is_not_the_darkest_is_found_by_its_look() -> None:
@@ -36,7 +36,7 @@ def test_a_line_that_is_not_the_darkest_is_found_by_its_look() -> None:
     left, right = line[0] + torch.tensor([0.0, 2.0]), line[-1] - torch.tensor([0.0, 2.0])
     found = trace_contour(image, left, right, shape=learned())
     assert (found.points[:, 1] - line[:, 1]).abs().mean() < 1.0
-    dark = trace_contour(image, left, right, shape=learned(with_look=False))
+    dark = trace_contour(image, left, right, shape=learned(with_profile=False))
     assert (dark.points[:, 1] - line[:, 1]).abs().mean() > 2.0
 
 
@@ -50,7 +50,7 @@ def test_brightness_and_contrast_do_not_matter() -> None:
 def test_loose_corners_are_made_up_for() -> None:
     image, line = lidded(11)
     left, right = line[0] + torch.tensor([0.0, 9.0]), line[-1] + torch.tensor([0.0, 7.0])
-    loose = trace_contour(image, left, right, shape=learned(looseness=4.0))
+    loose = trace_contour(image, left, right, shape=learned(corner_deviation=4.0))
     tight = trace_contour(image, left, right, shape=learned())
     assert (loose.points[:, 1] - line[:, 1]).abs().mean() < 1.0
     assert (loose.points[:, 1] - line[:, 1]).abs().mean() < (tight.points[:, 1] - line[:, 1]).abs().mean()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
@@ -89,6 +91,32 @@ def test_state_and_config_rebuild_the_detector(detector: UVLandmarkDetector, tmp
     assert torch.equal(first.confidence, second.confidence)
 
 
+def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
+    """Keys of the state, and the word for what it sees, as they were."""
+    images, places = zip(*(drawn(seed) for seed in range(3)), strict=True)
+    lines = [{"lips": torch.tensor([[40.0, 90.0], [60.0, 95.0 + i], [80.0, 90.0]])} for i in range(3)]
+    fitted = UVLandmarkDetector.fit(torch.stack(images), torch.stack(places), NAMES, "curvature", SETTINGS, lines=lines)
+    folder = tmp_path / "model"
+    save_detector(fitted, folder)
+    path, text = folder / "state.safetensors", (folder / "model.toml").read_text()
+    old = {"line_statistics": "courses", "line_profiles": "looks", "corner_deviation": "looseness"}
+    before = path.read_bytes()
+    path.write_bytes(save({old.get(key, key): value for key, value in load(before).items()}))
+    for now, then in (
+        (f"size = {len(before)}", f"size = {path.stat().st_size}"),
+        (hashlib.sha256(before).hexdigest(), hashlib.sha256(path.read_bytes()).hexdigest()),
+        ('"curvature"', '"relief"'),
+    ):
+        assert now in text
+        text = text.replace(now, then)
+    (folder / "model.toml").write_text(text)
+    again = load_detector(folder)
+    assert again.appearance == "curvature"
+    assert again.line_statistics.abs().max() > 0
+    for key, value in fitted.state_dict().items():
+        assert torch.equal(again.state_dict()[key], value)
+
+
 def test_files_that_lie_are_refused(detector: UVLandmarkDetector, tmp_path: Path) -> None:
     pytest.importorskip("safetensors")
     pytest.importorskip("tomli_w")
@@ -128,5 +156,5 @@ def test_bad_input_is_named(detector: UVLandmarkDetector) -> None:
         UVLandmarkDetector.fit(torch.zeros(4, 1, 64, 64), torch.zeros(4, 2, 2), NAMES)
     with pytest.raises(ValueRangeError, match="at least two"):
         UVLandmarkDetector.fit(torch.zeros(1, 1, 64, 64), torch.zeros(1, 3, 2), NAMES)
-    with pytest.raises(ValueRangeError, match="'texture' or 'relief'"):
+    with pytest.raises(ValueRangeError, match="'texture' or 'curvature'"):
         UVLandmarkDetector(2, appearance="smell")

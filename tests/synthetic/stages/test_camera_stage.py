@@ -15,27 +15,27 @@ from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.action_performance import ACTION_UNITS, MOVES, PerformanceSettings, perform_action_units
 from torchface.synthetic.stages.camera_stage import (
     SIDE_MARKERS,
-    FilmedSession,
+    RecordedSession,
     StageSettings,
     film,
-    film_session,
+    record_session,
     stage_markers,
 )
-from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, loose_cameras
+from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from torchface.synthetic.stages.reflective_paint import reflective_paint
 
 QUICK = PerformanceSettings(repetitions=1, combination_repetitions=1, combinations=(("4", "9"),), fps=8.0, pace=1.5)
-STILL = CameraFlaws(noise=0.0, blur=0.0, loose_rotation=0.0, loose_translation=0.0)
+STILL = CameraFlaws(noise=0.0, blur=0.0, shake_rotation=0.0, shake_translation=0.0)
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> FilmedSession:
+def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     settings = StageSettings(96, 128, performance=QUICK)
     identity = draw_identities(1, torch.Generator().manual_seed(3))[0]
-    return film_session(tmp_path_factory.mktemp("stage"), "one", identity, torch.Generator().manual_seed(1), settings)
+    return record_session(tmp_path_factory.mktemp("stage"), "one", identity, torch.Generator().manual_seed(1), settings)
 
 
-def test_video_markers_and_labels_lie_beside_each_other(session: FilmedSession) -> None:
+def test_video_markers_and_labels_lie_beside_each_other(session: RecordedSession) -> None:
     video, take, labels = open_video(session.video.path), load_take(session.take_path), session.labels
     assert (video.width, video.height, video.fps) == (96, 128, 8.0)
     assert take.markers is not None
@@ -46,7 +46,7 @@ def test_video_markers_and_labels_lie_beside_each_other(session: FilmedSession) 
     assert set(labels.units) == set(ACTION_UNITS)
 
 
-def test_labels_say_where_things_are(session: FilmedSession) -> None:
+def test_labels_say_where_things_are(session: RecordedSession) -> None:
     """The helmet's bolt has a dark middle in a bright rim; markers are the brightest; regions hold paint."""
     frame = session.video.frame(session.labels.neutral).float() / 255
     x, y = (round(v) for v in session.labels.helmet)
@@ -60,7 +60,7 @@ def test_labels_say_where_things_are(session: FilmedSession) -> None:
         assert 0.03 < share < 0.6, name
 
 
-def test_intensities_are_what_moves_the_face(session: FilmedSession) -> None:
+def test_intensities_are_what_moves_the_face(session: RecordedSession) -> None:
     performance = session.performance
     for a, unit in enumerate(ACTION_UNITS):
         alone = [s for s in performance.performed if s.units == (unit,)]
@@ -88,7 +88,7 @@ def test_the_paint_moves_with_the_skin() -> None:
     for shape in MOVES["1+2"]:
         weights[1, rig.names.index(shape)] = 1.0
     generator = torch.Generator().manual_seed(0)
-    rotation, translation = loose_cameras(camera, 2, 60.0, STILL, generator)
+    rotation, translation = shaken_cameras(camera, 2, 60.0, STILL, generator)
     markers = stage_markers(rig, 20).select(SIDE_MARKERS)
     pictures = list(film(rig, weights, reflective_paint(512), markers, camera, rotation, translation, STILL, generator))
     skin = rig(weights)
@@ -108,8 +108,8 @@ def test_the_paint_moves_with_the_skin() -> None:
 
 def test_a_loose_camera_moves_helmet_and_markers_alike() -> None:
     camera = helmet_camera()
-    flaws = CameraFlaws(loose_rotation=0.5, loose_translation=1.0)
-    rotation, translation = loose_cameras(camera, 200, 60.0, flaws, torch.Generator().manual_seed(0))
+    flaws = CameraFlaws(shake_rotation=0.5, shake_translation=1.0)
+    rotation, translation = shaken_cameras(camera, 200, 60.0, flaws, torch.Generator().manual_seed(0))
     points = torch.tensor([HELMET_POINT, (60.0, -4.0, 44.0), (-60.0, -4.0, 44.0)], dtype=torch.float64)
     pixels = torch.stack([
         replace(camera, rotation=r, translation=t).project(points) for r, t in zip(rotation, translation, strict=True)

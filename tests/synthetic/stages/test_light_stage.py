@@ -18,7 +18,7 @@ from torchface.rendering.point_light import PointLight, in_camera_frame
 from torchface.synthetic import performer
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.synthetic.stages.face_paint import face_paint
-from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light, lit_picture, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, render_lit_video, turning_cameras
 
 PLAIN = LightStageSettings(width=120, height=120, samples=1, gloss=0.0, noise=0.0)
 AMBIENT, INTENSITY = torch.tensor([0.2, 0.3, 0.4]), torch.tensor([0.5, 0.6, 0.7])
@@ -70,7 +70,7 @@ def test_a_film_is_a_file_with_its_truth(tmp_path: Path) -> None:
     rig = performer(texture=True)
     light, told = PointLight(AMBIENT, INTENSITY, torch.tensor([-400.0, -200, 0])), []
     settings = replace(PLAIN, noise=0.01, width=64, height=48)
-    film = film_under_light(
+    film = render_lit_video(
         tmp_path / "film.avi", rig, torch.zeros(3, len(rig.names)), light, 10.0, torch.Generator().manual_seed(0),
         settings, progress=lambda _, done, of: told.append((done, of)),
     )  # fmt: skip
@@ -88,7 +88,7 @@ def test_what_cannot_be_filmed_is_said(tmp_path: Path) -> None:
     with pytest.raises(ShapeError, match="skin"):
         lit_picture(rig.neutral, look_at(torch.zeros(3), 0.0), light, PLAIN)
     with pytest.raises(ShapeError, match="weights"):
-        film_under_light(tmp_path / "a.avi", rig, torch.zeros(3, 2), light, 10.0, torch.Generator(), PLAIN)
+        render_lit_video(tmp_path / "a.avi", rig, torch.zeros(3, 2), light, 10.0, torch.Generator(), PLAIN)
     with pytest.raises(ValueRangeError, match="noise"):
         LightStageSettings(noise=-1.0)
 

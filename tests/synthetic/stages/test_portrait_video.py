@@ -10,11 +10,11 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.synthetic.stages.portrait_video import (
     EXPRESSIONS,
-    PortraitFilm,
     PortraitSettings,
+    PortraitVideo,
     expression_weights,
-    film_portrait,
     mixed_expressions,
+    render_portrait_video,
 )
 
 SETTINGS = PortraitSettings(width=144, height=180)
@@ -26,12 +26,12 @@ def rig() -> BlendshapeRig:
 
 
 @pytest.fixture(scope="module")
-def film(rig: BlendshapeRig) -> PortraitFilm:
+def film(rig: BlendshapeRig) -> PortraitVideo:
     weights = expression_weights(rig.names, [EXPRESSIONS["jaw open"], EXPRESSIONS["eyes shut"]])
-    return film_portrait(rig, weights, torch.Generator().manual_seed(2), SETTINGS)
+    return render_portrait_video(rig, weights, torch.Generator().manual_seed(2), SETTINGS)
 
 
-def test_landmarks_lie_where_the_face_shows_them(film: PortraitFilm) -> None:
+def test_landmarks_lie_where_the_face_shows_them(film: PortraitVideo) -> None:
     def grey(frame: int, rows: list[int]) -> float:
         x, y = film.landmarks[frame, rows].mean(0).round().long().tolist()
         return float(film.frames[frame, y - 1 : y + 2, x - 1 : x + 2].float().mean())
@@ -45,11 +45,11 @@ def test_landmarks_lie_where_the_face_shows_them(film: PortraitFilm) -> None:
     assert shut[1] < 0.3 * shut[0]
 
 
-def test_the_head_turns_and_the_film_comes_again(rig: BlendshapeRig, film: PortraitFilm) -> None:
-    again = film_portrait(rig, film.weights, torch.Generator().manual_seed(2), SETTINGS)
+def test_the_head_turns_and_the_film_comes_again(rig: BlendshapeRig, film: PortraitVideo) -> None:
+    again = render_portrait_video(rig, film.weights, torch.Generator().manual_seed(2), SETTINGS)
     assert torch.equal(again.frames, film.frames)
     assert torch.equal(again.landmarks, film.landmarks)
-    still = film_portrait(
+    still = render_portrait_video(
         rig, film.weights[[0, 0]], torch.Generator().manual_seed(2), PortraitSettings(144, 180, 0, 0, noise=0)
     )
     assert torch.equal(still.landmarks[0], still.landmarks[1])
@@ -77,7 +77,7 @@ def test_expressions_name_both_sides_and_mix_above_and_below(rig: BlendshapeRig)
 
 def test_films_that_cannot_be_taken_are_refused(rig: BlendshapeRig) -> None:
     with pytest.raises(ShapeError, match="expected \\(T,51\\)"):
-        film_portrait(rig, torch.zeros(2, 50), torch.Generator())
+        render_portrait_video(rig, torch.zeros(2, 50), torch.Generator())
     with pytest.raises(ValueRangeError, match="noise is -1"):
         PortraitSettings(noise=-1.0)
     with pytest.raises(ValueRangeError, match="width is 4"):

@@ -15,7 +15,7 @@ from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.io import load_mesh
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.scans.scan_annotations import load_annotations
-from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE, twelve_from_ibug
+from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import performer
@@ -70,9 +70,9 @@ def test_normals_point_outward(scan: RawScan) -> None:
 
 
 def test_truth_belongs_to_the_head(closed: Mesh, scan: RawScan) -> None:
-    twelve = twelve_from_ibug(closed.vertices[closed.landmarks].double())
-    back = (scan.annotation.twelve() - scan.translation) @ scan.rotation
-    skin = [i for i, name in enumerate(TWELVE) if "cheek" not in name]
+    twelve = uv_landmarks_from_ibug(closed.vertices[closed.landmarks].double())
+    back = (scan.annotation.ordered() - scan.translation) @ scan.rotation
+    skin = [i for i, name in enumerate(UV_LANDMARK_NAMES) if "cheek" not in name]
     assert (back[skin] - twelve[skin]).norm(dim=-1).max() < 1.0
     assert set(scan.annotation.lines) == set(LINES)
     for name, (left, right) in LINES.items():
@@ -115,7 +115,7 @@ def test_files_hold_what_a_user_would_bring(closed: Mesh, scan: RawScan, tmp_pat
     assert read.texture is not None
     assert (load_landmark_points(paths[0].with_suffix(".ljson")).ibug() - scan.ibug).abs().max() < 1e-6
     truth = load_annotations(tmp_path / "annotations.json")[paths[0].name]
-    assert torch.equal(truth.twelve(), scan.annotation.twelve())
+    assert torch.equal(truth.ordered(), scan.annotation.ordered())
 
 
 def test_a_surface_net_finds_a_planted_sphere() -> None:

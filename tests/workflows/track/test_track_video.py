@@ -26,7 +26,7 @@ from torchface.landmarks.images.tracking import LandmarkTracker, TrackedFace
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, film_under_light
+from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.workflows.live.live_track import track_live
 from torchface.workflows.track import track_video as workflow
 from torchface.workflows.track.head_rotations import head_angles
@@ -77,7 +77,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
         weights[:, actor.names.index(name)] = size * (ramp if name == "jawOpen" else (math.pi * ramp).sin())
     light = PointLight(torch.full((3,), 0.35), torch.full((3,), 0.7), torch.tensor([-500.0, -700.0, 100.0]))
     settings = LightStageSettings(width=160, height=120, samples=1, turn=12.0)
-    film = film_under_light(
+    film = render_lit_video(
         folder / "film.avi", actor, weights, light, 30.0, torch.Generator().manual_seed(0), settings
     )
     save_rig(actor, folder / "rig.glb")

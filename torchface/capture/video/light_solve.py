@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.capture.video.skin_samples import SeenSkin
 from torchface.color_space import to_srgb
-from torchface.rendering.point_light import FARTHEST
+from torchface.rendering.point_light import MAX_DISTANCE
 
 _DARKEST = 0.01  # linear; below, noise of the camera and not its coding decides
 _LEAST_WIDTH = 3.0 / 255  # sRGB; a few steps of the file are no outlier
@@ -121,7 +121,7 @@ def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
     H, g = _normal_equations(seen, now)
     for _ in range(_STEPS):
         step = -torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-9).diag(), g)
-        then = _with_factors(seen, _moved(now.lamp, step, 1 / FARTHEST, 1 / _NEAREST), width, now.factors)
+        then = _with_factors(seen, _moved(now.lamp, step, 1 / MAX_DISTANCE, 1 / _NEAREST), width, now.factors)
         if then.cost >= now.cost:  # too far, or shadows that fell otherwise
             damping *= 8
             if damping > 1e4:

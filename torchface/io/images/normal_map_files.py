@@ -1,4 +1,4 @@
-"""Normal maps as picture files, in the convention of glTF, Blender, Unity and OpenGL: green is up."""
+"""Normal maps as image files, in the convention of glTF, Blender, Unity and OpenGL: green is up."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def save_normal_map(normals: Tensor, path: str | Path) -> None:
 
 
 def load_normal_map(path: str | Path) -> Tensor:
-    """Unit vectors in tangent space (3,H,W) from a picture of 8 or 16 bits; a map whose green is down is not noticed.
+    """Unit vectors in tangent space (3,H,W) from an image of 8 or 16 bits; a map whose green is down is not noticed.
 
     Raises:
-        FileFormatError: no picture, or one whose directions point into the surface, as no normal map's do.
+        FileFormatError: no image, or one whose directions point into the surface, as no normal map's do.
     """
     normals = decode_normals(load_image(path))
     inward = float((normals[2] < 0).double().mean())

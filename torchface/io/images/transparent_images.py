@@ -1,4 +1,4 @@
-"""Pictures with transparency: what is laid over something else."""
+"""Images with transparency: what is laid over something else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Annotated frames as a folder: a picture and iBUG's PTS of the same name for each."""
+"""Annotated frames as a folder: an image and iBUG's PTS of the same name for each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedFrame:
-    """A picture with landmarks.
+    """An image with landmarks.
 
     Args:
         name: of its files, without ending.
@@ -31,7 +31,7 @@ class AnnotatedFrame:
 
 
 def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
-    """Every picture of a folder that has a ``.pts`` beside it, by name.
+    """Every image of a folder that has a ``.pts`` beside it, by name.
 
     Raises:
         FileFormatError: no such folder, none in it, or a file that cannot be read.
@@ -39,18 +39,18 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileFormatError(f"{folder}: found no such folder, expected one with pictures and .pts files")
+        raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
     frames = []
     for path in sorted(folder.glob("*.pts")):
         picture = next((found for end in PICTURES if (found := path.with_suffix(end)).is_file()), None)
         if picture is None:
-            raise FileFormatError(f"{path}: found no picture beside it, expected {path.stem}.png or another")
+            raise FileFormatError(f"{path}: found no image beside it, expected {path.stem}.png or another")
         points = load_landmark_points(path).ibug()
         if points.shape[1] != 2:
-            raise FileFormatError(f"{path}: found points in space, expected pixels of the picture beside it")
+            raise FileFormatError(f"{path}: found points in space, expected pixels of the image beside it")
         frames.append(AnnotatedFrame(path.stem, load_image(picture), points.float()))
     if not frames:
-        raise FileFormatError(f"{folder}: found no .pts file, expected pictures with one beside each")
+        raise FileFormatError(f"{folder}: found no .pts file, expected images with one beside each")
     return frames
 
 

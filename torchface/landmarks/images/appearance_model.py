@@ -19,7 +19,7 @@ from torchface.landmarks.images.shape_modes import PlanarPose, planar_pose
 
 COUNT = 68
 _MARGIN = 0.3
-_MOST_SAMPLES = 8
+_MAX_SAMPLES = 8
 _ASTRAY = 4.0  # times the lowest energy: steps that have come to this lead nowhere
 _STILL = 0.02  # pixels of a level: a face whose landmarks move by less has arrived
 
@@ -90,16 +90,16 @@ class AppearanceFit(NamedTuple):
     Args:
         landmarks: pixels, (B,68,2); NaN where the start is.
         error: how badly the face there looks like the person, (B,); about 1 on frames like those learned from.
-        start_error: the same at the start.
+        initial_error: the same at the start.
     """
 
     landmarks: Tensor
     error: Tensor
-    start_error: Tensor
+    initial_error: Tensor
 
 
 class FaceCrop(NamedTuple):
-    """Features (B,C,h,w) of upright pictures of faces, and the similarities from their pixels to the image's."""
+    """Features (B,C,h,w) of upright images of faces, and the similarities from their pixels to the image's."""
 
     features: Tensor
     pose: PlanarPose
@@ -230,7 +230,7 @@ class AppearanceModel(nn.Module):
         return self._error_in(self.crop(grey_images(images), points, float(self.levels[-1].scale)), points)
 
     def crop(self, images: Tensor, landmarks: Tensor, resolution: float) -> FaceCrop:
-        """Upright pictures of faces, ``resolution`` pixels a unit of the mean shape, as features.
+        """Upright images of faces, ``resolution`` pixels a unit of the mean shape, as features.
 
         Args:
             images: grey, (B,1,H,W).
@@ -241,14 +241,14 @@ class AppearanceModel(nn.Module):
         pose = planar_pose(self.mean_shape, landmarks)
         # From the crop's pixels: by its corner and resolution to units, then by the face's pose to the image.
         corner = torch.view_as_complex(low.contiguous())
-        pose = PlanarPose(pose.turn / resolution, pose.shift + pose.turn * corner)
+        pose = PlanarPose(pose.rotation / resolution, pose.translation + pose.rotation * corner)
         width, height = ((high - low) * resolution).ceil().long().tolist()
         # Several samples a pixel where the image is finer than the crop: skipping pixels would alias.
-        samples = pose.scale.round().long().clamp(1, _MOST_SAMPLES)
+        samples = pose.scale.round().long().clamp(1, _MAX_SAMPLES)
         pictures = images.new_empty(len(images), 1, height, width)
         for count in samples.unique().tolist():
             rows = samples == count
-            some = PlanarPose(pose.turn[rows], pose.shift[rows])
+            some = PlanarPose(pose.rotation[rows], pose.translation[rows])
             pictures[rows] = _cut_out(images[rows], some, (width, height), count)
         return FaceCrop(dense_features(pictures, self.settings.features), pose)
 
@@ -265,7 +265,7 @@ class AppearanceModel(nn.Module):
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
         still = torch.zeros_like(lowest, dtype=torch.bool)
-        for turn in range(self.settings.iterations + 1):
+        for iteration in range(self.settings.iterations + 1):
             residual = level.residual(level.sample(crop.features, self._points(found)))
             state = self._shape(found)[1]
             energy = residual.left.square().sum((1, 2)) / level.noise + (precision * state.square()).sum(1)
@@ -273,7 +273,7 @@ class AppearanceModel(nn.Module):
             best = torch.where(better[:, None, None], found, best)
             lowest = torch.where(better, energy, lowest)
             still = still | ~(energy < _ASTRAY * lowest)
-            if turn == self.settings.iterations or still.all():
+            if iteration == self.settings.iterations or still.all():
                 break
             moved = torch.einsum("bq,qlc->blc", level.step(residual, state, precision), self.motions)
             warp = self._linear_parts(found)
@@ -334,7 +334,7 @@ class AppearanceModel(nn.Module):
 
 
 def _cut_out(images: Tensor, pose: PlanarPose, size: tuple[int, int], samples: int) -> Tensor:
-    """Pictures (B,1,height,width) whose pixels lie where a pose puts them, each a mean over ``samples`` a side."""
+    """Images (B,1,height,width) whose pixels lie where a pose puts them, each a mean over ``samples`` a side."""
     step = (torch.arange(samples, device=images.device) + 0.5) / samples - 0.5
     x, y = ((torch.arange(count, device=images.device)[:, None] + step).flatten() for count in size)
     grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(images.dtype)

@@ -16,7 +16,7 @@ from torchface.landmarks.images.ibug import MIRROR_68
 from torchface.landmarks.images.shape_modes import learn_shape_modes, similarity_modes
 from torchface.progress import Progress, silent
 
-_FEWEST = 3
+_MIN_IMAGES = 3
 _NOSE_BRIDGE = 29
 _RANK = 1e-7
 
@@ -73,7 +73,7 @@ def learn_appearance(
 
 
 def mirrored(landmarks: Tensor, widths: Sequence[int]) -> Tensor:
-    """Landmarks (M,68,2) of the mirror images of pictures with these widths, pixels."""
+    """Landmarks (M,68,2) of the mirror images of images with these widths, pixels."""
     flipped = landmarks[:, list(MIRROR_68)].clone()
     flipped[..., 0] = flipped.new_tensor(widths)[:, None] - 1 - flipped[..., 0]
     return flipped
@@ -163,8 +163,8 @@ def _checked(image: Tensor, number: int) -> Tensor:
 
 
 def _check_landmarks(images: Sequence[Tensor], landmarks: Tensor) -> None:
-    if len(images) < _FEWEST:
-        raise ShapeError(f"images: found {len(images)}, expected at least {_FEWEST} to learn how a face moves")
+    if len(images) < _MIN_IMAGES:
+        raise ShapeError(f"images: found {len(images)}, expected at least {_MIN_IMAGES} to learn how a face moves")
     if landmarks.shape != (len(images), COUNT, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected {(len(images), COUNT, 2)}")
     for number, (image, points) in enumerate(zip(images, landmarks, strict=True)):

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.ibug import MIRROR_68
-from torchface.landmarks.images.landmark_trees import LandmarkTrees, similarity_to, start_shapes
+from torchface.landmarks.images.landmark_trees import LandmarkTrees, initial_shapes, similarity_to
 
 _AROUND = 0.6  # of the box's side that is shown to the trees on every side
 _OUTLYING = 0.02  # of the box's side: starts that end so far from the others count half
 _HALF = 0.02
-_LARGEST_SIDE = 4096
+_MAX_SIDE = 4096
 
 
 @dataclass(frozen=True)
@@ -26,20 +26,20 @@ class ConsensusSettings:
     """From where trees start.
 
     Args:
-        starts: how many, an even number; half of them on the mirrored picture. Their mean is steadier than any of
+        starts: how many, an even number; half of them on the mirrored image. Their mean is steadier than any of
             them, and knows no side.
-        side: pixels a side that the box is given in the picture that the trees see.
-        shift: standard deviation of the starts' place, of the box.
-        zoom: standard deviation of the logarithm of their size.
-        turn: standard deviation of their tilt, degrees.
-        seed: draws them, once for all pictures.
+        side: pixels a side that the box is given in the image that the trees see.
+        translation: standard deviation of the starts' place, of the box.
+        scale: standard deviation of the logarithm of their size.
+        rotation: standard deviation of their tilt, degrees.
+        seed: draws them, once for all images.
     """
 
     starts: int = 16
     side: int = 110
-    shift: float = 0.04
-    zoom: float = 0.06
-    turn: float = 4.0
+    translation: float = 0.04
+    scale: float = 0.06
+    rotation: float = 4.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class ConsensusSettings:
             raise ValueRangeError(
                 f"consensus: found {self.starts} starts, side {self.side}; expected 2 to 4096 and even, 16 to 1024"
             )
-        if not all(0 <= value < 45 for value in (self.shift, self.zoom, self.turn)):
+        if not all(0 <= value < 45 for value in (self.translation, self.scale, self.rotation)):
             raise ValueRangeError(f"consensus: found {self}, expected deviations from 0")
 
 
@@ -73,19 +73,19 @@ def consensus(
 ) -> Consensus:
     r"""Landmarks of one face, the robust mean over several starts.
 
-    The face is cut out and brought to one size first, so that large pictures cost no more than small ones and no
+    The face is cut out and brought to one size first, so that large images cost no more than small ones and no
     pixels are skipped. A start k counts for landmark l with the weight :math:`1 / (1 + (d_{kl} / d_0)^2)`,
     :math:`d_{kl}` its distance from the starts' median.
 
     Args:
         trees: find iBUG's 68.
         image: grey, uint8 (H,W).
-        box: x, y, width, height of the face, (4,) pixels; it may reach out of the picture.
-        tilt: of the face, radians, clockwise as the picture is seen.
+        box: x, y, width, height of the face, (4,) pixels; it may reach out of the image.
+        tilt: of the face, radians, clockwise as the image is seen.
         settings: from where the trees start.
 
     Raises:
-        ShapeError: no such picture or box.
+        ShapeError: no such image or box.
         ValueRangeError: the box is NaN, empty, or absurdly large.
     """
     settings = settings or ConsensusSettings()
@@ -96,8 +96,8 @@ def consensus(
     if box.shape != (4,):
         raise ShapeError(f"box: found {tuple(box.shape)}, expected (4,)")
     side = math.sqrt(max(float(box[2] * box[3]), 0.0)) if bool(torch.isfinite(box).all()) else 0.0
-    if not 1 <= side <= _LARGEST_SIDE:
-        raise ValueRangeError(f"box: found {box.tolist()}, expected a face of 1 to {_LARGEST_SIDE} pixels")
+    if not 1 <= side <= _MAX_SIDE:
+        raise ValueRangeError(f"box: found {box.tolist()}, expected a face of 1 to {_MAX_SIDE} pixels")
     picture, scale, corner = _cut(image.cpu().numpy(), box, side, settings.side)
     seen = torch.from_numpy(picture)[None, None].to(trees.mean) / 255
     middle = ((box[:2] + box[2:] / 2).to(trees.mean) + 0.5 - corner.to(trees.mean)) * scale.to(trees.mean) - 0.5
@@ -115,13 +115,13 @@ def consensus(
 
 
 def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:
-    """How far landmarks (L,2) are turned against the trees' mean shape, radians, clockwise as the picture is seen."""
-    turn = similarity_to(trees.mean, landmarks[None].to(trees.mean))[0]
-    return math.atan2(float(turn[1, 0]), float(turn[0, 0]))
+    """How far landmarks (L,2) are turned against the trees' mean shape, radians, clockwise as the image is seen."""
+    rotation = similarity_to(trees.mean, landmarks[None].to(trees.mean))[0]
+    return math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
 
 
 def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.ndarray, Tensor, Tensor]:
-    """The picture round a box at the wanted size, pixels of it a pixel (2,), and the corner it was cut at (2,)."""
+    """The image round a box at the wanted size, pixels of it a pixel (2,), and the corner it was cut at (2,)."""
     middle = (box[:2] + box[2:] / 2).tolist()
     reach = (0.5 + _AROUND) * side
     x, y = math.floor(middle[0] - reach), math.floor(middle[1] - reach)
@@ -144,18 +144,20 @@ def _starts(mean: Tensor, middle: Tensor, settings: ConsensusSettings, tilt: flo
     """The mean shape (L,2) round a middle (2,), moved, turned and scaled: (K/2,L,2)."""
     drawn = torch.randn(settings.starts // 2, 4, generator=torch.Generator().manual_seed(settings.seed)).clamp(-2, 2)
     drawn = (drawn - drawn.mean(0)).to(mean)
-    angle = tilt + math.radians(settings.turn) * drawn[:, 3]
-    zoom = (settings.zoom * drawn[:, 2]).exp()
-    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * zoom[:, None, None]
+    angle = tilt + math.radians(settings.rotation) * drawn[:, 3]
+    scale = (settings.scale * drawn[:, 2]).exp()
+    rotation = (
+        torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * scale[:, None, None]
+    )
     side = float(settings.side)
     square = torch.cat([middle - side / 2, middle.new_tensor([side, side])])[None]
-    shape = start_shapes(mean, square)[0]
+    shape = initial_shapes(mean, square)[0]
     centre = shape.mean(0)
-    return centre + (shape - centre) @ turn.transpose(1, 2) + (settings.shift * side * drawn[:, :2])[:, None]
+    return centre + (shape - centre) @ rotation.transpose(1, 2) + (settings.translation * side * drawn[:, :2])[:, None]
 
 
 def _mirrored(shapes: Tensor, last: int) -> Tensor:
-    """Shapes (K,L,2) in the mirrored picture, whose last column is ``last``."""
+    """Shapes (K,L,2) in the mirrored image, whose last column is ``last``."""
     across = shapes[:, list(MIRROR_68)].clone()
     across[..., 0] = last - across[..., 0]
     return across

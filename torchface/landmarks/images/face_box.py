@@ -1,4 +1,4 @@
-"""Where faces are in a picture: OpenCV's shipped Haar cascades, or a YuNet network that the user brings."""
+"""Where faces are in an image: OpenCV's shipped Haar cascades, or a YuNet network that the user brings."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _OVERLAP = 0.25
 # A profile cascade's box beside the frontal one's for the same face: this much of a side further to where the face
 # looks away from, and this much larger. Medians over photographs and drawn faces.
 _PROFILE_ASIDE, _PROFILE_SIZE = 0.2, 1.25
-_LARGEST_NETWORK = 64 * 2**20
+_MAX_NETWORK = 64 * 2**20
 _NETWORK_OUTPUTS = tuple(f"{name}_{stride}" for name in ("cls", "obj", "bbox", "kps") for stride in (8, 16, 32))
 # Eyes, tip of the nose, corners of the mouth in a face's box, over photographs and drawn faces.
 _FIVE = torch.tensor([[0.33, 0.374], [0.68, 0.374], [0.49, 0.572], [0.357, 0.758], [0.655, 0.758]])
 
 
 class NoFaceError(TorchfaceError):
-    """A picture shows no face, or fewer than asked for."""
+    """An image shows no face, or fewer than asked for."""
 
 
 @dataclass(frozen=True, eq=False)
 class FaceBoxes:
-    """Faces found in a picture, the largest first.
+    """Faces found in an image, the largest first.
 
     Args:
         boxes: x, y, width, height, (F,4) float32 pixels; squares as ``ibug.box_around`` draws them.
@@ -47,23 +47,23 @@ class FaceBoxes:
 
 
 class FaceDetector(Protocol):
-    """Finds faces in one picture, uint8 (H,W) or (3,H,W), red first."""
+    """Finds faces in one image, uint8 (H,W) or (3,H,W), red first."""
 
     def __call__(self, image: Tensor) -> FaceBoxes: ...
 
 
 @dataclass(frozen=True)
 class HaarDetector:
-    """OpenCV's shipped cascades: the frontal one, and that of profiles on the picture and its mirror image.
+    """OpenCV's shipped cascades: the frontal one, and that of profiles on the image and its mirror image.
 
-    A box of a profile counts only where no frontal one overlaps it. The search works on a small copy of the picture, in
-    which the smallest face looked for has 24 pixels, so that large pictures cost no more than small ones.
+    A box of a profile counts only where no frontal one overlaps it. The search works on a small copy of the image, in
+    which the smallest face looked for has 24 pixels, so that large images cost no more than small ones.
 
     Args:
-        smallest: side of the smallest face's box, of the picture's shorter side.
+        smallest: side of the smallest face's box, of the image's shorter side.
         neighbours: search windows that must agree on a face.
         step: factor between the sizes searched.
-        profiles: also look for profiles where no frontal face is found at all; ``"always"`` in every picture,
+        profiles: also look for profiles where no frontal face is found at all; ``"always"`` in every image,
             ``"never"`` in none.
 
     Source: Viola and Jones 2001; Lienhart and Maydt 2002.
@@ -102,7 +102,7 @@ class HaarDetector:
                     aside[:, 0] = small.shape[1] - 1 - aside[:, 0] - aside[:, 2]
                 free = overlaps(aside, boxes).amax(1) < _OVERLAP if len(boxes) else torch.ones(len(aside)).bool()
                 boxes, counts = torch.cat([boxes, aside[free]]), torch.cat([counts, found[free]])
-        if len(boxes):  # back to the picture's pixels, whose centres are at integers
+        if len(boxes):  # back to the image's pixels, whose centres are at integers
             ratio = boxes.new_tensor([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
             boxes = torch.cat([(boxes[:, :2] + 0.5) * ratio - 0.5, boxes[:, 2:] * ratio], 1)
         return sorted_boxes(boxes, counts / (counts + 10))
@@ -128,7 +128,7 @@ class YuNetDetector:
     Args:
         path: the file.
         least_score: faces of lower score are none.
-        longest: the picture is made smaller until its longer side has so many pixels.
+        longest: the image is made smaller until its longer side has so many pixels.
 
     Raises:
         FileFormatError: the file cannot be read or is no such network.
@@ -176,14 +176,14 @@ class YuNetDetector:
 
 
 def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes:
-    """All faces in a picture, the largest first; none is no error.
+    """All faces in an image, the largest first; none is no error.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
         detector: the shipped cascades if absent, profiles beside frontal faces.
 
     Raises:
-        ShapeError: no such picture.
+        ShapeError: no such image.
     """
     _check_picture(image)
     return (detector or HaarDetector(profiles="always"))(image)
@@ -199,13 +199,13 @@ def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = No
 
     Raises:
         NoFaceError: there are not so many.
-        ShapeError: no such picture.
+        ShapeError: no such image.
     """
     faces = find_faces(image, detector)
     if not 0 <= number < len(faces):
         found = "no face" if not len(faces) else f"{len(faces)} {'face' if len(faces) == 1 else 'faces'}"
         raise NoFaceError(
-            f"picture of {image.shape[-1]} x {image.shape[-2]}: found {found}, expected "
+            f"image of {image.shape[-1]} x {image.shape[-2]}: found {found}, expected "
             + ("one at least" if number == 0 else f"more than {number}")
         )
     return faces.boxes[number]
@@ -221,7 +221,7 @@ def overlaps(first: Tensor, second: Tensor) -> Tensor:
 
 
 def grey_pixels(image: Tensor) -> np.ndarray:
-    """A picture's grey values, uint8 (H,W), as OpenCV weighs colours."""
+    """An image's grey values, uint8 (H,W), as OpenCV weighs colours."""
     _check_picture(image)
     if image.ndim == 2:
         return image.cpu().numpy()
@@ -236,7 +236,7 @@ def sorted_boxes(boxes: Tensor, scores: Tensor) -> FaceBoxes:
 
 def _check_picture(image: Tensor) -> None:
     if image.dtype != torch.uint8 or not (image.ndim == 2 or (image.ndim == 3 and len(image) == 3)) or 0 in image.shape:
-        raise ShapeError(f"picture: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W) or (3,H,W)")
+        raise ShapeError(f"image: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W) or (3,H,W)")
 
 
 def _as_frontal(boxes: Tensor) -> Tensor:
@@ -275,11 +275,11 @@ def _check_network(path: Path) -> None:
 
     try:
         size = path.stat().st_size
-        content = path.read_bytes() if 0 < size <= _LARGEST_NETWORK else b""
+        content = path.read_bytes() if 0 < size <= _MAX_NETWORK else b""
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path}: cannot be read ({error})") from error
     if not content:
-        raise FileFormatError(f"{path}: found {size} bytes, expected a YuNet network of 1 to {_LARGEST_NETWORK}")
+        raise FileFormatError(f"{path}: found {size} bytes, expected a YuNet network of 1 to {_MAX_NETWORK}")
     try:
         model = onnx.load_model_from_string(content)
         onnx.checker.check_model(model)

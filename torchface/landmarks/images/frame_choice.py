@@ -10,7 +10,7 @@ from torchface.landmarks.images.shape_modes import procrustes_mean
 
 _PARTS = (slice(0, 17), slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), slice(48, 68))
 _ASTRAY = 6.0
-_LEAST_SPREAD = 0.01
+_MIN_DEVIATION = 0.01
 
 
 def choose_frames(landmarks: Tensor, count: int = 15, confidence: Tensor | None = None) -> Tensor:
@@ -53,7 +53,7 @@ def choose_frames(landmarks: Tensor, count: int = 15, confidence: Tensor | None 
     frames, aligned = frames[sound], aligned[sound]
     offset = aligned - aligned.median(0).values
     spread = torch.stack([offset[:, part].square().sum((1, 2)).mean().sqrt() for part in _PARTS])
-    weights = 1 / spread.clamp(min=_LEAST_SPREAD)
+    weights = 1 / spread.clamp(min=_MIN_DEVIATION)
     scaled = torch.cat([w * offset[:, part].flatten(1) for w, part in zip(weights, _PARTS, strict=True)], dim=1)
     chosen = [int(scaled.norm(dim=1).argmin())]
     nearest = (scaled - scaled[chosen[0]]).norm(dim=1)

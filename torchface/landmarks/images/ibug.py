@@ -21,7 +21,7 @@ def _mirror() -> tuple[int, ...]:
 
 
 MIRROR_68 = _mirror()
-"""Which of the 68 each becomes when the picture is mirrored."""
+"""Which of the 68 each becomes when the image is mirrored."""
 
 INNER = slice(17, 68)
 """Brows, nose, eyes and mouth: all but the jaw's contour."""

@@ -1,4 +1,4 @@
-"""Landmarks in a picture by a cascade of regression trees that compare pixels near the current landmarks."""
+"""Landmarks in an image by a cascade of regression trees that compare pixels near the current landmarks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torchface.files.documents import Value
 FAINTEST = 0.02
 """Spread of the grey values under which a face counts as having none, in [0,1]."""
 
-_MOST = {"landmarks": 10_000, "cascades": 1000, "trees": 100_000, "depth": 12, "features": 32_000}
+_MAX_SIZES = {"landmarks": 10_000, "cascades": 1000, "trees": 100_000, "depth": 12, "features": 32_000}
 
 
 class LandmarkTrees(nn.Module):
-    r"""An ensemble of regression trees: landmarks of faces from grey pictures and boxes round the faces.
+    r"""An ensemble of regression trees: landmarks of faces from grey images and boxes round the faces.
 
     It starts from the mean shape in the box. Each cascade reads ``features`` grey values, each at a place that is fixed
     relative to a landmark of the current shape, turned and scaled as the shape is; its trees compare pairs of them and
@@ -29,7 +29,7 @@ class LandmarkTrees(nn.Module):
 
     with :math:`s R` the similarity from mean shape to S and :math:`\sigma` the spread of the grey values read, so that
     neither light nor contrast, nor size nor tilt of the face, nor the box's exact place matter. Leaves are int8, one
-    scale a tree, on the principal components of what was left to learn in their cascade. Outside of a picture its
+    scale a tree, on the principal components of what was left to learn in their cascade. Outside of an image its
     border goes on. A box that is NaN gives NaN.
 
     Args:
@@ -68,8 +68,8 @@ class LandmarkTrees(nn.Module):
         super().__init__()
         sizes = {"landmarks": landmarks, "cascades": cascades, "trees": trees, "depth": depth, "features": features}
         for name, size in sizes.items():
-            if not 1 <= size <= _MOST[name]:
-                raise ValueRangeError(f"{name}: found {size}, expected 1 to {_MOST[name]}")
+            if not 1 <= size <= _MAX_SIZES[name]:
+                raise ValueRangeError(f"{name}: found {size}, expected 1 to {_MAX_SIZES[name]}")
         if not 1 <= components <= 2 * landmarks:
             raise ValueRangeError(f"components: found {components}, expected 1 to {2 * landmarks}")
         self.sizes = {**sizes, "components": components}
@@ -118,7 +118,7 @@ class LandmarkTrees(nn.Module):
             raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,1,H,W)")
         if boxes.shape != (len(images), 4):
             raise ShapeError(f"boxes: found {tuple(boxes.shape)}, expected ({len(images)},4)")
-        return self.refine(images, start_shapes(self.mean, boxes.to(self.mean)))
+        return self.refine(images, initial_shapes(self.mean, boxes.to(self.mean)))
 
     def refine(self, images: Tensor, shapes: Tensor) -> Tensor:
         """Landmarks (B,L,2) from other starts than the mean shape in a box, such as where they were a frame ago.
@@ -134,10 +134,10 @@ class LandmarkTrees(nn.Module):
             raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected {(len(images), *self.mean.shape)}")
         shapes = shapes.to(self.mean)
         for cascade in range(self.sizes["cascades"]):  # each starts where the one before ended
-            turn = similarity_to(self.mean, shapes)
-            pixels = shapes[:, self.anchors[cascade]] + self.offsets[cascade] @ turn.transpose(1, 2)
+            rotation = similarity_to(self.mean, shapes)
+            pixels = shapes[:, self.anchors[cascade]] + self.offsets[cascade] @ rotation.transpose(1, 2)
             step = self._step(cascade, read_grey(images, pixels)).view(-1, *self.mean.shape)
-            shapes = shapes + step @ turn.transpose(1, 2)
+            shapes = shapes + step @ rotation.transpose(1, 2)
         return shapes
 
     def _step(self, cascade: int, grey: Tensor) -> Tensor:
@@ -153,7 +153,7 @@ class LandmarkTrees(nn.Module):
         return torch.einsum("t,btk->bk", self.scales[cascade], leaf.to(grey.dtype)) @ self.bases[cascade]
 
 
-def start_shapes(mean: Tensor, boxes: Tensor) -> Tensor:
+def initial_shapes(mean: Tensor, boxes: Tensor) -> Tensor:
     """The mean shape (L,2), in units of a box, in each box (B,4): (B,L,2) pixels.
 
     A box that is no square counts as the square of the same middle and area.

@@ -7,27 +7,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_ROUNDS = 20
+_ITERATIONS = 20
 
 
 class PlanarPose(NamedTuple):
-    """Similarities of the plane as complex numbers, z -> turn·z + shift: ``turn`` (B,) and ``shift`` (B,)."""
+    """Similarities of the plane as complex numbers (B,): z -> rotation·z + translation; the scale is |rotation|."""
 
-    turn: Tensor
-    shift: Tensor
+    rotation: Tensor
+    translation: Tensor
 
     def apply(self, shapes: Tensor) -> Tensor:
         """Shapes (B,L,2) or (L,2) moved, (B,L,2)."""
-        return torch.view_as_real(self.turn[:, None] * _complex(shapes) + self.shift[:, None])
+        return torch.view_as_real(self.rotation[:, None] * _complex(shapes) + self.translation[:, None])
 
     def undo(self, shapes: Tensor) -> Tensor:
         """Shapes (B,L,2) moved back."""
-        return torch.view_as_real((_complex(shapes) - self.shift[:, None]) / self.turn[:, None])
+        return torch.view_as_real((_complex(shapes) - self.translation[:, None]) / self.rotation[:, None])
 
     @property
     def scale(self) -> Tensor:
         """How many times larger things become, (B,)."""
-        return self.turn.abs()
+        return self.rotation.abs()
 
 
 class ShapeModes(NamedTuple):
@@ -56,9 +56,9 @@ def planar_pose(mean: Tensor, shapes: Tensor) -> PlanarPose:
     Source: Cootes et al. 1995.
     """
     start, end = _complex(mean), _complex(shapes)
-    shift = end.mean(1)
-    turn = (start.conj() * (end - shift[:, None])).sum(1) / start.abs().square().sum()
-    return PlanarPose(turn, shift)
+    translation = end.mean(1)
+    rotation = (start.conj() * (end - translation[:, None])).sum(1) / start.abs().square().sum()
+    return PlanarPose(rotation, translation)
 
 
 def similarity_modes(mean: Tensor) -> Tensor:
@@ -113,7 +113,7 @@ def learn_shape_modes(
 def procrustes_mean(shapes: Tensor) -> tuple[Tensor, Tensor]:
     """The mean (L,2) of shapes (M,L,2) without their poses, upright as the first is, and they laid on it (M,L,2)."""
     mean = _unit(shapes[0])
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         aligned = planar_pose(mean, shapes).undo(shapes)
         mean = _unit(planar_pose(mean, aligned.mean(0)[None]).undo(aligned.mean(0)[None])[0])
     upright = planar_pose(_unit(shapes.mean(0)), mean[None])

@@ -33,7 +33,7 @@ class TrackingSettings:
 
     Starts on a face end near each other, starts on anything else do not: with the shipped trees the mean spread was
     0.008 to 0.036 of the box's side on 19 photographed faces, 0.004 to 0.020 on drawn ones, and 0.057 to 0.10 on
-    pieces of pictures without a face (5th to 95th percentile; the most on a photographed face was 0.045, the least
+    pieces of images without a face (5th to 95th percentile; the most on a photographed face was 0.045, the least
     without one 0.054).
 
     Args:
@@ -247,7 +247,7 @@ class LandmarkTracker:
         return boxes[self.face] if self.face < len(boxes) else None
 
     def _plausible(self, box: Tensor, grey: Tensor) -> bool:
-        """Whether a box is a size that a face can have, and its middle in the picture."""
+        """Whether a box is a size that a face can have, and its middle in the image."""
         if not bool(torch.isfinite(box).all()):
             return False
         x, y = (box[:2] + box[2:] / 2).tolist()
@@ -310,7 +310,7 @@ def find_landmarks(
 
     Raises:
         NoFaceError: there are not so many faces.
-        ShapeError: no such picture.
+        ShapeError: no such image.
         ValueRangeError: the trees find other landmarks than the 68.
     """
     if trees.mean.shape != (COUNT, 2):
@@ -347,7 +347,7 @@ def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tenso
 
     Args:
         appearance: of the person.
-        grey: the picture, uint8 (H,W).
+        grey: the image, uint8 (H,W).
         start: (68,2), pixels.
     """
     box = box_around(start)
@@ -358,7 +358,7 @@ def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tenso
     if 0 in piece.shape:
         return start
     fit = appearance.refine(piece[None, None].float() / 255, (start - low)[None])
-    better = bool(torch.isfinite(fit.landmarks).all()) and float(fit.error) <= float(fit.start_error)
+    better = bool(torch.isfinite(fit.landmarks).all()) and float(fit.error) <= float(fit.initial_error)
     near = float((fit.landmarks[0] + low - start).norm(dim=1).mean()) < 0.15 * float(box[2]) if better else False
     return (fit.landmarks[0] + low).to(start) if near else start
 

@@ -14,11 +14,11 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.states import pack_state, read_state
 from torchface.files.whole_files import write_file
 from torchface.landmarks.images.ibug import MIRROR_68
-from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees, similarity_to, start_shapes
+from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees, initial_shapes, similarity_to
 from torchface.progress import Progress, silent
 
 _ROWS = 4096  # samples whose pixels are read at once
-_MOST_PIXELS = 2**33
+_MAX_PIXELS = 2**33
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ class TreeSettings:
         features: pixels a cascade, from which pairs are drawn.
         test_splits: pairs that are tried at every node; the best is kept.
         shrinkage: share of a leaf's mean that is taken; the trees after it learn the rest.
-        oversampling: starts a picture.
+        oversampling: starts an image.
         closeness: distance at which a pair is e times less likely to be tried than one at no distance, of the box.
         padding: how far beyond the mean shape pixels are drawn, of the box.
         components: of what is left to learn in a cascade, on which leaves are stored; 0 for all, twice the landmarks.
         split_samples: starts on which a tree's splits are chosen; its leaves are the means of all. 0 for all.
-        shift: standard deviation of the starts' place, of the box.
-        zoom: standard deviation of the logarithm of the starts' size.
-        turn: standard deviation of the starts' tilt, degrees.
-        gamma: standard deviation of the logarithm of the exponent that makes a start's picture lighter or darker.
+        translation: standard deviation of the starts' place, of the box.
+        scale: standard deviation of the logarithm of the starts' size.
+        rotation: standard deviation of the starts' tilt, degrees.
+        gamma: standard deviation of the logarithm of the exponent that makes a start's image lighter or darker.
         noise: added to the grey values, standard deviation, in [0,1].
         seed: of everything drawn.
     """
@@ -56,9 +56,9 @@ class TreeSettings:
     padding: float = 0.05
     components: int = 40
     split_samples: int = 8192
-    shift: float = 0.06
-    zoom: float = 0.1
-    turn: float = 8.0
+    translation: float = 0.06
+    scale: float = 0.1
+    rotation: float = 8.0
     gamma: float = 0.25
     noise: float = 0.01
     seed: int = 0
@@ -66,7 +66,7 @@ class TreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Starts: which picture (N,), mirrored or not (N,), gamma (N,), where to end (N,L,2); all pictures' pixels."""
+    """Starts: which image (N,), mirrored or not (N,), gamma (N,), where to end (N,L,2); all images' pixels."""
 
     picture: Tensor
     flipped: Tensor
@@ -97,9 +97,9 @@ def fit_trees(
     mirror: Sequence[int] | None = None,
     checkpoint: Path | None = None,
 ) -> LandmarkTrees:
-    """Learns landmarks from annotated pictures.
+    """Learns landmarks from annotated images.
 
-    Every picture is started from several boxes near its own, half of them mirrored; a tree learns a share of what the
+    Every image is started from several boxes near its own, half of them mirrored; a tree learns a share of what the
     trees before it left, its leaves rounded as they are stored, so that later trees make up for that too.
 
     Args:
@@ -108,14 +108,14 @@ def fit_trees(
         landmarks: (M,L,2), pixels; NaN where one is not known.
         settings: how trees are grown.
         progress: told each step and how far it is.
-        mirror: which landmark each becomes in a mirrored picture; iBUG's where there are 68, else nothing is mirrored.
-        checkpoint: a file that is written after every cascade; where it is there, from the same pictures and settings,
+        mirror: which landmark each becomes in a mirrored image; iBUG's where there are 68, else nothing is mirrored.
+        checkpoint: a file that is written after every cascade; where it is there, from the same images and settings,
             learning goes on from it, to the same result. It may be deleted afterwards.
 
     Raises:
         ShapeError: numbers of images, boxes and landmarks differ, or an image is no uint8 (H,W).
         ValueRangeError: a box is NaN or empty, a landmark is never seen, or a setting is out of range.
-        FileFormatError: the checkpoint is of other pictures or settings, or damaged.
+        FileFormatError: the checkpoint is of other images or settings, or damaged.
     """
     settings = settings or TreeSettings()
     boxes, landmarks = boxes.float(), landmarks.float()
@@ -150,14 +150,14 @@ def _check(images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor, settings:
     for i, image in enumerate(images):
         if image.ndim != 2 or image.dtype != torch.uint8 or 0 in image.shape:
             raise ShapeError(f"image {i}: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W)")
-    if sum(image.numel() for image in images) > _MOST_PIXELS:
-        raise ShapeError(f"images: found more than {_MOST_PIXELS} pixels in all, expected fewer; crop them")
+    if sum(image.numel() for image in images) > _MAX_PIXELS:
+        raise ShapeError(f"images: found more than {_MAX_PIXELS} pixels in all, expected fewer; crop them")
     if not bool(torch.isfinite(boxes).all()) or not bool((boxes[:, 2:] > 0).all()):
         row = int((~torch.isfinite(boxes).all(1) | (boxes[:, 2:] <= 0).any(1)).nonzero()[0])
         raise ValueRangeError(f"box {row}: found {boxes[row].tolist()}, expected finite numbers and a positive size")
     never = ~torch.isfinite(landmarks).all(-1).any(0)
     if never.any():
-        raise ValueRangeError(f"landmark {int(never.nonzero()[0])}: found in no picture, expected in one at least")
+        raise ValueRangeError(f"landmark {int(never.nonzero()[0])}: found in no image, expected in one at least")
     for name, value in asdict(settings).items():
         least = 1 if name in ("cascades", "trees", "depth", "features", "test_splits", "oversampling") else 0
         if not value >= least:
@@ -184,8 +184,8 @@ def _draw_starts(
         mean = (mean + mean[list(mirror)] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])) / 2
     count, total = len(images), len(images) * settings.oversampling
     picture = torch.arange(count).repeat(settings.oversampling)
-    turn_of_duty = torch.arange(settings.oversampling).repeat_interleave(count)
-    flipped = (turn_of_duty + picture) % 2 == 1 if mirror is not None else torch.zeros(total, dtype=torch.bool)
+    draw = torch.arange(settings.oversampling).repeat_interleave(count)
+    flipped = (draw + picture) % 2 == 1 if mirror is not None else torch.zeros(total, dtype=torch.bool)
     width = torch.tensor([image.shape[1] for image in images])
     height = torch.tensor([image.shape[0] for image in images])
     targets, placed = landmarks[picture], boxes[picture].clone()
@@ -196,14 +196,16 @@ def _draw_starts(
         targets = torch.where(flipped[:, None, None], across, targets)
         placed[:, 0] = torch.where(flipped, last - placed[:, 0] - placed[:, 2], placed[:, 0])
     drawn = torch.randn(total, 5, generator=generator).clamp(-2.5, 2.5)
-    drawn[:count, :4] = 0  # each picture's own box among them
+    drawn[:count, :4] = 0  # each image's own box among them
     size = (placed[:, 2] * placed[:, 3]).sqrt()
-    start = start_shapes(mean, placed)
+    start = initial_shapes(mean, placed)
     centre = start.mean(1, keepdim=True)
-    angle, zoom = drawn[:, 3] * (settings.turn * torch.pi / 180), (settings.zoom * drawn[:, 2]).exp()
-    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * zoom[:, None, None]
-    start = centre + (start - centre) @ turn.transpose(1, 2)
-    start = start + (settings.shift * size[:, None] * drawn[:, :2])[:, None]
+    angle, scale = drawn[:, 3] * (settings.rotation * torch.pi / 180), (settings.scale * drawn[:, 2]).exp()
+    rotation = (
+        torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * scale[:, None, None]
+    )
+    start = centre + (start - centre) @ rotation.transpose(1, 2)
+    start = start + (settings.translation * size[:, None] * drawn[:, :2])[:, None]
     sizes = torch.tensor([image.numel() for image in images])
     samples = _Samples(
         picture,
@@ -234,15 +236,15 @@ def _grow_cascade(
     anchors = torch.cdist(places, mean).argmin(1)
     model.anchors[cascade] = anchors
     model.offsets[cascade] = (places - mean[anchors]).half().float()
-    turn = similarity_to(mean, shapes)
+    rotation = similarity_to(mean, shapes)
     # Pixels by rows: a split reads two of them, over all samples.
     grey = torch.empty(settings.features, len(shapes))
     for rows in torch.arange(len(shapes)).split(_ROWS):
-        spots = shapes[rows][:, anchors] + model.offsets[cascade] @ turn[rows].transpose(1, 2)
+        spots = shapes[rows][:, anchors] + model.offsets[cascade] @ rotation[rows].transpose(1, 2)
         read = samples.grey(rows, spots)
         read = read + settings.noise * torch.randn(read.shape, generator=generator)
         grey[:, rows] = (read / read.std(1, correction=0, keepdim=True).clamp(min=FAINTEST)).T
-    missing = torch.nan_to_num(samples.targets - shapes) @ torch.linalg.inv(turn).transpose(1, 2)
+    missing = torch.nan_to_num(samples.targets - shapes) @ torch.linalg.inv(rotation).transpose(1, 2)
     missing = missing.flatten(1)
     _, axes = torch.linalg.eigh((missing.T @ missing).double())
     basis = axes.flip(1)[:, : model.sizes["components"]].T.float().half().float()
@@ -255,7 +257,7 @@ def _grow_cascade(
         _grow_tree(model, cascade, tree, grey, residual, likely, settings, generator)
         progress("growing trees", cascade * settings.trees + tree + 1, total)
     step = ((before - residual) @ basis).view_as(shapes)
-    return shapes + step @ turn.transpose(1, 2)
+    return shapes + step @ rotation.transpose(1, 2)
 
 
 def _grow_tree(
@@ -270,7 +272,7 @@ def _grow_tree(
 ) -> None:
     """Grows one tree on grey values (P,N) and takes what it says from the residual (N,K)."""
     features, count = grey.shape
-    # Starts that follow each other are of different pictures: a run of them is as good as a draw, and is no copy.
+    # Starts that follow each other are of different images: a run of them is as good as a draw, and is no copy.
     some = min(settings.split_samples or count, count)
     begin = int(torch.randint(count - some + 1, (), generator=generator))
     wanted = residual[begin : begin + some]
@@ -355,7 +357,7 @@ def _resume(path: Path, signature: Tensor, model: LandmarkTrees, shapes: Tensor)
     state, _ = read_state(path, expected, path.stat().st_size)
     if not torch.equal(state.pop("signature"), signature) or not 0 < int(state["done"]) <= model.sizes["cascades"]:
         raise FileFormatError(
-            f"{path}: found a checkpoint of other pictures or settings, expected one of these; delete it"
+            f"{path}: found a checkpoint of other images or settings, expected one of these; delete it"
         )
     done, shapes = int(state.pop("done")), state.pop("shapes")
     model.load_state_dict(state)

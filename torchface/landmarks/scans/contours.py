@@ -24,19 +24,19 @@ class TraceSettings:
     Args:
         border: the line stays this near to the box round the two corners, above and below.
         similar: weight of neighbours having the same intensity, or being as like.
-        dark: weight of being dark, or like the learned look.
+        dark: weight of being dark, or like the learned profile.
         smooth: weight of neighbours lying level, a squared pixel.
         near: weight of staying near the course that the line starts with, a squared standard deviation.
         line_width: intensity is measured against that so many pixels above and below.
         blurs: standard deviations of the blur under which the line is found first, and then finer.
         sags: where no usual course is known, the line starts as an arc that sags by these shares of its length; the
             best end wins.
-        spread: the standard deviation about such an arc, a share of its length.
+        deviation: the standard deviation about such an arc, a share of its length.
         displacements: where corners are known to be loose, either end of the usual course is tried moved by so many
             standard deviations; the best line wins, and every column pays for its displacement as for leaving the
             course.
-        sweeps: at most so many a blur; fewer when nothing moves any more.
-        loose_ends: a corner is only known to within so many pixels up or down.
+        iterations: at most so many a blur; fewer when nothing moves any more.
+        end_tolerance: a corner is only known to within so many pixels up or down.
     """
 
     border: int = 50
@@ -47,10 +47,10 @@ class TraceSettings:
     line_width: int = 5
     blurs: tuple[float, ...] = (1.0,)
     sags: tuple[float, ...] = (-0.06, 0.0, 0.06, 0.12)
-    spread: float = 0.07
+    deviation: float = 0.07
     displacements: tuple[float, ...] = (-2.0, -1.0, 0.0, 1.0, 2.0)
-    sweeps: int = 15
-    loose_ends: int = 8
+    iterations: int = 15
+    end_tolerance: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Contour:
 
     Args:
         points: one a pixel column from the left corner to the right one, (N,2), x right and y down.
-        kept: whether a point is as dark as the line, or as like its look, within one standard deviation, (N,) bool.
+        kept: whether a point is as dark as the line, or as like its profile, within one standard deviation, (N,) bool.
         energy: what was minimised, a column.
     """
 
@@ -89,7 +89,7 @@ def trace_contour(
     settings: TraceSettings | None = None,
     shape: LineShape | None = None,
 ) -> Contour:
-    r"""Traces the line between two corners: a dark one, or one that looks as it was learned to.
+    r"""Traces the line between two corners: a dark one, or one with the profile that was learned.
 
     A line has one row :math:`y_c` a column c; with I how little a pixel is like the line, over its standard deviation
     in the box,
@@ -98,8 +98,8 @@ def trace_contour(
         + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
 
     with :math:`y^0` the course that it starts with. In the thesis I is the intensity; here it is how much brighter a
-    pixel is than the darker of what lies above and below, or, where the line's look was learned from annotated lines,
-    1 less the correlation of what lies round the pixel with that look: the line between two lids need not be the
+    pixel is than the darker of what lies above and below, or, where its profile was learned from annotated lines,
+    1 less the correlation of what lies round the pixel with that profile: the line between two lids need not be the
     darkest of the furrows there. The thesis starts from the straight line and has no last term; here the start is the
     mean of annotated lines where there were any, else the straight line and an arc. Learned lines are tried with
     their ends moved up and down as far as corners are usually off; the least energy wins.
@@ -112,7 +112,7 @@ def trace_contour(
         image: grey (1,S,S) or colours (3,S,S) in [0,1].
         left, right: corners, (2,) pixels; the left one further left by two pixels at least.
         settings: weights and limits.
-        shape: how the line usually runs and looks.
+        shape: how the line usually runs, and its profile.
 
     Raises:
         ShapeError: not an image.
@@ -122,16 +122,16 @@ def trace_contour(
     """
     settings = settings or TraceSettings()
     box, rows, columns = _box(image, left, right, settings.border)
-    shapes = [LineShape.arc(sag, settings.spread) for sag in settings.sags] if shape is None else [shape]
+    shapes = [LineShape.arc(sag, settings.deviation) for sag in settings.sags] if shape is None else [shape]
     starts, pulls, displaced = _starts(shapes, left, right, torch.from_numpy(columns), settings)
     starts -= rows[0]
-    look = None if shape is None or shape.profile is None else shape.looks(left, right, torch.from_numpy(columns))
+    profile = None if shape is None or shape.profile is None else shape.profiles(left, right, torch.from_numpy(columns))
     path = starts.round().clip(0, len(rows) - 1).astype(np.int64)
     grey = np.zeros(0)
     for blur in settings.blurs:  # each goes on from where the coarser one ended
         smooth = gaussian_blur(box[None, None], blur)[0, 0].double()
-        grey = _valleys(smooth.numpy(), settings.line_width) if look is None else _unlike(smooth, look)
-        path = _sweep(grey, path, starts, pulls, settings)
+        grey = _valleys(smooth.numpy(), settings.line_width) if profile is None else _unlike(smooth, profile)
+        path = _conditional_modes(grey, path, starts, pulls, settings)
     energies = _energy(grey, path, starts, pulls, settings) + displaced
     best = int(energies.argmin())
     line = path[best]
@@ -151,12 +151,12 @@ def _starts(
     share = torch.linspace(0, 1, len(columns), dtype=torch.float64)
     starts, pulls, costs = [], [], []
     for shape in shapes:
-        rows, spread = shape.rows(left, right, columns)
-        tried = settings.displacements if shape.looseness > 0 else (0.0,)
+        rows, deviation = shape.rows(left, right, columns)
+        tried = settings.displacements if shape.corner_deviation > 0 else (0.0,)
         for at_left, at_right in product(tried, tried):
             displaced = at_left * (1 - share) + at_right * share
-            starts.append(rows + shape.looseness * displaced)
-            pulls.append(settings.near / spread**2)
+            starts.append(rows + shape.corner_deviation * displaced)
+            pulls.append(settings.near / deviation**2)
             costs.append(settings.near * float(displaced.square().mean()))
     return torch.stack(starts).numpy(), torch.stack(pulls).numpy(), np.array(costs)
 
@@ -192,25 +192,27 @@ def _valleys(grey: NDArray, width: int) -> NDArray:
     return (valley - valley.min()) / max(float(valley.std()), 1e-6)
 
 
-def _unlike(grey: Tensor, look: Tensor) -> NDArray:
-    """How little what lies round a pixel resembles the look (N,P) of the line in its column, in standard deviations."""
-    reach = look.shape[1] // 2
+def _unlike(grey: Tensor, profile: Tensor) -> NDArray:
+    """1 less the correlation of what lies round a pixel with its column's profile (N,P), in standard deviations."""
+    reach = profile.shape[1] // 2
     padded = torch.nn.functional.pad(grey[None, None], (0, 0, reach, reach), mode="replicate")[0, 0]
-    around = padded.unfold(0, look.shape[1], 1)
-    unlike = 1 - (unit_profiles(around) * look).sum(-1).numpy()
+    around = padded.unfold(0, profile.shape[1], 1)
+    unlike = 1 - (unit_profiles(around) * profile).sum(-1).numpy()
     return unlike / max(float(unlike.std()), 1e-6)
 
 
-def _sweep(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
+def _conditional_modes(
+    grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings
+) -> NDArray:
     """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
     path = path.copy()
     lines = np.arange(len(path))
     count = path.shape[1]
     row = np.arange(len(grey), dtype=np.float64)
-    outside = np.abs(row[:, None] - starts[:, None, [0, -1]]) > settings.loose_ends
+    outside = np.abs(row[:, None] - starts[:, None, [0, -1]]) > settings.end_tolerance
     # The order is the method: a column's choice is what the next column starts from. Hence a loop, and NumPy, whose
     # small operations take a fifth of torch's time.
-    for _ in range(settings.sweeps):
+    for _ in range(settings.iterations):
         before = path.copy()
         shades = grey[path, np.arange(count)]
         limit = shades.mean(1) + shades.std(1)

@@ -1,4 +1,4 @@
-"""A picture of form alone: shaded curvature, for scans without texture and for what should not depend on paint."""
+"""An image of form alone: shaded curvature, for scans without texture and for what should not depend on paint."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from torchface.landmarks.scans.cylinder import UnwrappedHead
 from torchface.rendering.gaussian_blur import gaussian_blur
 
 
-def relief(head: UnwrappedHead, scale: float = 1.2, contrast: float = 8.0) -> Tensor:
+def curvature_image(head: UnwrappedHead, scale: float = 1.2, contrast: float = 8.0) -> Tensor:
     r"""Mean curvature of the unwrapped surface as grey: ridges bright, creases dark.
 
     .. math:: g = \tfrac12 + \tfrac12 \tanh(c H), \quad
        H = \tfrac12 \Big(\frac{n_u \cdot x_u}{x_u \cdot x_u} + \frac{n_v \cdot x_v}{x_v \cdot x_v}\Big)
 
     with x the surface after a Gaussian blur of its distance from the axis, n its unit normal, u and v along the
-    picture's axes (that they stay nearly perpendicular is the approximation).
+    image's axes (that they stay nearly perpendicular is the approximation).
 
     Between closed lids there is no furrow that a hand-held scanner resolves: the deepest one runs some 3 mm above the
-    line where they meet. Tracing in this picture therefore goes by the learned look of the line, not by darkness.
+    line where they meet. Tracing in this image therefore goes by the learned look of the line, not by darkness.
 
     Args:
         head: an unwrapped scan.

@@ -21,7 +21,7 @@ _NEAREST_AXIS = 15.0
 
 @dataclass(frozen=True)
 class CylinderLayout:
-    r"""Where a point of the face frame lies in the unwrapped picture.
+    r"""Where a point of the face frame lies in the unwrapped image.
 
     The frame has its origin on the head's axis, y up, z toward the viewer. With pitch p (millimetres a pixel) and
     cylinder radius R, :math:`x = c + \frac{R}{p} \operatorname{atan2}(X, Z)` and :math:`y = c - Y / p`,
@@ -33,7 +33,7 @@ class CylinderLayout:
         radius: of the cylinder, millimetres.
 
     Raises:
-        ValueRangeError: a number is not positive, or the picture is wider than the whole turn.
+        ValueRangeError: a number is not positive, or the image is wider than the whole turn.
     """
 
     size: int = 1024
@@ -76,7 +76,7 @@ class UnwrappedHead:
     """What the outermost surface shows round a head's axis.
 
     Args:
-        layout: of the picture.
+        layout: of the image.
         pose: from the scan's space to the face frame, a batch of one.
         triangle: under each pixel, (S,S) int64, -1 where there is none.
         barycentric: in that triangle, (S,S,3).
@@ -125,7 +125,7 @@ def unwrap(mesh: Mesh, pose: Similarity, layout: CylinderLayout | None = None) -
     Args:
         mesh: a scan in any space.
         pose: from that space to the face frame, a batch of one.
-        layout: of the picture.
+        layout: of the image.
 
     Raises:
         ShapeError: the pose is not one.

@@ -1,4 +1,4 @@
-"""How far found landmarks and lines are from the true ones, in pixels and millimetres, and a picture of both."""
+"""How far found landmarks and lines are from the true ones, in pixels and millimetres, and an image of both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.landmarks.scans.contours import evenly_spaced
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks
-from torchface.landmarks.scans.twelve_landmarks import LINES
+from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.mesh import Mesh
 
 _FOUND, _TRUE = (1.0, 0.1, 0.1), (0.1, 0.9, 0.2)
@@ -43,7 +43,7 @@ class ScanErrors:
 
 def landmark_errors(found: ScanLandmarks, scan: Mesh, truth: ScanAnnotation, name: str = "") -> ScanErrors:
     """Compares what was found on a scan with the truth about it."""
-    known = truth.twelve()
+    known = truth.ordered()
     layout, pose = found.head.layout, found.head.pose
     pixels = (found.pixels.double() - layout.pixels(pose.apply(known[None])[0])).norm(dim=-1)
     millimetres = (found.points.double() - known).norm(dim=-1)
@@ -77,14 +77,14 @@ def error_table(errors: Sequence[ScanErrors]) -> dict[str, float]:
 
 
 def picture(found: ScanLandmarks, truth: ScanAnnotation | None = None) -> Tensor:
-    """The part of the unwrapped picture round the face, found landmarks and lines red, true ones green, (3,H,W)."""
+    """The part of the unwrapped image round the face, found landmarks and lines red, true ones green, (3,H,W)."""
     image = found.image.expand(3, -1, -1).clone()
     layout, pose = found.head.layout, found.head.pose
     thick = max(1, found.image.shape[-1] // 512)
     if truth is not None:
         for line in truth.lines.values():
             _dots(image, evenly_spaced(layout.pixels(pose.apply(line[None].double())[0]), 300), thick, _TRUE)
-        _dots(image, layout.pixels(pose.apply(truth.twelve()[None])[0]), 3 * thick, _TRUE)
+        _dots(image, layout.pixels(pose.apply(truth.ordered()[None])[0]), 3 * thick, _TRUE)
     for contour in found.contours.values():
         _dots(image, contour.points[contour.kept], thick, _FOUND)
     _dots(image, found.pixels, 3 * thick, _FOUND)

@@ -14,14 +14,14 @@ from torchface.landmarks.scans.cylinder import CylinderLayout, unwrap
 from torchface.landmarks.scans.nose_search import nose_candidates, protrusion
 from torchface.landmarks.scans.pose_search import PoseSearch, find_pose, misfit, refine
 from torchface.landmarks.scans.surface_sample import sample_surface
-from torchface.landmarks.scans.twelve_landmarks import MIRRORED, TWELVE
+from torchface.landmarks.scans.uv_landmark_names import MIRRORED, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
 
 _AXIS_BEHIND_EYES = 70.0
 _MAP = CylinderLayout(size=128, pitch=2.8)
 _ABOVE_EYES, _BELOW_MOUTH, _HALF_ANGLE = 32.0, 22.0, 1.15
-_ROUNDS = 2
-_WORST_MISFIT = 3.5
+_ITERATIONS = 2
+_MAX_MISFIT = 3.5
 _LAST_REACHES = (8.0, 6.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0)
 
 
@@ -44,7 +44,7 @@ class FaceFrame(nn.Module):
     normals: Tensor
     nose: Tensor
 
-    def __init__(self, points: int, count: int = len(TWELVE)) -> None:
+    def __init__(self, points: int, count: int = len(UV_LANDMARK_NAMES)) -> None:
         super().__init__()
         self.register_buffer("landmarks", torch.zeros(count, 3, dtype=torch.float64))
         self.register_buffer("surface", torch.zeros(points, 3, dtype=torch.float64))
@@ -70,16 +70,17 @@ class FaceFrame(nn.Module):
 
         Source: thesis 3.2.2 needs one UV space; generalised Procrustes analysis (Gower 1975) gives it here.
         """
-        if landmarks.shape != (len(scans), len(TWELVE), 3) or not len(scans):
+        if landmarks.shape != (len(scans), len(UV_LANDMARK_NAMES), 3) or not len(scans):
             raise ShapeError(
-                f"landmarks: found {tuple(landmarks.shape)}, expected ({len(scans)},{len(TWELVE)},3), one scan or more"
+                f"landmarks: found {tuple(landmarks.shape)}, expected ({len(scans)},{len(UV_LANDMARK_NAMES)},3), "
+                "one scan or more"
             )
         mean = _mean_landmarks(landmarks.double())
         poses = similarity_transform(landmarks.double(), mean.expand(len(scans), -1, -1))
         samples = [sample_surface(scan) for scan in scans]
         frame = cls(0)
         # Landmarks are placed by hand and few; once the mean face is known, its whole surface places a scan better.
-        for _ in range(_ROUNDS):
+        for _ in range(_ITERATIONS):
             frame = cls._of_poses(scans, landmarks.double(), poses)
             poses = _stack([frame._refined(sample, _row(poses, i)) for i, sample in enumerate(samples)])
         return cls._of_poses(scans, landmarks.double(), poses)
@@ -128,10 +129,10 @@ class FaceFrame(nn.Module):
         pose, rest = find_pose(
             self.surface, self.normals, nose, direction, sample, nose_candidates(sample), search or PoseSearch()
         )
-        if rest > _WORST_MISFIT:
+        if rest > _MAX_MISFIT:
             raise ValueRangeError(
                 f"scan: found no face; the likeliest place differs from the mean face by {rest:.1f} mm on average, "
-                f"expected at most {_WORST_MISFIT} (are the units millimetres?)"
+                f"expected at most {_MAX_MISFIT} (are the units millimetres?)"
             )
         return self._refined(sample, pose.inverse())
 

@@ -11,12 +11,12 @@ from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, scan_landmarks
-from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE, twelve_from_ibug
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
+from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 
 _SAME_LINE = 12.0
-_TWELVE_IN_IBUG = {"nose": 30, "between_eyes": 27, "mouth_top": 51, "mouth_bottom": 57}
+_UV_LANDMARKS_IN_IBUG = {"nose": 30, "between_eyes": 27, "mouth_top": 51, "mouth_bottom": 57}
 _CORNERS_IN_IBUG = {
     "right_eye_outer": 36,
     "right_eye_inner": 39,
@@ -144,10 +144,10 @@ def contour_correspondences(
 
 
 def _annotated_landmarks(template: Mesh, ibug: Tensor) -> dict[str, int]:
-    named = {name: int(ibug[row]) for name, row in {**_TWELVE_IN_IBUG, **_CORNERS_IN_IBUG}.items()}
-    twelve = twelve_from_ibug(template.vertices[ibug].double())
+    named = {name: int(ibug[row]) for name, row in {**_UV_LANDMARKS_IN_IBUG, **_CORNERS_IN_IBUG}.items()}
+    twelve = uv_landmarks_from_ibug(template.vertices[ibug].double())
     for name in ("right_cheek", "left_cheek"):
-        away = (template.vertices.double() - twelve[TWELVE.index(name)]).norm(dim=-1)
+        away = (template.vertices.double() - twelve[UV_LANDMARK_NAMES.index(name)]).norm(dim=-1)
         named[name] = int(away.argmin())
     return named
 
@@ -213,7 +213,7 @@ class AutomaticLandmarks:
     """Finds pairs for ``register``: called with the template laid on a scan, the scan, and the similarity from the
     template's own space to the scan's; gives template vertex ids (K,) and scan points (K,3).
 
-    Only sure pairs are given. Where the picture is unlike those learned from (open eyes, another skin), filters agree
+    Only sure pairs are given. Where the image is unlike those learned from (open eyes, another skin), filters agree
     on little, confidence is low, and registration goes by shape alone instead of by guesses.
 
     Args:

@@ -1,4 +1,4 @@
-"""How a line between two corners usually runs and looks: learned from annotated ones, to trace new ones by."""
+"""How a line between two corners usually runs, and its grey profile: learned from annotated lines."""
 
 from __future__ import annotations
 
@@ -13,67 +13,70 @@ from torchface.rendering.gaussian_blur import gaussian_blur
 
 STATIONS = 17
 REACH = 10
-"""Rows above and below a line that tell what it looks like."""
+"""Rows above and below a line that its profile spans."""
 
-_LEAST_SPREAD = 0.02  # of the length: corners are not found more exactly
+_MIN_DEVIATION = 0.02  # of the length: corners are not found more exactly
 _BLUR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class LineShape:
-    """The usual course of a line, in shares of the length of its chord, and its look.
+    """The usual course of a line, in fractions of the length of its chord, and its profile.
 
     Args:
         offset: how far below the chord the line runs at equal steps from its left to its right corner, (K,).
-        spread: standard deviation of that, (K,).
-        looseness: standard deviation of how far above or below their true places corners are found, pixels.
+        deviation: standard deviation of that, (K,).
+        corner_deviation: standard deviation of how far above or below their true places corners are found, pixels.
         profile: grey values from ``REACH`` rows above the line to as many below, at the same steps, with mean 0 and
             norm 1, (K,2·REACH+1); a line without one is dark.
     """
 
     offset: Tensor
-    spread: Tensor
-    looseness: float = 0.0
+    deviation: Tensor
+    corner_deviation: float = 0.0
     profile: Tensor | None = None
 
     @staticmethod
-    def arc(sag: float, spread: float) -> LineShape:
+    def arc(sag: float, deviation: float) -> LineShape:
         """A parabola that sags by a share of its length; 0 is the straight line."""
         along = torch.linspace(0, 1, STATIONS, dtype=torch.float64)
-        return LineShape(4 * sag * along * (1 - along), torch.full((STATIONS,), spread, dtype=torch.float64))
+        return LineShape(4 * sag * along * (1 - along), torch.full((STATIONS,), deviation, dtype=torch.float64))
 
     @staticmethod
-    def fit(lines: Sequence[Tensor], images: Sequence[Tensor] | None = None, looseness: float = 0.0) -> LineShape:
+    def fit(
+        lines: Sequence[Tensor], images: Sequence[Tensor] | None = None, corner_deviation: float = 0.0
+    ) -> LineShape:
         """The mean course of pixel lines, each (N,2) from its left to its right corner; two lines at least.
 
         Args:
             lines: as annotated.
-            images: what each line runs through, (C,S,S); without them the look is not learned.
-            looseness: see the class.
+            images: what each line runs through, (C,S,S); without them the profile is not learned.
+            corner_deviation: see the class.
         """
         rows = torch.stack([_offsets(line.double()) for line in lines])
-        shape = LineShape(rows.mean(0), rows.std(0).clamp(min=_LEAST_SPREAD), looseness)
+        shape = LineShape(rows.mean(0), rows.std(0).clamp(min=_MIN_DEVIATION), corner_deviation)
         if images is None:
             return shape
-        looks = torch.stack([_look(image, line.double()) for image, line in zip(images, lines, strict=True)])
-        return LineShape(shape.offset, shape.spread, looseness, unit_profiles(looks.mean(0)))
+        pairs = zip(images, lines, strict=True)
+        profiles = torch.stack([_profiles_across(image, line.double()) for image, line in pairs])
+        return LineShape(shape.offset, shape.deviation, corner_deviation, unit_profiles(profiles.mean(0)))
 
     def rows(self, left: Tensor, right: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the line is expected between two corners (2,): rows (N,) at columns (N,), and their spread, pixels."""
+        """Where the line is expected between two corners (2,): rows (N,) at columns (N,), and deviations, pixels."""
         left, right = left.double(), right.double()
         share = ((columns.double() - left[0]) / (right[0] - left[0])).clamp(0, 1)
         straight = left[1] + share * (right[1] - left[1])
         length = right[0] - left[0]
-        return straight + length * _at(self.offset, share), length * _at(self.spread, share)
+        return straight + length * _at(self.offset, share), length * _at(self.deviation, share)
 
-    def looks(self, left: Tensor, right: Tensor, columns: Tensor) -> Tensor:
-        """What columns (N,) look like round the line, (N,2·REACH+1).
+    def profiles(self, left: Tensor, right: Tensor, columns: Tensor) -> Tensor:
+        """The expected profiles across the line at columns (N,), (N,2·REACH+1).
 
         Raises:
-            ValueRangeError: the look was not learned.
+            ValueRangeError: the profile was not learned.
         """
         if self.profile is None:
-            raise ValueRangeError("LineShape: found no look, expected one learned from images")
+            raise ValueRangeError("LineShape: found no profile, expected one learned from images")
         share = ((columns.double() - left[0].double()) / (right[0] - left[0]).double()).clamp(0, 1)
         return unit_profiles(_at(self.profile, share))
 
@@ -104,7 +107,7 @@ def _rows_at(line: Tensor, columns: Tensor) -> Tensor:
     return y[after - 1] + share * (y[after] - y[after - 1])
 
 
-def _look(image: Tensor, line: Tensor) -> Tensor:
+def _profiles_across(image: Tensor, line: Tensor) -> Tensor:
     """Profiles (K,2·REACH+1) of an image (C,S,S) across a line (N,2): the mean of the columns round each station."""
     grey = gaussian_blur(image.mean(0, keepdim=True)[None].float(), _BLUR)[0, 0].double()
     height, width = grey.shape

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.files.documents import Value, read_json, write_json
-from torchface.landmarks.scans.twelve_landmarks import TWELVE
+from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES
 
 _FORMAT = "torchface.scan-annotations/1"
 _MAX_BYTES = 256 * 2**20
@@ -28,10 +28,10 @@ class ScanAnnotation:
     points: dict[str, Tensor]
     lines: dict[str, Tensor] = field(default_factory=dict)
 
-    def twelve(self) -> Tensor:
-        """The landmarks in the order of ``TWELVE``, (12,3), NaN where one is not known."""
+    def ordered(self) -> Tensor:
+        """The landmarks in the order of ``UV_LANDMARK_NAMES``, (12,3), NaN where one is not known."""
         missing = torch.full((3,), torch.nan, dtype=torch.float64)
-        return torch.stack([self.points[name].double() if name in self.points else missing for name in TWELVE])
+        return torch.stack([self.points[name].double() if name in self.points else missing for name in UV_LANDMARK_NAMES])
 
 
 def save_annotations(annotations: Mapping[str, ScanAnnotation], path: str | Path) -> None:
@@ -62,7 +62,7 @@ def load_annotations(path: str | Path) -> dict[str, ScanAnnotation]:
 
 
 def _annotation(one: Value) -> ScanAnnotation:
-    points, lines = one["points"].table(*TWELVE), one["lines"].table() if one["lines"] else {}
+    points, lines = one["points"].table(*UV_LANDMARK_NAMES), one["lines"].table() if one["lines"] else {}
     return ScanAnnotation(
         {name: point.tensor(3, expected="three finite numbers") for name, point in points.items()},
         {name: line.tensor(None, 3, expected="points of three finite numbers") for name, line in lines.items()},

@@ -1,4 +1,4 @@
-"""The twelve landmarks and the lip and lid lines of a raw scan, found in its unwrapped picture."""
+"""The twelve landmarks and the lip and lid lines of a raw scan, found in its unwrapped image."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
-from torchface.landmarks.scans.curvature_image import relief
+from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
 from torchface.landmarks.scans.line_shape import LineShape
-from torchface.landmarks.scans.twelve_landmarks import LINES
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
+from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.mesh import Mesh
 
 _BROAD_SCALE, _BROAD_CONTRAST = 3.0, 16.0  # millimetres; facets of coarse scans and their noise are smaller
@@ -28,7 +28,7 @@ class ScanLandmarks:
         names: of the landmarks.
         points: (L,3) in the scan's space, millimetres.
         confidence: (L,) in [0,1]; 0 where only the usual place is known.
-        pixels: (L,2) in the unwrapped picture.
+        pixels: (L,2) in the unwrapped image.
         contours: the traced lines by name, in pixels; a line whose corners lie the wrong way round is missing.
         head: the unwrapped scan.
         image: what the detector saw, (C,S,S).
@@ -57,13 +57,13 @@ class ScanLandmarks:
 
 
 def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
-    """The picture (C,S,S) that a detector of this appearance looks at.
+    """The image (C,S,S) that a detector of this appearance looks at.
 
     Raises:
         ValueRangeError: a texture is wanted and the scan has no colours.
     """
-    if appearance == "relief":
-        return relief(head, _BROAD_SCALE, _BROAD_CONTRAST)
+    if appearance == "curvature":
+        return curvature_image(head, _BROAD_SCALE, _BROAD_CONTRAST)
     if head.texture is None:
         raise ValueRangeError(
             "scan: found no texture and no vertex colours, expected some: this detector learned from textures; "
@@ -73,9 +73,9 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
 
 
 def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
-    """The picture (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
+    """The image (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
     from its surroundings."""
-    return relief(head) if appearance == "relief" else appearance_image(head, appearance)
+    return curvature_image(head) if appearance == "curvature" else appearance_image(head, appearance)
 
 
 def scan_landmarks(

@@ -16,12 +16,12 @@ from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.hog import cell_map, similarity, unit_windows, windows
 from torchface.landmarks.scans.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.scans.score_statistics import best_scores, score_statistics
-from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE
+from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
 from torchface.optim.mean_shift import mean_shift
 from torchface.rendering.gaussian_blur import unsharp
 
-FARTHEST = 4.5  # standard deviations from the usual place beyond which nothing is believed
+MAX_DISTANCE = 4.5  # standard deviations from the usual place beyond which nothing is believed
 _PRIOR_FLOOR = 2.0  # pixels; landmarks set by hand are not surer than that
 
 
@@ -56,7 +56,7 @@ class UVLandmarkDetector(nn.Module):
         images: how many training images there were.
         size: side of the square images, pixels.
         names: of the landmarks.
-        appearance: what the images show, "texture" or "relief".
+        appearance: what the images show, "texture" or "curvature".
         settings: how to match; a dict as in ``config`` will do.
         frame: config of the ``FaceFrame`` that scans are laid into, where there is one.
 
@@ -70,22 +70,22 @@ class UVLandmarkDetector(nn.Module):
     prior_mean: Tensor
     prior_covariance: Tensor
     noise: Tensor
-    courses: Tensor
-    looks: Tensor
-    looseness: Tensor
+    line_statistics: Tensor
+    line_profiles: Tensor
+    corner_deviation: Tensor
 
     def __init__(
         self,
         images: int,
         size: int = 1024,
-        names: tuple[str, ...] = TWELVE,
+        names: tuple[str, ...] = UV_LANDMARK_NAMES,
         appearance: str = "texture",
         settings: DetectorSettings | dict[str, Any] | None = None,
         frame: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if appearance not in ("texture", "relief"):
-            raise ValueRangeError(f"appearance: found {appearance!r}, expected 'texture' or 'relief'")
+        if appearance not in ("texture", "curvature"):
+            raise ValueRangeError(f"appearance: found {appearance!r}, expected 'texture' or 'curvature'")
         self.names, self.size, self.appearance = tuple(names), size, appearance
         self.settings = DetectorSettings.of(settings)
         self.frame = None if frame is None else FaceFrame(**frame)
@@ -97,9 +97,9 @@ class UVLandmarkDetector(nn.Module):
         self.register_buffer("prior_mean", torch.zeros(count, 2))
         self.register_buffer("prior_covariance", torch.zeros(count, 2, 2))
         self.register_buffer("noise", torch.zeros(count))
-        self.register_buffer("courses", torch.zeros(len(LINES), 2, STATIONS))
-        self.register_buffer("looks", torch.zeros(len(LINES), STATIONS, 2 * REACH + 1))
-        self.register_buffer("looseness", torch.zeros(count))
+        self.register_buffer("line_statistics", torch.zeros(len(LINES), 2, STATIONS))
+        self.register_buffer("line_profiles", torch.zeros(len(LINES), STATIONS, 2 * REACH + 1))
+        self.register_buffer("corner_deviation", torch.zeros(count))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -116,11 +116,13 @@ class UVLandmarkDetector(nn.Module):
     def sees(self, mesh: Mesh) -> bool:
         """Whether a scan has what this detector looks at: colours, if it learned from those."""
         textured = mesh.texture is not None and mesh.uvs is not None and mesh.uv_faces is not None
-        return self.appearance == "relief" or textured or mesh.colors is not None
+        return self.appearance == "curvature" or textured or mesh.colors is not None
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> UVLandmarkDetector:
         """A detector of zeros for the state to be loaded into."""
+        if config.get("appearance") == "relief":  # the name in older models
+            config = {**config, "appearance": "curvature"}
         return cls(**config)
 
     @classmethod
@@ -128,7 +130,7 @@ class UVLandmarkDetector(nn.Module):
         cls,
         images: Tensor,
         landmarks: Tensor,
-        names: tuple[str, ...] = TWELVE,
+        names: tuple[str, ...] = UV_LANDMARK_NAMES,
         appearance: str = "texture",
         settings: DetectorSettings | None = None,
         frame: FaceFrame | None = None,
@@ -142,12 +144,12 @@ class UVLandmarkDetector(nn.Module):
             images: (M,C,S,S) in [0,1], at least two.
             landmarks: pixels, (M,L,2); NaN where one is not known (at most all but two of the images).
             names: of the L landmarks.
-            appearance: what the images show, "texture" or "relief".
+            appearance: what the images show, "texture" or "curvature".
             settings: how to match.
             frame: the frame the images were unwrapped in, kept for ``scan_landmarks``.
             lines: pixels of each image's lip and lid lines by name, (N,2) from left to right, where known:
                 tracing starts from their mean and looks for what they look like.
-            line_images: the pictures that lines are traced in, (M,C,S,S), where they are others.
+            line_images: the images that lines are traced in, (M,C,S,S), where they are others.
             progress: called with the number of images done and in all.
 
         Raises:
@@ -233,7 +235,7 @@ class UVLandmarkDetector(nn.Module):
         clusters = mean_shift(points, self.settings.bandwidth, votes)
         offset = clusters.centres - mean
         squared = (offset * torch.linalg.solve(covariance, offset.T).T).sum(-1)
-        near = torch.exp(-0.5 * squared) * (squared < FARTHEST**2)
+        near = torch.exp(-0.5 * squared) * (squared < MAX_DISTANCE**2)
         value = clusters.sizes * near
         best = int(value.argmax())
         if float(value[best]) <= 0:
@@ -242,12 +244,12 @@ class UVLandmarkDetector(nn.Module):
 
     def _more_likely_good(self, landmark: int, scores: Tensor) -> Tensor:
         """Whether scores (M,R) of a landmark's filters are likelier among the good than among the bad."""
-        mean_good, spread_good = self.good[landmark, :, :1], self.good[landmark, :, 1:]
-        mean_bad, spread_bad = self.bad[landmark, :, :1], self.bad[landmark, :, 1:]
+        mean_good, deviation_good = self.good[landmark, :, :1], self.good[landmark, :, 1:]
+        mean_bad, deviation_bad = self.bad[landmark, :, :1], self.bad[landmark, :, 1:]
         # Above the mean of the good, a score can only be better: a wide Gaussian of bad ones has no say there.
         clipped = torch.minimum(scores, mean_good)
-        likely = -0.5 * ((clipped - mean_good) / spread_good) ** 2 - spread_good.log()
-        unlikely = -0.5 * ((clipped - mean_bad) / spread_bad) ** 2 - spread_bad.log()
+        likely = -0.5 * ((clipped - mean_good) / deviation_good) ** 2 - deviation_good.log()
+        unlikely = -0.5 * ((clipped - mean_bad) / deviation_bad) ** 2 - deviation_bad.log()
         return likely >= unlikely
 
     def _fit_prior(self, landmarks: Tensor) -> None:
@@ -277,16 +279,16 @@ class UVLandmarkDetector(nn.Module):
             for k in range(count):
                 places[i, k] = self._weighed(k, places[i, k], shares[i, k])
         # 1.48 medians of the absolute value are a normal variable's standard deviation.
-        self.looseness.copy_(1.48 * (places - landmarks)[..., 1].abs().nanmedian(0).values)
+        self.corner_deviation.copy_(1.48 * (places - landmarks)[..., 1].abs().nanmedian(0).values)
 
     def line_shapes(self) -> dict[str, LineShape]:
         """How the lines usually run and look, those that were annotated in training."""
         shapes = {}
         for row, (name, ends) in enumerate(LINES.items()):
-            offset, spread = self.courses[row]
-            if bool((spread > 0).all()) and all(end in self.names for end in ends):
-                loose = max(float(self.looseness[self.names.index(end)]) for end in ends)
-                shapes[name] = LineShape(offset, spread, loose, self.looks[row])
+            offset, deviation = self.line_statistics[row]
+            if bool((deviation > 0).all()) and all(end in self.names for end in ends):
+                corners = max(float(self.corner_deviation[self.names.index(end)]) for end in ends)
+                shapes[name] = LineShape(offset, deviation, corners, self.line_profiles[row])
         return shapes
 
     def _fit_lines(self, lines: Sequence[Mapping[str, Tensor]], images: Tensor) -> None:
@@ -294,9 +296,9 @@ class UVLandmarkDetector(nn.Module):
             known = [(one[name], image) for one, image in zip(lines, images, strict=False) if name in one]
             if len(known) >= 2:
                 shape = LineShape.fit([line for line, _ in known], [image for _, image in known])
-                self.courses[row] = torch.stack([shape.offset, shape.spread]).to(self.courses)
+                self.line_statistics[row] = torch.stack([shape.offset, shape.deviation]).to(self.line_statistics)
                 if shape.profile is not None:
-                    self.looks[row] = shape.profile.to(self.looks)
+                    self.line_profiles[row] = shape.profile.to(self.line_profiles)
 
     def _raw_cells(self, images: Tensor) -> Tensor:
         sharp = unsharp(images.float(), self.settings.unsharp_sigma, self.settings.unsharp_amount)

@@ -148,25 +148,25 @@ class ExpressionRegression(nn.Module):
         if form == "offsets":
             predicted = predicted @ poses.rotation.double().transpose(-1, -2)[:, None]
             places = (predicted.abs().amax((0, -1)) > _STILL).flatten().nonzero()[:, 0]
-            looked_at = _moving(predicted) if region is None else region
+            considered = _moving(predicted) if region is None else region
         else:
             predicted = poses.apply(predicted.flatten(1, 2)).view_as(predicted)
             places = torch.arange(predicted.shape[1] * predicted.shape[2])
-            looked_at = torch.ones(laid.shape[1], dtype=torch.bool) if region is None else region
-        if looked_at.dtype != torch.bool or looked_at.shape != laid.shape[1:2] or not bool(looked_at.any()):
+            considered = torch.ones(laid.shape[1], dtype=torch.bool) if region is None else region
+        if considered.dtype != torch.bool or considered.shape != laid.shape[1:2] or not bool(considered.any()):
             raise ShapeError(
-                f"region: found {looked_at.dtype} {tuple(looked_at.shape)}, expected a mask (V,), not empty"
+                f"region: found {considered.dtype} {tuple(considered.shape)}, expected a mask (V,), not empty"
             )
         moving = predicted.flatten(1, 2)[:, places].flatten(1).float()
-        flat = laid[:, looked_at].flatten(1).float()
+        flat = laid[:, considered].flatten(1).float()
         if neutral_components is None or offset_components is None or ridge is None:
             choice = choose_components(flat, moving, neutral_components, offset_components, ridge)
             neutral_components, offset_components, ridge = choice.inputs, choice.outputs, choice.ridge
         neutral, offset = principal_components(flat), _components_or_mean(moving)
         kept = min(neutral_components, len(neutral.components)), min(offset_components, len(offset.components))
-        self = cls(laid.shape[1], names, int(looked_at.sum()), len(places), *kept, topology, form)
+        self = cls(laid.shape[1], names, int(considered.sum()), len(places), *kept, topology, form)
         self.neutral_mean.copy_(laid.mean(0))
-        self.region.copy_(looked_at.nonzero()[:, 0])
+        self.region.copy_(considered.nonzero()[:, 0])
         self.neutral_components.copy_(neutral.components[: kept[0]].unflatten(1, (-1, 3)))
         self.offset_mean.copy_(offset.mean.view(-1, 3))
         self.offset_components.copy_(offset.components[: kept[1]].reshape(kept[1], len(places), 3))

@@ -1,1 +1,1 @@
-"""Stages that film, scan and mark a head as real equipment does, with the truth beside it."""
+"""Stages that video, scan and mark a head as real equipment does, with the truth beside it."""

@@ -1,4 +1,4 @@
-"""What stands behind a face in a picture, and what a camera does to it: structure, blur, noise, compression."""
+"""What stands behind a face in an image, and what a camera does to it: structure, blur, noise, compression."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def uniform(low: float, high: float, generator: torch.Generator) -> float:
 
 
 def backdrop(height: int, width: int, generator: torch.Generator) -> Tensor:
-    """A grey picture (H,W) in [0,1] with clouds, edges, stripes and spots of all sizes."""
+    """A grey image (H,W) in [0,1] with clouds, edges, stripes and spots of all sizes."""
     picture = np.full((height, width), uniform(0.05, 0.95, generator), dtype=np.float32)
     for octave in range(1, 7):
         amount = uniform(0, 0.35, generator) * 0.75**octave
@@ -44,7 +44,7 @@ def backdrop(height: int, width: int, generator: torch.Generator) -> Tensor:
 
 
 def photographed(picture: Tensor, height: int, generator: torch.Generator) -> Tensor:
-    """What a camera makes of a grey picture (H,W) in [0,1]: uint8 (height, width), blurred, noisy, compressed."""
+    """What a camera makes of a grey image (H,W) in [0,1]: uint8 (height, width), blurred, noisy, compressed."""
     high, wide = picture.shape
     sigma = abs(uniform(-0.6, 1.2, generator)) * high / 200
     grey = gaussian_blur(picture[None, None], sigma if sigma > 0.2 else 0)[0, 0].numpy()

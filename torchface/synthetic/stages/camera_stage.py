@@ -1,4 +1,4 @@
-"""A camera stage: a performer with painted strokes and reflective markers, filmed by a camera on a helmet.
+"""A camera stage: a performer with painted strokes and reflective markers, recorded by a camera on a helmet.
 
 A real video file, the markers as C3D beside it, a description of what was performed, and the truth.
 """
@@ -26,18 +26,18 @@ from torchface.synthetic.head.identity import both_sides, mean_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.topology import EYE_RIM, topology
 from torchface.synthetic.stages.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
-from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS, FilmedHead
-from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, loose_cameras
+from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
+from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
 from torchface.synthetic.stages.reflective_paint import reflective_paint
 
 SIDE_MARKERS = ("SIDE_L", "SIDE_R")
-"""Labels of the two markers by which pictures are stabilised."""
+"""Labels of the two markers by which images are stabilised."""
 
 
 @dataclass(frozen=True)
 class StageSettings:
-    """How a session is filmed.
+    """How a session is recorded.
 
     Args:
         width, height: of the video, pixels.
@@ -58,7 +58,7 @@ class StageSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class FilmedSession:
+class RecordedSession:
     """The files of a session, and the truth behind them.
 
     Args:
@@ -85,7 +85,7 @@ class FilmedSession:
     translation: Tensor
 
 
-def film_session(
+def record_session(
     folder: str | Path,
     name: str,
     identity: Tensor | None,
@@ -93,8 +93,8 @@ def film_session(
     settings: StageSettings = StageSettings(),
     progress: Progress | None = None,
     attachment: Attachment | None = None,
-) -> FilmedSession:
-    """Paints a performer, sets markers, films a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
+) -> RecordedSession:
+    """Paints a performer, sets markers, records a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
 
     Args:
         folder: that exists.
@@ -114,11 +114,11 @@ def film_session(
     rig = performer(identity, texture=True)
     performance = perform_action_units(rig.names, generator, settings.performance)
     attachment = stage_markers(rig, settings.markers) if attachment is None else attachment
-    attachment.select(SIDE_MARKERS)  # without them there is no way to hold pictures still; said before hours of filming
+    attachment.select(SIDE_MARKERS)  # without them there is no way to hold images still; said before hours of filming
     recording = record(rig, attachment, performance.weights, generator, settings.marker_flaws, settings.performance.fps)
     paint = reflective_paint(rig.neutral.texture.shape[-1], generator, settings.unsteadiness)  # type: ignore[union-attr]
     camera = helmet_camera(settings.width, settings.height)
-    rotation, translation = loose_cameras(camera, len(performance.weights), performance.fps, settings.flaws, generator)
+    rotation, translation = shaken_cameras(camera, len(performance.weights), performance.fps, settings.flaws, generator)
     labels = replace(
         describe(rig, attachment, replace(camera, rotation=rotation[0], translation=translation[0])),
         frames=len(performance.weights),
@@ -130,7 +130,7 @@ def film_session(
     take_path, labels_path = folder / f"{name}.c3d", folder / f"{name}.toml"
     save_take(recording.take, take_path)
     save_action_labels(labels, labels_path)
-    return FilmedSession(
+    return RecordedSession(
         video, take_path, labels_path, labels, rig, attachment, performance, recording, rotation, translation
     )
 
@@ -166,7 +166,7 @@ def stage_markers(rig: BlendshapeRig, count: int = 40) -> Attachment:
 
 
 def describe(rig: BlendshapeRig, attachment: Attachment, camera: Camera) -> ActionLabels:
-    """Where in a neutral picture the helmet's point, the side markers and the regions are; one frame, no actions."""
+    """Where in a neutral image the helmet's point, the side markers and the regions are; one frame, no actions."""
     points = attachment.select(SIDE_MARKERS).on(rig.neutral.faces, rig.vertices).double()
     normals = vertex_normals(rig.vertices.double(), rig.neutral.faces)
     normals = attachment.select(SIDE_MARKERS).on(rig.neutral.faces, normals)
@@ -216,7 +216,7 @@ def film(
     flaws: CameraFlaws,
     generator: torch.Generator,
 ) -> Iterator[Tensor]:
-    """Grey pictures (H,W) in [0,1] of a painted performer, one a frame.
+    """Grey images (H,W) in [0,1] of a painted performer, one a frame.
 
     The light sits round the lens: skin scatters it, paint throws much of it back, markers all of it.
 
@@ -235,13 +235,13 @@ def film(
     """
     if not len(weights) == len(rotation) == len(translation):
         raise ShapeError(
-            f"film: found {len(weights)} frames of weights and {len(rotation)} of camera, expected as many"
+            f"video: found {len(weights)} frames of weights and {len(rotation)} of camera, expected as many"
         )
-    scene = FilmedHead(rig, paint, attachment)
+    scene = HeadCameraRenderer(rig, paint, attachment)
     _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
     shape = ways.shape[:2]
     shade = _vignette(shape, flaws.vignette)
-    for t in range(len(weights)):  # a picture at a time: each has a surface of its own
+    for t in range(len(weights)):  # an image at a time: each has a surface of its own
         centre = -rotation[t].T @ translation[t]
         light = scene.picture(weights[t], centre, ways.reshape(-1, 3) @ rotation[t]).view(shape)
         light = flaws.exposure * shade * gaussian_blur(light[None, None], flaws.blur)[0, 0]

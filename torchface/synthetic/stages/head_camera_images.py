@@ -19,7 +19,7 @@ _SENSITIVITY = torch.tensor([0.45, 0.40, 0.15])  # such cameras see much of the 
 _DISTANCE = 230.0  # at which a surface is as bright as its grey says, millimetres
 
 
-class FilmedHead:
+class HeadCameraRenderer:
     """Front of the head, helmet plates and marker balls as one mesh that moves.
 
     Args:
@@ -34,7 +34,7 @@ class FilmedHead:
     def __init__(self, rig: BlendshapeRig, paint: Tensor, attachment: Attachment) -> None:
         mesh = rig.neutral
         if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
-            raise ShapeError("film: the rig has no skin, expected performer(identity, texture=True)")
+            raise ShapeError("video: the rig has no skin, expected performer(identity, texture=True)")
         front = ((rig.vertices[:, 2] > -10) & (rig.vertices[:, 1] > -150))[mesh.faces].all(1)
         used, self.faces = mesh.faces[front].unique(return_inverse=True)
         self.rest, self.deltas = rig.vertices[used].double(), rig.deltas[:, used].double()

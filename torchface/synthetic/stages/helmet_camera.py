@@ -26,23 +26,23 @@ _PLATES = (
 
 @dataclass(frozen=True)
 class CameraFlaws:
-    """What is wrong with the pictures.
+    """What is wrong with the images.
 
     Args:
         noise: standard deviation of a grey value's noise at full brightness, of 1; read noise is a third of it.
-        exposure: brightness against a well exposed picture.
+        exposure: brightness against a well exposed image.
         blur: of the lens, standard deviation in pixels.
         vignette: how much darker the corners are.
-        loose_rotation: amplitude of the camera's shake about each axis, degrees.
-        loose_translation: along each axis, millimetres.
+        shake_rotation: amplitude of the camera's shake about each axis, degrees.
+        shake_translation: along each axis, millimetres.
     """
 
     noise: float = 0.02
     exposure: float = 1.0
     blur: float = 0.5
     vignette: float = 0.25
-    loose_rotation: float = 0.35
-    loose_translation: float = 0.7
+    shake_rotation: float = 0.35
+    shake_translation: float = 0.7
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -51,7 +51,7 @@ class CameraFlaws:
 
 
 def helmet_camera(width: int = 192, height: int = 256) -> Camera:
-    """The camera at rest: on a boom before the mouth, tilted up, upright pictures from the helmet's rim to the chin."""
+    """The camera at rest: on a boom before the mouth, tilted up, upright images from the helmet's rim to the chin."""
     return look_at(torch.tensor([0.0, -19.0, 84.0]), 0.0, -9.0, 196.0, width, height, 46.0)
 
 
@@ -66,7 +66,7 @@ def helmet_plates() -> tuple[Tensor, Tensor, Tensor]:
     return torch.tensor(vertices, dtype=torch.float64), torch.tensor(faces), torch.tensor(greys)
 
 
-def loose_cameras(
+def shaken_cameras(
     camera: Camera, frames: int, fps: float, flaws: CameraFlaws, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """The camera's rotation (T,3,3) and translation (T,3), world to camera, as it sways and shakes.
@@ -82,10 +82,10 @@ def loose_cameras(
         return curve / curve.abs().amax(0).clamp(min=1e-9)
 
     motion = 0.5 * curves(0.05, 0.4) + 0.5 * curves(1.0, 6.0)
-    angle = math.radians(flaws.loose_rotation) * motion[:, :3]
+    angle = math.radians(flaws.shake_rotation) * motion[:, :3]
     skew = torch.zeros(frames, 3, 3, dtype=torch.float64)
     skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -angle[:, 2], angle[:, 1], -angle[:, 0]
     turn = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))
     rotation = turn @ camera.rotation.double()
-    translation = turn @ camera.translation.double() + flaws.loose_translation * motion[:, 3:]
+    translation = turn @ camera.translation.double() + flaws.shake_translation * motion[:, 3:]
     return rotation, translation

@@ -11,7 +11,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
 
-_FEWEST = 12
+_MIN_SHAPES = 12
 # Eyes and tongue are parts of their own on many rigs; jaws carry beards and necks along on some.
 _NOT_OF_THE_SKIN = ("eyeLook", "tongue", "jaw")
 
@@ -31,10 +31,10 @@ def landmarks_by_shape(rig: BlendshapeRig) -> Tensor:
     known = performer(texture=False)
     ours, here = _places(known), _places(rig)
     both = [name for name in ours if name in here]
-    if len(both) < _FEWEST:
+    if len(both) < _MIN_SHAPES:
         raise ValueRangeError(
             f"rig: found no 68 landmarks and {len(both)} shapes with ARKit's names, expected landmarks or at least "
-            f"{_FEWEST} such shapes; landmarks are set with: torchface pick RIG"
+            f"{_MIN_SHAPES} such shapes; landmarks are set with: torchface pick RIG"
         )
     source = torch.stack([ours[name] for name in both])
     target = torch.stack([here[name] for name in both])

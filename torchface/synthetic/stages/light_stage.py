@@ -1,4 +1,4 @@
-"""A performer filmed in colour under a lamp of known place: gloss, cast shadows, noise, and the truth beside it."""
+"""A performer recorded in colour under a lamp of known place: gloss, cast shadows, noise, and the truth beside it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _WALL = (0.16, 0.18, 0.20)  # linear
 
 @dataclass(frozen=True)
 class LightStageSettings:
-    """How the performer is filmed.
+    """How the performer is recorded.
 
     Args:
         width, height: pixels.
         field_of_view: vertical, degrees.
-        span: millimetres that the picture's height covers at the face.
+        span: millimetres that the image's height covers at the face.
         turn: how far the head turns to each side, degrees; half as far up and down.
         gloss: strength of highlights beside the lamp's; skin has about 0.15.
         shininess: exponent of the highlights.
@@ -59,7 +59,7 @@ class LightStageSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class LitFilm:
+class LitVideo:
     """A colour video of a performer, and the truth behind it.
 
     Args:
@@ -82,7 +82,7 @@ class LitFilm:
         return self.rig(self.weights)
 
 
-def film_under_light(
+def render_lit_video(
     path: str | Path,
     rig: BlendshapeRig,
     weights: Tensor,
@@ -91,8 +91,8 @@ def film_under_light(
     generator: torch.Generator,
     settings: LightStageSettings = LightStageSettings(),
     progress: Progress | None = None,
-) -> LitFilm:
-    """Films a performance in colour; the head turns slowly from side to side.
+) -> LitVideo:
+    """Records a performance in colour; the head turns slowly from side to side.
 
     Args:
         path: of the video; ``.avi`` and ``.mkv`` are lossless.
@@ -114,14 +114,14 @@ def film_under_light(
     cameras = turning_cameras(rig, len(weights), fps, generator, settings)
 
     def pictures() -> Iterator[Tensor]:
-        for t, camera in enumerate(cameras):  # a picture at a time: each has a surface of its own
+        for t, camera in enumerate(cameras):  # an image at a time: each has a surface of its own
             mesh = rig.neutral.with_vertices(rig(weights[t : t + 1])[0])
             linear = lit_picture(mesh, camera, light, settings)
             noise = settings.noise * linear.sqrt() * torch.randn(linear.shape, generator=generator)
             yield (to_srgb((linear + noise).clamp(0, 1)) * 255).round().to(torch.uint8)[None]
             progress("rendering the video", t + 1, len(cameras))
 
-    return LitFilm(write_video(pictures(), path, fps), rig, weights, cameras, light)
+    return LitVideo(write_video(pictures(), path, fps), rig, weights, cameras, light)
 
 
 def turning_cameras(

@@ -47,7 +47,7 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
     allowed = skin & (amplitude > 1.0)
     normals = vertex_normals(vertices, faces)
     allowed &= normals[:, 2] > math.cos(math.radians(visible_from))
-    # Lashes and the film over the eye, parts of their own, hide no marker.
+    # Lashes and the video over the eye, parts of their own, hide no marker.
     allowed &= ~RayCaster(vertices, faces[skin[faces[:, 0]]]).occluded(
         vertices + 0.1 * normals, torch.tensor([0.0, 0, 1]).double().expand_as(vertices)
     )
@@ -142,7 +142,7 @@ def record(
     flaws: StageFlaws = StageFlaws(),
     fps: float = 60.0,
 ) -> Recording:
-    """Films markers on a moving rig.
+    """Records markers on a moving rig.
 
     Args:
         rig: whose skin carries the markers.

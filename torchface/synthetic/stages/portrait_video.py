@@ -1,4 +1,4 @@
-"""A performer filmed by an ordinary camera in an ordinary room: grey frames, and where the 68 landmarks are in them."""
+"""A performer recorded by an ordinary camera in an ordinary room: grey frames with their 68 landmarks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _UPPER = ("brow", "eye", "cheekSquint", "noseSneer")
 
 @dataclass(frozen=True)
 class PortraitSettings:
-    """How the film is taken.
+    """How the video is taken.
 
     Args:
         width, height: pixels.
@@ -62,12 +62,12 @@ class PortraitSettings:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0) or (name in ("width", "height") and value < 16):
                 raise ValueRangeError(
-                    f"portrait film: {name} is {value}, expected a finite number that is not negative"
+                    f"portrait video: {name} is {value}, expected a finite number that is not negative"
                 )
 
 
 @dataclass(frozen=True, eq=False)
-class PortraitFilm:
+class PortraitVideo:
     """Frames (T,H,W) uint8, the truth about their landmarks (T,68,2) pixels, and the weights (T,N) behind them."""
 
     frames: Tensor
@@ -75,14 +75,14 @@ class PortraitFilm:
     weights: Tensor
 
 
-def film_portrait(
+def render_portrait_video(
     rig: BlendshapeRig,
     weights: Tensor,
     generator: torch.Generator,
     settings: PortraitSettings = PortraitSettings(),
     progress: Progress | None = None,
-) -> PortraitFilm:
-    """Films a performer whose head turns and sways from frame to frame, before a wall with spots.
+) -> PortraitVideo:
+    """Records a performer whose head turns and sways from frame to frame, before a wall with spots.
 
     Args:
         rig: a performer with skin and annotated landmarks.
@@ -105,7 +105,7 @@ def film_portrait(
     camera = look_at(middle + torch.tensor([0.0, 12.0, -20.0]), 0.0, 0.0, 250.0, settings.width, settings.height, 24.0)
     wall = _wall(size, generator)
     frames, landmarks = [], []
-    for number, row in enumerate(weights):  # a picture at a time: each has a surface of its own
+    for number, row in enumerate(weights):  # an image at a time: each has a surface of its own
         turn, sway = 2 * torch.rand(2, 3, generator=generator, dtype=torch.float64) - 1
         rotation = rotation_matrix(math.radians(settings.turn) * turn)
         pivot = middle + torch.tensor([0.0, -40.0, -90.0])
@@ -120,7 +120,7 @@ def film_portrait(
         frames.append((255 * picture.clamp(0, 1)).round().to(torch.uint8))
         landmarks.append(camera.project(posed[ids]))
         progress("rendering the video", number + 1, len(weights))
-    return PortraitFilm(torch.stack(frames), torch.stack(landmarks).float(), weights)
+    return PortraitVideo(torch.stack(frames), torch.stack(landmarks).float(), weights)
 
 
 def expression_weights(names: tuple[str, ...], expressions: list[dict[str, float]]) -> Tensor:

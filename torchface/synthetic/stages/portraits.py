@@ -1,4 +1,4 @@
-"""Grey portraits of made-up people with exact landmarks, as varied as a landmark detector needs to learn from."""
+"""Grey portraits of synthetic people with exact landmarks, as varied as a landmark detector needs to learn from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SENSITIVITY = torch.tensor([0.35, 0.5, 0.15])
 # What people in photographs have more or less of than the mean head, standard deviations: width, most of all.
 _LEANING = {"face_width": 1.2, "jaw_width": 1.3, "cheek_fullness": 1.0, "head_width": 0.8, "pupil_distance": -0.4,
             "face_height": 0.4, "chin_height": 0.4, "mouth_width": 0.6, "brow_height": 0.5}  # fmt: skip
-_REFERENCE = 220  # pixels a side that rays are cast for; the picture is then made smaller or a little larger
+_REFERENCE = 220  # pixels a side that rays are cast for; the image is then made smaller or a little larger
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class PictureSettings:
 
     Args:
         yaw, pitch, roll: standard deviations of the head's pose; none beyond 2.4 of them.
-        smallest, largest: height of the pictures, pixels; the face fills about half.
-        each: pictures of one person.
+        smallest, largest: height of the images, pixels; the face fills about half.
+        each: images of one person.
         spread: of identities, 1 as varied as people are.
     """
 
@@ -53,8 +53,8 @@ class PictureSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class FacePicture:
-    """A picture and the truth about it.
+class FaceImage:
+    """An image and the truth about it.
 
     Args:
         image: grey, uint8 (H,W).
@@ -86,21 +86,21 @@ class _Person:
     width: float
 
 
-def face_pictures(
+def face_images(
     count: int,
     seed: int,
     settings: PictureSettings | None = None,
     progress: Progress | None = None,
     first: int = 0,
-) -> Iterator[FacePicture]:
-    """Draws people, poses, expressions, lights and backgrounds, one picture at a time.
+) -> Iterator[FaceImage]:
+    """Draws people, poses, expressions, lights and backgrounds, one image at a time.
 
     Args:
-        count: how many pictures.
-        seed: decides them; a picture does not depend on how many are asked for.
+        count: how many images.
+        seed: decides them; an image does not depend on how many are asked for.
         settings: what is drawn how widely.
         progress: told each step and how far it is.
-        first: number of the first picture; several calls make what one would.
+        first: number of the first image; several calls make what one would.
     """
     progress = progress or silent
     settings = settings or PictureSettings()
@@ -214,7 +214,7 @@ def _draw_camera(settings: PictureSettings, generator: torch.Generator) -> Camer
     return replace(camera, rotation=tilt @ camera.rotation, translation=tilt @ camera.translation)
 
 
-def _picture(person: _Person, settings: PictureSettings, generator: torch.Generator) -> FacePicture:
+def _picture(person: _Person, settings: PictureSettings, generator: torch.Generator) -> FaceImage:
     rig = person.rig
     rest = widened(rig.vertices, person.width)
     moved = widened(rig(_draw_weights(rig.names, generator)[None])[0], person.width)
@@ -247,7 +247,7 @@ def _picture(person: _Person, settings: PictureSettings, generator: torch.Genera
     stored = photographed(picture.clamp(0, 1) ** curve, height, generator)
     zoom = height / _REFERENCE
     landmarks = (annotated_landmarks(pixels).float() + 0.5) * zoom - 0.5
-    return FacePicture(stored, landmarks, box_around(landmarks), 0)
+    return FaceImage(stored, landmarks, box_around(landmarks), 0)
 
 
 def _albedo(
@@ -332,7 +332,7 @@ def _openness(
 
 
 def _glasses(picture: Tensor, camera: Camera, marks: Tensor, form: tuple[float, float, float]) -> Tensor:
-    """Frames of spectacles drawn over a picture (H,W): half their width and height, millimetres, and their grey."""
+    """Frames of spectacles drawn over an image (H,W): half their width and height, millimetres, and their grey."""
     half_width, half_height, grey = form
     turn = torch.linspace(0, 2 * math.pi, 40).double()
     drawn = picture.numpy().copy()

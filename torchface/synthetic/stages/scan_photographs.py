@@ -19,7 +19,7 @@ _FLASH = Lighting(lights=(((0.3, 0.3, 0.9), 0.35), ((-0.4, 0.1, 0.8), 0.2)), amb
 
 @dataclass(frozen=True)
 class Photography:
-    """How pictures are taken: ``height`` pixels that cover ``span`` millimetres."""
+    """How images are taken: ``height`` pixels that cover ``span`` millimetres."""
 
     height: int = 900
     span: float = 330.0
@@ -32,7 +32,7 @@ def photographed(scan: Mesh, subject: Mesh, centre: Tensor, photography: Photogr
         scan: the fused surface, in the subject's place.
         subject: what stood before the cameras, with colours or a texture.
         centre: of the face, (3,).
-        photography: how pictures are taken.
+        photography: how images are taken.
     """
     width = round(photography.height * 0.8)
     cameras = [look_at(centre, yaw, 0.0, photography.span, width, photography.height) for yaw in _YAWS]

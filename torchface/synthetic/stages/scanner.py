@@ -18,7 +18,7 @@ from torchface.io.mesh_files import save_mesh
 from torchface.landmarks.scans.contours import evenly_spaced
 from torchface.landmarks.scans.landmark_pairs import template_features
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation, save_annotations
-from torchface.landmarks.scans.twelve_landmarks import LINES, TWELVE, twelve_from_ibug
+from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse
@@ -144,7 +144,7 @@ def scan_head(head: Mesh, seed: int, settings: ScannerSettings | None = None) ->
 
 
 def write_scan(scan: RawScan, folder: str | Path, name: str) -> Path:
-    """Writes ``name.obj`` with its material and picture, and ``name.ljson`` with the 68 landmarks, as menpo does.
+    """Writes ``name.obj`` with its material and image, and ``name.ljson`` with the 68 landmarks, as menpo does.
 
     Returns:
         The path of the OBJ file.
@@ -178,9 +178,9 @@ def write_scans(
 
 def _truth(head: Mesh, landmarks: Tensor) -> ScanAnnotation:
     """Twelve landmarks, cheeks laid onto the surface, and the lines where lids and lips meet."""
-    twelve = twelve_from_ibug(landmarks)
+    twelve = uv_landmarks_from_ibug(landmarks)
     on_surface = SurfaceIndex(head.vertices, head.faces).nearest(twelve).points
-    points = dict(zip(TWELVE, on_surface, strict=True))
+    points = dict(zip(UV_LANDMARK_NAMES, on_surface, strict=True))
     features = template_features(head)
     lines = {}
     for name, (left, right) in LINES.items():

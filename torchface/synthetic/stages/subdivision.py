@@ -8,8 +8,8 @@ from torch import Tensor
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY, sample_texture
 
-_MOST_FACES = 1_000_000
-_INTERPOLATION_ROUNDS = 6
+_MAX_FACES = 1_000_000
+_INTERPOLATION_ITERATIONS = 6
 
 
 def finely_coloured(mesh: Mesh, edge: float) -> Mesh:
@@ -24,12 +24,12 @@ def finely_coloured(mesh: Mesh, edge: float) -> Mesh:
     vertices, colors = mesh.vertices.double(), mesh.colors
     uvs = _corner_uvs(mesh, polygons)
     control = vertices
-    for _ in range(_INTERPOLATION_ROUNDS):
+    for _ in range(_INTERPOLATION_ITERATIONS):
         coarse, quads, _ = catmull_clark(control, polygons)
         finer, _, _ = catmull_clark(coarse, quads)
         control = control + (mesh.vertices.double() - finer[: len(vertices)])
     vertices = control
-    while len(polygons) * 4 <= _MOST_FACES and _typical_edge(vertices, polygons) > edge:
+    while len(polygons) * 4 <= _MAX_FACES and _typical_edge(vertices, polygons) > edge:
         held = vertices if colors is None else torch.cat([vertices, colors.double()], dim=1)
         held, polygons, uvs = catmull_clark(held, polygons, uvs)
         vertices = held[:, :3]

@@ -31,7 +31,7 @@ GESTURES: dict[str, dict[str, float]] = {
 
 
 def perform(frames: int, generator: torch.Generator, fps: float = 60.0) -> Take:
-    """A take of made-up weights: names are ARKit's 52, values (T,52,1) in [0,1].
+    """A take of synthetic weights: names are ARKit's 52, values (T,52,1) in [0,1].
 
     Gestures follow each other with raised-cosine ramps, held and overlapping; speech moves jaw and lips at syllable
     rate in between; blinks take 80 ms to close and 160 ms to open; glances jump and rest.

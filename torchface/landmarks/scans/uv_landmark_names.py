@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
-TWELVE = (
+UV_LANDMARK_NAMES = (
     "nose",
     "between_eyes",
     "right_eye_outer",
@@ -21,7 +21,7 @@ TWELVE = (
     "mouth_top",
     "mouth_bottom",
 )
-"""In order; left and right are the performer's own, so ``right_`` lies on the picture's left."""
+"""In order; left and right are the performer's own, so ``right_`` lies on the image's left."""
 
 MIRRORED = (0, 1, 5, 4, 3, 2, 7, 6, 9, 8, 10, 11)
 """The landmark on the other side of the face."""
@@ -31,7 +31,7 @@ LINES = {
     "left_lids": ("left_eye_inner", "left_eye_outer"),
     "lips": ("right_mouth_corner", "left_mouth_corner"),
 }
-"""The traced lines and the landmarks at their ends, the one on the picture's left first."""
+"""The traced lines and the landmarks at their ends, the one on the image's left first."""
 
 _IBUG = {
     "nose": 30,
@@ -48,7 +48,7 @@ _IBUG = {
 _CHEEKS = {"right_cheek": (36, 48, 3), "left_cheek": (45, 54, 13)}
 
 
-def twelve_from_ibug(points: Tensor) -> Tensor:
+def uv_landmarks_from_ibug(points: Tensor) -> Tensor:
     """The twelve landmarks of 68-point sets.
 
     iBUG has no cheeks: a cheek is taken as the mean of the eye's outer corner, the mouth's corner and the jaw point
@@ -58,15 +58,15 @@ def twelve_from_ibug(points: Tensor) -> Tensor:
         points: (...,68,D) in iBUG's order.
 
     Returns:
-        (...,12,D) in the order of ``TWELVE``.
+        (...,12,D) in the order of ``UV_LANDMARK_NAMES``.
 
     Raises:
         ShapeError: not 68 points.
     """
     if points.ndim < 2 or points.shape[-2] != 68:
-        raise ShapeError(f"twelve_from_ibug: found {tuple(points.shape)}, expected (...,68,D)")
+        raise ShapeError(f"uv_landmarks_from_ibug: found {tuple(points.shape)}, expected (...,68,D)")
     rows = [
         points[..., _IBUG[name], :] if name in _IBUG else points[..., list(_CHEEKS[name]), :].mean(-2)
-        for name in TWELVE
+        for name in UV_LANDMARK_NAMES
     ]
     return torch.stack(rows, dim=-2)
