@@ -25,7 +25,7 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import box_around, relative_errors
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.portraits import FaceImage, PictureSettings, face_images
+from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train.runner import metric_lines, run
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
@@ -58,7 +58,7 @@ class Settings:
     licence: str = ""
     workers: int = 1
     trees: TreeSettings = field(default_factory=TreeSettings)
-    pictures: PictureSettings = field(default_factory=PictureSettings)
+    images: FaceImageSettings = field(default_factory=FaceImageSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +122,10 @@ def split(settings: Settings, progress: Progress | None = None) -> tuple[Faces, 
         raise TorchfaceError(f"data: found {len(real)} faces, expected more than the {kept} held out")
     learn, test = real[: len(real) - kept], real[len(real) - kept :]
     if settings.performers:
-        learn = learn + rendered_faces(
-            settings.performers, settings.seed, settings.pictures, progress, settings.workers
-        )
+        learn = learn + rendered_faces(settings.performers, settings.seed, settings.images, progress, settings.workers)
         if not settings.data:
             seed = settings.seed + 1_000_000
-            test = rendered_faces(settings.held_out, seed, settings.pictures, progress, settings.workers)
+            test = rendered_faces(settings.held_out, seed, settings.images, progress, settings.workers)
     return learn, test
 
 
@@ -164,7 +162,7 @@ def load_faces(path: Path) -> Faces:
 def rendered_faces(
     count: int,
     seed: int,
-    settings: PictureSettings | None = None,
+    settings: FaceImageSettings | None = None,
     progress: Progress | None = None,
     workers: int = 1,
 ) -> Faces:
@@ -191,7 +189,7 @@ def rendered_faces(
     )
 
 
-def _rendered_part(part: tuple[int, PictureSettings | None, int, int]) -> list[FaceImage]:
+def _rendered_part(part: tuple[int, FaceImageSettings | None, int, int]) -> list[FaceImage]:
     seed, settings, first, count = part
     return list(face_images(count, seed, settings, first=first))
 
@@ -240,7 +238,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
     flags = [f"--data {' '.join(path.name for path in settings.data)}"] if settings.data else []
     flags += [f"--performers {settings.performers}"] if settings.performers else []
     flags += [f"--held-out {settings.held_out} --seed {settings.seed}"]
-    for part in ("trees", "pictures"):  # a default a turn: what differs is said
+    for part in ("trees", "images"):  # a default a turn: what differs is said
         usual, ours = asdict(type(getattr(settings, part))()), asdict(getattr(settings, part))
         flags += [f"--{part}.{key.replace('_', '-')} {ours[key]}" for key in ours if ours[key] != usual[key]]
     metrics = {}

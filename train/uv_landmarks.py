@@ -25,7 +25,7 @@ from torchface.landmarks import (
     scan_landmarks,
     unwrap,
 )
-from torchface.landmarks.scans.detector_evaluation import ScanErrors, error_table, landmark_errors, picture
+from torchface.landmarks.scans.detector_evaluation import ScanErrors, draw_result, error_table, landmark_errors
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_picture, sheet
 from torchface.synthetic import draw_identities, performer
@@ -97,7 +97,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
     for scan in test:
         found = scan_landmarks(detector, scan.mesh)
         errors.append(landmark_errors(found, scan.mesh, scan.truth, scan.name))
-        pictures.append(picture(found, scan.truth))
+        pictures.append(draw_result(found, scan.truth))
         progress(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
     save(detector, settings, errors, len(learn))
     if pictures:

@@ -20,7 +20,7 @@ from torchface.landmarks import (
     scan_landmarks,
     uv_landmarks_from_ibug,
 )
-from torchface.landmarks.scans.detector_evaluation import error_table, landmark_errors, picture
+from torchface.landmarks.scans.detector_evaluation import draw_result, error_table, landmark_errors
 from torchface.rendering.compositing import save_picture, sheet
 from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
 
@@ -51,7 +51,7 @@ def test_landmarks_of_scanned_performers(
         found = scan_landmarks(detectors[kind], scan.mesh)
         spent += time.perf_counter() - begin
         errors.append(landmark_errors(found, scan.mesh, scan.truth))
-        pictures.append(picture(found, scan.truth))
+        pictures.append(draw_result(found, scan.truth))
     print(f"\n{kind}: learned from {LEARN} scanned performers, tested on {TEST} others, {spent / TEST:.1f} s a scan")
     table = error_table(errors)
     for what, value in table.items():
@@ -81,10 +81,10 @@ def test_landmarks_of_a_real_scan(kind: str, data: Path, detectors: dict[str, UV
     usual, _ = found.head.surface_points(scan, detectors[kind].prior_mean)
     alone = float((usual.double() - twelve).norm(dim=-1)[inner].mean())
     print(f"\nreal scan, {kind} learned from scanned performers: {mean:.2f} mm over eyes, nose and mouth")
-    print(f"    the face frame alone, without looking at the picture: {alone:.2f} mm")
+    print(f"    the face frame alone, without looking at the draw_result: {alone:.2f} mm")
     for name, value, sure in zip(
         UV_LANDMARK_NAMES, errors.millimetres.tolist(), found.confidence.tolist(), strict=True
     ):
         print(f"    {name:24}{value:8.2f} mm, confidence {sure:.3f}")
-    save_picture(picture(found, truth), PICTURES / f"real_scan_{kind}.png")
+    save_picture(draw_result(found, truth), PICTURES / f"real_scan_{kind}.png")
     assert mean <= 6.0

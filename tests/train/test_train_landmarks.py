@@ -14,7 +14,7 @@ from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug import box_around
 from torchface.rendering.compositing import save_picture
-from torchface.synthetic.stages.portraits import FaceImage, PictureSettings, face_images
+from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train import landmarks as recipe
 from train.landmarks import Faces, Settings, evaluate, load_faces, rendered_faces, train
 
@@ -23,7 +23,7 @@ FEW = TreeSettings(cascades=3, trees=15, depth=3, features=80, test_splits=10, o
 
 @pytest.fixture(scope="module")
 def pictures() -> list[FaceImage]:
-    return list(face_images(9, 5, PictureSettings(yaw=8, each=9, smallest=100, largest=120)))
+    return list(face_images(9, 5, FaceImageSettings(yaw=8, each=9, smallest=100, largest=120)))
 
 
 @pytest.fixture(scope="module")
@@ -114,15 +114,15 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
 
 
 def test_performers_are_learned_from(tmp_path: Path) -> None:
-    small = PictureSettings(smallest=90, largest=100)
-    settings = Settings(performers=4, out=tmp_path / "made_up", held_out=2, trees=FEW, pictures=small)
+    small = FaceImageSettings(smallest=90, largest=100)
+    settings = Settings(performers=4, out=tmp_path / "made_up", held_out=2, trees=FEW, images=small)
     _, errors = train(settings)
     assert len(errors) == 2
     record = zoo.describe(tmp_path / "made_up")
     assert record.data == "4 rendered pictures of the embedded performer; no person's face."
     assert record.licence == "MIT"
-    assert "--pictures.smallest 90" not in record.recipe  # the default
-    assert "--pictures.largest 100" in record.recipe
+    assert "--images.smallest 90" not in record.recipe  # the default
+    assert "--images.largest 100" in record.recipe
     once = rendered_faces(3, 8, small)
     twice = list(face_images(1, 8, small)) + list(face_images(1, 8, small, first=1))
     assert all(torch.equal(a, b) for a, b in zip(once.images, [picture.image for picture in twice], strict=False))
@@ -149,7 +149,7 @@ def test_bad_input_is_named(folder: Path, tmp_path: Path) -> None:
 
 def test_landmarks_lie_in_box_and_picture(pictures: list[FaceImage]) -> None:
     """Brows, nose, eyes and mouth lie in the box, and the jaw in the picture."""
-    for picture in face_images(4, 31, PictureSettings(yaw=5, pitch=3, smallest=200, largest=220)):
+    for picture in face_images(4, 31, FaceImageSettings(yaw=5, pitch=3, smallest=200, largest=220)):
         grey, points = picture.image.float(), picture.landmarks
         assert picture.image.dtype == torch.uint8
         x, y = points[[31, 35, 3, 13]].round().long().unbind(1)

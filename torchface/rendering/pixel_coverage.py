@@ -78,18 +78,18 @@ class Footprint:
         (top, left), (bottom, right) = (int(rows.min()), int(columns.min())), (int(rows.max()), int(columns.max()))
         height, width = bottom - top + 1, right - left + 1
         place = (rows - top) * width + columns - left
-        held = torch.zeros(height * width, values.shape[1] + 1)
-        held.index_add_(0, place, torch.cat([weight * values.float(), weight], dim=1))
-        blurred = gaussian_blur(held.T.reshape(1, -1, height, width), sigma)[0].flatten(1).T[place]
+        summed = torch.zeros(height * width, values.shape[1] + 1)
+        summed.index_add_(0, place, torch.cat([weight * values.float(), weight], dim=1))
+        blurred = gaussian_blur(summed.T.reshape(1, -1, height, width), sigma)[0].flatten(1).T[place]
         return blurred[:, :-1] / blurred[:, -1:].clamp(min=1e-6)
 
-    def blended(self, picture: Tensor, over: Tensor, alpha: Tensor) -> Tensor:
+    def blended(self, image: Tensor, over: Tensor, alpha: Tensor) -> Tensor:
         """An image (3,H,W) with what the samples bring, (S,3) times alpha (S,) already, laid over it."""
-        flat = picture.reshape(3, -1).T
+        flat = image.reshape(3, -1).T
         weight = self.share.to(flat)[:, None]
         laid = torch.zeros(len(flat), 4, dtype=flat.dtype)
         laid.index_add_(0, self.pixel, weight * torch.cat([over, alpha[:, None]], dim=1).to(flat))
-        return (flat * (1 - laid[:, 3:]) + laid[:, :3]).T.reshape(picture.shape)
+        return (flat * (1 - laid[:, 3:]) + laid[:, :3]).T.reshape(image.shape)
 
 
 def footprint(

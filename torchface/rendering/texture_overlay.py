@@ -129,7 +129,7 @@ def overlay(
 
     Source: thesis 4.2.11 and figure 80.
     """
-    picture = _checked(frame, vertices, paint.mesh, camera)
+    image = _checked(frame, vertices, paint.mesh, camera)
     covered = footprint(vertices, paint.mesh.faces.cpu(), paint.skin, camera, calibration)
     if len(covered.pixel) == 0:
         return frame
@@ -139,8 +139,8 @@ def overlay(
         return frame
     covered, colors = covered.select(painted), colors[painted]
     shade = _light_on(covered, light, _soft_shadow(covered, light))
-    mixed = covered.blended(to_linear(picture), colors[:, :3] * shade, colors[:, 3])
-    return _as(frame, picture, mixed, covered.pixel)
+    mixed = covered.blended(to_linear(image), colors[:, :3] * shade, colors[:, 3])
+    return _as(frame, image, mixed, covered.pixel)
 
 
 def relight(
@@ -180,14 +180,14 @@ def relight(
 
     Source: thesis 4.2.11 and figure 80.
     """
-    picture = _checked(frame, vertices, mesh, camera)
+    image = _checked(frame, vertices, mesh, camera)
     if share is not None and share.shape != (len(mesh.vertices),):
         raise ShapeError(f"share: found {tuple(share.shape)}, expected ({len(mesh.vertices)},)")
     faces = mesh.faces.cpu()
     covered = footprint(vertices, faces, torch.ones(len(faces), dtype=torch.bool), camera, calibration)
     if len(covered.pixel) == 0:
         return frame
-    linear = to_linear(picture)
+    linear = to_linear(image)
     old, lit = linear.reshape(3, -1).T[covered.pixel], _soft_shadow(covered, light)
     reflected = (old + _FLOOR) / (_light_on(covered, light, lit) + _FLOOR)
     # Where the old shadow ends, a pixel's lag between mesh and face would draw a line, and where the face ends, pixels
@@ -197,7 +197,7 @@ def relight(
     new = reflected * (_light_on(covered, new_light, _soft_shadow(covered, new_light)) + _FLOOR) - _FLOOR
     new = torch.minimum(new.clamp(min=0), _MAX_GAIN * old)
     alpha = torch.ones(len(old)) if share is None else covered.of_vertices(share.double()[:, None], faces)[:, 0].float()
-    return _as(frame, picture, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
+    return _as(frame, image, covered.blended(linear, new * alpha[:, None], alpha), covered.pixel)
 
 
 def _soft_shadow(covered: Footprint, light: PointLight) -> Tensor:
@@ -241,12 +241,12 @@ def _checked(frame: Tensor, vertices: Tensor, mesh: Mesh, camera: Camera) -> Ten
     return frame.detach().cpu().float() / 255 if frame.dtype == torch.uint8 else frame.detach().cpu().float()
 
 
-def _as(frame: Tensor, picture: Tensor, linear: Tensor, pixel: Tensor) -> Tensor:
+def _as(frame: Tensor, image: Tensor, linear: Tensor, pixel: Tensor) -> Tensor:
     """The image with the pixels changed that something was laid on, in the frame's kind; the others stay exactly."""
     touched = pixel.unique()
-    result = picture.reshape(3, -1).clone()
+    result = image.reshape(3, -1).clone()
     result[:, touched] = to_srgb(linear.reshape(3, -1)[:, touched].clamp(0, 1))
-    result = result.view(picture.shape)
+    result = result.view(image.shape)
     if frame.dtype == torch.uint8:
         return (result * 255).round().to(torch.uint8)
     return result.to(frame)

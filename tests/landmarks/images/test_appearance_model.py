@@ -344,7 +344,7 @@ def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceMode
         AppearanceModel.fit(frames, points * torch.tensor([1.0, 0.0]) + 50)
     with pytest.raises(ShapeError, match="image 1"):
         AppearanceModel.fit([frames[0], frames[1][None, None], *frames[2:]], points)
-    with pytest.raises(ShapeError, match=r"start: found \(2, 67, 2\)"):
+    with pytest.raises(ShapeError, match=r"initial: found \(2, 67, 2\)"):
         model(images(film)[:2], torch.zeros(2, 67, 2))
     with pytest.raises(ShapeError, match=r"expected \(B,1,H,W\) or \(B,3,H,W\)"):
         model(images(film)[:2, 0], points[:2])

@@ -196,7 +196,7 @@ def test_a_moved_or_mirrored_picture_moves_the_landmarks(trees: LandmarkTrees, f
         return wide
 
     found = consensus(trees, placed(40, 40), box + torch.tensor([40, 40, 0, 0]))
-    assert (found.spread >= 0).all()
+    assert (found.dispersion >= 0).all()
     moved = consensus(trees, placed(57, 44), box + torch.tensor([57, 44, 0, 0]))
     assert torch.allclose(moved.landmarks, found.landmarks + torch.tensor([17, 4]), atol=1e-3)
     across = torch.cat([SIZE + 99 - 40 - box[:1] - box[2:3], box[1:2] + 40, box[2:]])

@@ -5,6 +5,6 @@ from torchface.landmarks.images.appearance_training import learn_appearance
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.tree_training import fit_trees
 
-# Training knows its model; a model knows of its training only here.
+# The training imports the model; the model gets its `fit` here.
 AppearanceModel.fit = staticmethod(learn_appearance)
 LandmarkTrees.fit = staticmethod(fit_trees)

@@ -12,7 +12,7 @@ from torchface.errors import FileFormatError
 from torchface.io.images.image_files import load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+_IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
         raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
     frames = []
     for path in sorted(folder.glob("*.pts")):
-        picture = next((found for end in PICTURES if (found := path.with_suffix(end)).is_file()), None)
-        if picture is None:
+        image_path = next((found for end in _IMAGE_ENDINGS if (found := path.with_suffix(end)).is_file()), None)
+        if image_path is None:
             raise FileFormatError(f"{path}: found no image beside it, expected {path.stem}.png or another")
         points = load_landmark_points(path).ibug()
         if points.shape[1] != 2:
             raise FileFormatError(f"{path}: found points in space, expected pixels of the image beside it")
-        frames.append(AnnotatedFrame(path.stem, load_image(picture), points.float()))
+        frames.append(AnnotatedFrame(path.stem, load_image(image_path), points.float()))
     if not frames:
         raise FileFormatError(f"{folder}: found no .pts file, expected images with one beside each")
     return frames
@@ -66,8 +66,8 @@ def save_annotated_frame(frame: AnnotatedFrame, folder: str | Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
-    picture, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
-    if not picture.exists():
-        save_image(frame.image, picture)
+    image_path, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
+    if not image_path.exists():
+        save_image(frame.image, image_path)
     save_pts(torch.as_tensor(frame.landmarks), points)
     return points

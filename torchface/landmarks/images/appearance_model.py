@@ -88,9 +88,9 @@ class AppearanceFit(NamedTuple):
     """Refined landmarks.
 
     Args:
-        landmarks: pixels, (B,68,2); NaN where the start is.
+        landmarks: pixels, (B,68,2); NaN where the initial guess is.
         error: how badly the face there looks like the person, (B,); about 1 on frames like those learned from.
-        initial_error: the same at the start.
+        initial_error: the same at the initial guess.
     """
 
     landmarks: Tensor
@@ -190,38 +190,38 @@ class AppearanceModel(nn.Module):
         if not (0.9 < float(size) < 1.1 and float(self.mean_shape.abs().max()) < 8):
             raise ValueRangeError(f"appearance: found a mean shape of size {float(size):.3g}, expected 1")
 
-    def forward(self, images: Tensor, start: Tensor) -> Tensor:
-        """Refined landmarks (B,68,2) of images (B,1|3,H,W) in [0,1] from a start (B,68,2), pixels."""
-        return self.refine(images, start).landmarks
+    def forward(self, images: Tensor, initial: Tensor) -> Tensor:
+        """Refined landmarks (B,68,2) of images (B,1|3,H,W) in [0,1] from an initial guess (B,68,2)."""
+        return self.refine(images, initial).landmarks
 
-    def refine(self, images: Tensor, start: Tensor) -> AppearanceFit:
+    def refine(self, images: Tensor, initial: Tensor) -> AppearanceFit:
         """Refined landmarks, and how well they fit before and after.
 
-        A face whose start has a NaN comes back as NaN, its errors infinite.
+        A face whose initial guess has a NaN comes back as NaN, its errors infinite.
 
         Args:
             images: (B,1,H,W) or (B,3,H,W) in [0,1].
-            start: (B,68,2) pixels, off by at most about a tenth of the eyes' distance.
+            initial: (B,68,2) pixels, wrong by at most about a tenth of the eyes' distance.
 
         Raises:
-            ShapeError: images or start of another shape.
+            ShapeError: images or initial guess of another shape.
         """
         grey = grey_images(images)
-        if start.shape != (len(grey), COUNT, 2):
-            raise ShapeError(f"start: found {tuple(start.shape)}, expected {(len(grey), COUNT, 2)}")
-        found = torch.full_like(start, torch.nan)
-        before, after = start.new_full((2, len(start)), torch.inf)
-        seen = torch.isfinite(start).flatten(1).all(1) & (start.flatten(1).std(1) > 0)
+        if initial.shape != (len(grey), COUNT, 2):
+            raise ShapeError(f"initial: found {tuple(initial.shape)}, expected {(len(grey), COUNT, 2)}")
+        found = torch.full_like(initial, torch.nan)
+        before, after = initial.new_full((2, len(initial)), torch.inf)
+        seen = torch.isfinite(initial).flatten(1).all(1) & (initial.flatten(1).std(1) > 0)
         if seen.any():
-            pictures, points = grey[seen], start[seen].to(self.mean_shape)
+            pictures, points = grey[seen], initial[seen].to(self.mean_shape)
             first = points
             for level in self.levels:
                 crop = self.crop(pictures, points, float(level.scale))
                 points = crop.pose.apply(self._refine_level(level, crop, crop.pose.undo(points)))
             # Both in the last crop: what is compared has been seen alike, and was computed once.
-            before[seen] = self._error_in(crop, first).to(start)
-            after[seen] = self._error_in(crop, points).to(start)
-            found[seen] = points.to(start)
+            before[seen] = self._error_in(crop, first).to(initial)
+            after[seen] = self._error_in(crop, points).to(initial)
+            found[seen] = points.to(initial)
         return AppearanceFit(found, after, before)
 
     def error(self, images: Tensor, landmarks: Tensor) -> Tensor:
@@ -256,12 +256,9 @@ class AppearanceModel(nn.Module):
         level = self.levels[-1]
         return level.error(level.residual(level.sample(crop.features, self._points(crop.pose.undo(landmarks)))))
 
-    def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, start: Tensor) -> Tensor:
-        """The best landmarks, by residual and shape, of those that the steps lead to from a start; pixels of the crop.
-
-        The start is one of them.
-        """
-        found = best = start
+    def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, initial: Tensor) -> Tensor:
+        """The best landmarks, by residual and shape, of an initial guess and those its steps lead to; pixels of the crop."""
+        found = best = initial
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
         still = torch.zeros_like(lowest, dtype=torch.bool)

@@ -56,16 +56,16 @@ class Consensus(NamedTuple):
 
     Args:
         landmarks: (L,2), pixels.
-        spread: (L,), root mean square distance of the starts' landmarks, of the box's side.
+        dispersion: (L,), root mean square distance of the starts' landmarks, of the box's side.
     """
 
     landmarks: Tensor
-    spread: Tensor
+    dispersion: Tensor
 
     @property
     def confidence(self) -> Tensor:
         """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.02 of the box's side."""
-        return 1 / (1 + (self.spread / _HALF).square())
+        return 1 / (1 + (self.dispersion / _HALF).square())
 
 
 def consensus(
@@ -98,8 +98,8 @@ def consensus(
     side = math.sqrt(max(float(box[2] * box[3]), 0.0)) if bool(torch.isfinite(box).all()) else 0.0
     if not 1 <= side <= _MAX_SIDE:
         raise ValueRangeError(f"box: found {box.tolist()}, expected a face of 1 to {_MAX_SIDE} pixels")
-    picture, scale, corner = _cut(image.cpu().numpy(), box, side, settings.side)
-    seen = torch.from_numpy(picture)[None, None].to(trees.mean) / 255
+    resized, scale, corner = _cut(image.cpu().numpy(), box, side, settings.side)
+    seen = torch.from_numpy(resized)[None, None].to(trees.mean) / 255
     middle = ((box[:2] + box[2:] / 2).to(trees.mean) + 0.5 - corner.to(trees.mean)) * scale.to(trees.mean) - 0.5
     starts = _starts(trees.mean, middle, settings, tilt)
     pictures = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (seen, seen.flip(-1))])
@@ -108,8 +108,8 @@ def consensus(
     found = torch.cat([found[: len(starts)], _mirrored(found[len(starts) :], last)])
     found = (found + 0.5) / scale.to(found) + corner.to(found) - 0.5
     median = found.median(0).values
-    away = (found - median).norm(dim=-1, keepdim=True) / side
-    weight = 1 / (1 + (away / _OUTLYING).square())
+    distance = (found - median).norm(dim=-1, keepdim=True) / side
+    weight = 1 / (1 + (distance / _OUTLYING).square())
     mean = (found * weight).sum(0) / weight.sum(0)
     return Consensus(mean, ((found - mean) / side).square().sum(-1).mean(0).sqrt())
 
@@ -136,8 +136,8 @@ def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.nd
         piece = cv2.copyMakeBorder(piece, before[0], after[0], before[1], after[1], cv2.BORDER_REPLICATE)
     size = max(2, round(count * wanted / side))
     method = cv2.INTER_AREA if size < count else cv2.INTER_LINEAR
-    picture = cv2.resize(piece, (size, size), interpolation=method)
-    return picture, torch.full((2,), size / count), torch.tensor([float(x), float(y)])
+    resized = cv2.resize(piece, (size, size), interpolation=method)
+    return resized, torch.full((2,), size / count), torch.tensor([float(x), float(y)])
 
 
 def _starts(mean: Tensor, middle: Tensor, settings: ConsensusSettings, tilt: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""What an image shows at every pixel, told so that light and gain do not matter."""
+"""Features of every pixel that do not depend on brightness and gain."""
 
 from __future__ import annotations
 

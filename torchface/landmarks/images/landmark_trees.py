@@ -166,10 +166,10 @@ def initial_shapes(mean: Tensor, boxes: Tensor) -> Tensor:
 def similarity_to(mean: Tensor, shapes: Tensor) -> Tensor:
     """Scale times rotation (B,2,2) that lays the mean shape (L,2) on shapes (B,L,2) with least squared error."""
     mean = mean - mean.mean(0)
-    away = shapes - shapes.mean(1, keepdim=True)
+    centred = shapes - shapes.mean(1, keepdim=True)
     energy = mean.square().sum()
-    along = (away * mean).sum((1, 2)) / energy
-    across = (away[..., 1] * mean[:, 0] - away[..., 0] * mean[:, 1]).sum(1) / energy
+    along = (centred * mean).sum((1, 2)) / energy
+    across = (centred[..., 1] * mean[:, 0] - centred[..., 0] * mean[:, 1]).sum(1) / energy
     return torch.stack([along, -across, across, along], dim=1).view(-1, 2, 2)
 
 

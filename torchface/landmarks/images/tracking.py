@@ -31,16 +31,16 @@ _PHOTOGRAPH = ConsensusSettings(starts=48)
 class TrackingSettings:
     """When a face counts as lost, and where it is looked for.
 
-    Starts on a face end near each other, starts on anything else do not: with the shipped trees the mean spread was
+    Starts on a face end near each other, starts on anything else do not: with the shipped trees the mean dispersion was
     0.008 to 0.036 of the box's side on 19 photographed faces, 0.004 to 0.020 on drawn ones, and 0.057 to 0.10 on
     pieces of images without a face (5th to 95th percentile; the most on a photographed face was 0.045, the least
     without one 0.054).
 
     Args:
-        sure: mean spread up to which a face is one without asking the detector, of the box's side.
-        doubtful: mean spread up to which it is one where the detector sees a face too.
+        sure: mean dispersion up to which a face is one without asking the detector, of the box's side.
+        doubtful: mean dispersion up to which it is one where the detector sees a face too.
         check: frames after which the detector is asked anyway.
-        checks: how often in a row it must see none, and the spread lie above half of ``sure``, for the face to be lost.
+        checks: how often in a row it must see none, with a dispersion above half of ``sure``, for the face to be lost.
         patience: frames for which a lost face is waited for at its place before another is taken.
         smallest: side of a box, pixels, under which a face is lost.
     """
@@ -187,14 +187,14 @@ class LandmarkTracker:
         if float(overlaps(self._last.box[None], moved[None])) < 0.75:  # it moved far: once more from where it is now
             box = self._anchored(moved)
             seen = consensus(self.trees, grey, box, tilt_of(self.trees, seen.landmarks), self.starts)
-        spread, settings = float(seen.spread.mean()), self.settings
-        if spread <= settings.sure and (self._frames + 1) % settings.check:
+        dispersion, settings = float(seen.dispersion.mean()), self.settings
+        if dispersion <= settings.sure and (self._frames + 1) % settings.check:
             return _Seen(seen, box)
         if self._confirmed(grey, box_around(seen.landmarks)):
             self._unseen = 0
-            return _Seen(seen, box) if spread <= settings.doubtful else None
+            return _Seen(seen, box) if dispersion <= settings.doubtful else None
         self._unseen += 1
-        if spread > settings.sure or (self._unseen >= settings.checks and spread > settings.sure / 2):
+        if dispersion > settings.sure or (self._unseen >= settings.checks and dispersion > settings.sure / 2):
             return None
         return _Seen(seen, box)  # turned faces are none to the detector
 
@@ -222,7 +222,7 @@ class LandmarkTracker:
         if not self._plausible(box_around(seen.found.landmarks), grey):
             return None
         self._unseen = 0
-        return seen if float(seen.found.spread.mean()) <= self.settings.doubtful else None
+        return seen if float(seen.found.dispersion.mean()) <= self.settings.doubtful else None
 
     def _anchored(self, box: Tensor) -> Tensor:
         """Where the trees look for a face with this box (4,) round its landmarks."""

@@ -32,15 +32,15 @@ class TreeSettings:
         features: pixels a cascade, from which pairs are drawn.
         test_splits: pairs that are tried at every node; the best is kept.
         shrinkage: share of a leaf's mean that is taken; the trees after it learn the rest.
-        oversampling: starts an image.
+        oversampling: initial shapes an image.
         closeness: distance at which a pair is e times less likely to be tried than one at no distance, of the box.
         padding: how far beyond the mean shape pixels are drawn, of the box.
         components: of what is left to learn in a cascade, on which leaves are stored; 0 for all, twice the landmarks.
-        split_samples: starts on which a tree's splits are chosen; its leaves are the means of all. 0 for all.
-        translation: standard deviation of the starts' place, of the box.
-        scale: standard deviation of the logarithm of the starts' size.
-        rotation: standard deviation of the starts' tilt, degrees.
-        gamma: standard deviation of the logarithm of the exponent that makes a start's image lighter or darker.
+        split_samples: initial shapes on which a tree's splits are chosen; its leaves are the means of all. 0 for all.
+        translation: standard deviation of the initial shapes' place, of the box.
+        scale: standard deviation of the logarithm of the initial shapes' size.
+        rotation: standard deviation of the initial shapes' tilt, degrees.
+        gamma: standard deviation of the logarithm of the exponent that makes a sample's image lighter or darker.
         noise: added to the grey values, standard deviation, in [0,1].
         seed: of everything drawn.
     """
@@ -66,9 +66,9 @@ class TreeSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Starts: which image (N,), mirrored or not (N,), gamma (N,), where to end (N,L,2); all images' pixels."""
+    """Samples: which image (N,), mirrored or not (N,), gamma (N,), where to end (N,L,2); all images' pixels."""
 
-    picture: Tensor
+    source: Tensor
     flipped: Tensor
     gamma: Tensor
     targets: Tensor
@@ -78,13 +78,13 @@ class _Samples:
     width: Tensor
 
     def grey(self, rows: Tensor, places: Tensor) -> Tensor:
-        """Grey values (n,P) in [0,1] of the starts ``rows`` (n,) at (n,P,2)."""
-        picture = self.picture[rows]
-        wide, high = self.width[picture][:, None], self.height[picture][:, None]
+        """Grey values (n,P) in [0,1] of the samples ``rows`` (n,) at (n,P,2)."""
+        source = self.source[rows]
+        wide, high = self.width[source][:, None], self.height[source][:, None]
         x, y = places[..., 0].round().long(), places[..., 1].round().long()
         x, y = x.clamp(min=0).minimum(wide - 1), y.clamp(min=0).minimum(high - 1)
         x = torch.where(self.flipped[rows][:, None], wide - 1 - x, x)
-        grey = self.pixels[self.origin[picture][:, None] + y * wide + x].float() / 255
+        grey = self.pixels[self.origin[source][:, None] + y * wide + x].float() / 255
         return grey ** self.gamma[rows][:, None]
 
 
@@ -126,10 +126,10 @@ def fit_trees(
     components = min(settings.components or 2 * count, 2 * count)
     model = LandmarkTrees(count, settings.cascades, settings.trees, settings.depth, settings.features, components)
     generator = torch.Generator().manual_seed(settings.seed)
-    samples, starts, mean = _draw_starts(images, boxes, landmarks, settings, mirror, generator)
+    samples, initial, mean = _draw_initial_shapes(images, boxes, landmarks, settings, mirror, generator)
     model.mean.copy_(mean)
     signature = _signature(images, boxes, landmarks, settings, mirror)
-    done, shapes = _resume(checkpoint, signature, model, starts) if checkpoint is not None else (0, starts)
+    done, shapes = _resume(checkpoint, signature, model, initial) if checkpoint is not None else (0, initial)
     for cascade in range(done, settings.cascades):
         # A generator a cascade, so that what goes on from a checkpoint draws what it would have drawn.
         drawn = torch.Generator().manual_seed(1_000_003 * settings.seed + cascade + 1)
@@ -168,7 +168,7 @@ def _check(images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor, settings:
         )
 
 
-def _draw_starts(
+def _draw_initial_shapes(
     images: Sequence[Tensor],
     boxes: Tensor,
     landmarks: Tensor,
@@ -176,21 +176,21 @@ def _draw_starts(
     mirror: Sequence[int] | None,
     generator: torch.Generator,
 ) -> tuple[_Samples, Tensor, Tensor]:
-    """The starts, their shapes (N,L,2) in pixels, and the mean shape (L,2) in units of a box."""
+    """The samples, their initial shapes (N,L,2) in pixels, and the mean shape (L,2) in units of a box."""
     side = (boxes[:, 2] * boxes[:, 3]).sqrt()[:, None, None]
     middle = (boxes[:, :2] + boxes[:, 2:] / 2)[:, None]
     mean = (0.5 + (landmarks - middle) / side).nanmean(0)
     if mirror is not None:
         mean = (mean + mean[list(mirror)] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])) / 2
     count, total = len(images), len(images) * settings.oversampling
-    picture = torch.arange(count).repeat(settings.oversampling)
+    source = torch.arange(count).repeat(settings.oversampling)
     draw = torch.arange(settings.oversampling).repeat_interleave(count)
-    flipped = (draw + picture) % 2 == 1 if mirror is not None else torch.zeros(total, dtype=torch.bool)
+    flipped = (draw + source) % 2 == 1 if mirror is not None else torch.zeros(total, dtype=torch.bool)
     width = torch.tensor([image.shape[1] for image in images])
     height = torch.tensor([image.shape[0] for image in images])
-    targets, placed = landmarks[picture], boxes[picture].clone()
+    targets, placed = landmarks[source], boxes[source].clone()
     if mirror is not None:
-        last = (width[picture] - 1).float()
+        last = (width[source] - 1).float()
         across = targets[:, list(mirror)].clone()
         across[..., 0] = last[:, None] - across[..., 0]
         targets = torch.where(flipped[:, None, None], across, targets)
@@ -198,17 +198,17 @@ def _draw_starts(
     drawn = torch.randn(total, 5, generator=generator).clamp(-2.5, 2.5)
     drawn[:count, :4] = 0  # each image's own box among them
     size = (placed[:, 2] * placed[:, 3]).sqrt()
-    start = initial_shapes(mean, placed)
-    centre = start.mean(1, keepdim=True)
+    initial = initial_shapes(mean, placed)
+    centre = initial.mean(1, keepdim=True)
     angle, scale = drawn[:, 3] * (settings.rotation * torch.pi / 180), (settings.scale * drawn[:, 2]).exp()
     rotation = (
         torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2) * scale[:, None, None]
     )
-    start = centre + (start - centre) @ rotation.transpose(1, 2)
-    start = start + (settings.translation * size[:, None] * drawn[:, :2])[:, None]
+    initial = centre + (initial - centre) @ rotation.transpose(1, 2)
+    initial = initial + (settings.translation * size[:, None] * drawn[:, :2])[:, None]
     sizes = torch.tensor([image.numel() for image in images])
     samples = _Samples(
-        picture,
+        source,
         flipped,
         (settings.gamma * drawn[:, 4]).exp(),
         targets,
@@ -217,7 +217,7 @@ def _draw_starts(
         height,
         width,
     )
-    return samples, start, mean
+    return samples, initial, mean
 
 
 def _grow_cascade(
@@ -270,7 +270,7 @@ def _grow_tree(
     settings: TreeSettings,
     generator: torch.Generator,
 ) -> None:
-    """Grows one tree on grey values (P,N) and takes what it says from the residual (N,K)."""
+    """Grows one tree on grey values (P,N) and subtracts its prediction from the residual (N,K)."""
     features, count = grey.shape
     # Starts that follow each other are of different images: a run of them is as good as a draw, and is no copy.
     some = min(settings.split_samples or count, count)

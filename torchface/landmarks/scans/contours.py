@@ -26,13 +26,13 @@ class TraceSettings:
         similar: weight of neighbours having the same intensity, or being as like.
         dark: weight of being dark, or like the learned profile.
         smooth: weight of neighbours lying level, a squared pixel.
-        near: weight of staying near the course that the line starts with, a squared standard deviation.
+        near: weight of staying near the course that the line initial with, a squared standard deviation.
         line_width: intensity is measured against that so many pixels above and below.
         blurs: standard deviations of the blur under which the line is found first, and then finer.
-        sags: where no usual course is known, the line starts as an arc that sags by these shares of its length; the
+        sags: where no usual course is known, the line initial as an arc that sags by these shares of its length; the
             best end wins.
         deviation: the standard deviation about such an arc, a share of its length.
-        displacements: where corners are known to be loose, either end of the usual course is tried moved by so many
+        displacements: where corners are uncertain, either end of the usual course is tried moved by so many
             standard deviations; the best line wins, and every column pays for its displacement as for leaving the
             course.
         iterations: at most so many a blur; fewer when nothing moves any more.
@@ -97,12 +97,12 @@ def trace_contour(
     .. math:: E = \sum_{c=1}^{N} a\,(I_c - I_{c+1})^2 + b\, I_c + s\,(y_c - y_{c+1})^2
         + d\,(y_c - y^0_c)^2 / \sigma_c^2 ,
 
-    with :math:`y^0` the course that it starts with. In the thesis I is the intensity; here it is how much brighter a
+    with :math:`y^0` the course that it initial with. In the thesis I is the intensity; here it is how much brighter a
     pixel is than the darker of what lies above and below, or, where its profile was learned from annotated lines,
     1 less the correlation of what lies round the pixel with that profile: the line between two lids need not be the
-    darkest of the furrows there. The thesis starts from the straight line and has no last term; here the start is the
+    darkest of the furrows there. The thesis initial from the straight line and has no last term; here the start is the
     mean of annotated lines where there were any, else the straight line and an arc. Learned lines are tried with
-    their ends moved up and down as far as corners are usually off; the least energy wins.
+    their ends moved up and down as far as corners usually err; the least energy wins.
 
     Iterated conditional modes goes from the left corner to the right one and gives every column the row that is best
     for its two neighbours as they are, again and again until nothing moves. Rows brighter than the present line's
@@ -123,16 +123,16 @@ def trace_contour(
     settings = settings or TraceSettings()
     box, rows, columns = _box(image, left, right, settings.border)
     shapes = [LineShape.arc(sag, settings.deviation) for sag in settings.sags] if shape is None else [shape]
-    starts, pulls, displaced = _starts(shapes, left, right, torch.from_numpy(columns), settings)
-    starts -= rows[0]
+    initial, pulls, displaced = _initial_lines(shapes, left, right, torch.from_numpy(columns), settings)
+    initial -= rows[0]
     profile = None if shape is None or shape.profile is None else shape.profiles(left, right, torch.from_numpy(columns))
-    path = starts.round().clip(0, len(rows) - 1).astype(np.int64)
+    path = initial.round().clip(0, len(rows) - 1).astype(np.int64)
     grey = np.zeros(0)
     for blur in settings.blurs:  # each goes on from where the coarser one ended
         smooth = gaussian_blur(box[None, None], blur)[0, 0].double()
         grey = _valleys(smooth.numpy(), settings.line_width) if profile is None else _unlike(smooth, profile)
-        path = _conditional_modes(grey, path, starts, pulls, settings)
-    energies = _energy(grey, path, starts, pulls, settings) + displaced
+        path = _conditional_modes(grey, path, initial, pulls, settings)
+    energies = _energy(grey, path, initial, pulls, settings) + displaced
     best = int(energies.argmin())
     line = path[best]
     shade = grey[line, np.arange(len(line))]
@@ -141,24 +141,24 @@ def trace_contour(
     return Contour(points, torch.from_numpy(kept), float(energies[best]))
 
 
-def _starts(
+def _initial_lines(
     shapes: list[LineShape], left: Tensor, right: Tensor, columns: Tensor, settings: TraceSettings
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Courses (S,N) in image rows, the pulls toward them (S,N), and what the displacement of each costs, (S,).
 
-    Where corners are known to be loose, every shape is tried with either end moved up and down.
+    Where corners are uncertain, every shape is tried with either end moved up and down.
     """
     share = torch.linspace(0, 1, len(columns), dtype=torch.float64)
-    starts, pulls, costs = [], [], []
+    initial, pulls, costs = [], [], []
     for shape in shapes:
         rows, deviation = shape.rows(left, right, columns)
         tried = settings.displacements if shape.corner_deviation > 0 else (0.0,)
         for at_left, at_right in product(tried, tried):
             displaced = at_left * (1 - share) + at_right * share
-            starts.append(rows + shape.corner_deviation * displaced)
+            initial.append(rows + shape.corner_deviation * displaced)
             pulls.append(settings.near / deviation**2)
             costs.append(settings.near * float(displaced.square().mean()))
-    return torch.stack(starts).numpy(), torch.stack(pulls).numpy(), np.array(costs)
+    return torch.stack(initial).numpy(), torch.stack(pulls).numpy(), np.array(costs)
 
 
 def _box(image: Tensor, left: Tensor, right: Tensor, border: int) -> tuple[Tensor, NDArray, NDArray]:
@@ -202,15 +202,15 @@ def _unlike(grey: Tensor, profile: Tensor) -> NDArray:
 
 
 def _conditional_modes(
-    grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings
+    grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray, settings: TraceSettings
 ) -> NDArray:
     """Passes over the columns of S lines (S,N) at once, from left to right, until nothing moves."""
     path = path.copy()
     lines = np.arange(len(path))
     count = path.shape[1]
     row = np.arange(len(grey), dtype=np.float64)
-    outside = np.abs(row[:, None] - starts[:, None, [0, -1]]) > settings.end_tolerance
-    # The order is the method: a column's choice is what the next column starts from. Hence a loop, and NumPy, whose
+    outside = np.abs(row[:, None] - initial[:, None, [0, -1]]) > settings.end_tolerance
+    # The order is the method: a column's choice is what the next column initial from. Hence a loop, and NumPy, whose
     # small operations take a fifth of torch's time.
     for _ in range(settings.iterations):
         before = path.copy()
@@ -218,7 +218,7 @@ def _conditional_modes(
         limit = shades.mean(1) + shades.std(1)
         for c in range(count):
             here = grey[:, c]
-            cost = settings.dark * here + pulls[:, c, None] * (row - starts[:, c, None]) ** 2
+            cost = settings.dark * here + pulls[:, c, None] * (row - initial[:, c, None]) ** 2
             for n in (c - 1, c + 1):
                 if 0 <= n < count:
                     there = grey[path[:, n], n]
@@ -233,9 +233,9 @@ def _conditional_modes(
     return path
 
 
-def _energy(grey: NDArray, path: NDArray, starts: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
+def _energy(grey: NDArray, path: NDArray, initial: NDArray, pulls: NDArray, settings: TraceSettings) -> NDArray:
     """Mean energy a column of lines (S,N)."""
     shades = grey[path, np.arange(path.shape[1])]
     total = settings.dark * shades.sum(1) + settings.similar * (np.diff(shades, axis=1) ** 2).sum(1)
-    total = total + (pulls * (path - starts) ** 2).sum(1)
+    total = total + (pulls * (path - initial) ** 2).sum(1)
     return (total + settings.smooth * (np.diff(path, axis=1) ** 2).sum(1)) / path.shape[1]

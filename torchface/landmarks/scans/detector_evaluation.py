@@ -52,8 +52,8 @@ def landmark_errors(found: ScanLandmarks, scan: Mesh, truth: ScanAnnotation, nam
         if line in truth.lines and line in found.contours:
             path = evenly_spaced(layout.pixels(pose.apply(truth.lines[line][None].double())[0]), 400)
             contour = found.contours[line]
-            away = torch.cdist(contour.points.double(), path).amin(1)
-            lines[line], stray[line] = float(away[contour.kept].mean()), float(away.mean())
+            distance = torch.cdist(contour.points.double(), path).amin(1)
+            lines[line], stray[line] = float(distance[contour.kept].mean()), float(distance.mean())
     return ScanErrors(name, pixels, millimetres, lines, stray)
 
 
@@ -70,13 +70,13 @@ def error_table(errors: Sequence[ScanErrors]) -> dict[str, float]:
         "mean error, mm": float(millimetres.nanmean()),
     }
     for line in LINES:
-        away = [one.lines[line] for one in errors if line in one.lines]
-        if away:
-            table[f"{line}, pixels"] = sum(away) / len(away)
+        distance = [one.lines[line] for one in errors if line in one.lines]
+        if distance:
+            table[f"{line}, pixels"] = sum(distance) / len(distance)
     return table
 
 
-def picture(found: ScanLandmarks, truth: ScanAnnotation | None = None) -> Tensor:
+def draw_result(found: ScanLandmarks, truth: ScanAnnotation | None = None) -> Tensor:
     """The part of the unwrapped image round the face, found landmarks and lines red, true ones green, (3,H,W)."""
     image = found.image.expand(3, -1, -1).clone()
     layout, pose = found.head.layout, found.head.pose

@@ -145,10 +145,10 @@ def contour_correspondences(
 
 def _annotated_landmarks(template: Mesh, ibug: Tensor) -> dict[str, int]:
     named = {name: int(ibug[row]) for name, row in {**_UV_LANDMARKS_IN_IBUG, **_CORNERS_IN_IBUG}.items()}
-    twelve = uv_landmarks_from_ibug(template.vertices[ibug].double())
+    named_points = uv_landmarks_from_ibug(template.vertices[ibug].double())
     for name in ("right_cheek", "left_cheek"):
-        away = (template.vertices.double() - twelve[UV_LANDMARK_NAMES.index(name)]).norm(dim=-1)
-        named[name] = int(away.argmin())
+        distance = (template.vertices.double() - named_points[UV_LANDMARK_NAMES.index(name)]).norm(dim=-1)
+        named[name] = int(distance.argmin())
     return named
 
 
@@ -170,8 +170,8 @@ def _lines_of_contacts(template: Mesh, pairs: Tensor, landmarks: dict[str, int])
         start, end = vertices[landmarks[left]], vertices[landmarks[right]]
         chord = end - start
         along = (middle - start) @ chord / (chord @ chord)
-        off = (middle - start - along[:, None] * chord).norm(dim=-1)
-        own = (along > 0) & (along < 1) & (off < _SAME_LINE)
+        distance = (middle - start - along[:, None] * chord).norm(dim=-1)
+        own = (along > 0) & (along < 1) & (distance < _SAME_LINE)
         if int(own.sum()) < 2:
             continue
         own = own.nonzero()[:, 0]

@@ -67,7 +67,7 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
     if head.texture is None:
         raise ValueRangeError(
             "scan: found no texture and no vertex colours, expected some: this detector learned from textures; "
-            "use one that learned from relief"
+            "use one that learned from curvature"
         )
     return head.texture
 

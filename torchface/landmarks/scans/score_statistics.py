@@ -70,8 +70,8 @@ def score_statistics(
                 continue
             scores = similarity(described, filters[k, others])[0]
             best[i, k, others], places[i, k, others] = best_scores(scores, settings.matches)
-            away = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
-            near = away.flatten() <= settings.good_radius**2
+            squared = (rows[:, None] - landmarks[i, k, 1]) ** 2 + (columns - landmarks[i, k, 0]) ** 2
+            near = squared.flatten() <= settings.good_radius**2
             kept = scores >= settings.similarity_threshold
             for which, region in enumerate((near, ~near)):
                 chosen = torch.where(kept & region, scores, 0.0)

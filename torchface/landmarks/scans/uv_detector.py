@@ -44,7 +44,7 @@ class UVLandmarkDetector(nn.Module):
 
     over the clusters c that mean shift makes of the good ones among every filter's best 200 matches.
 
-    Beyond the thesis, a found place is weighed against the usual one by how far off it was, for its size, when each
+    Beyond the thesis, a found place is weighed against the usual one by its error, for its size, when each
     training image was searched with the filters of the others: a landmark that filters cannot tell (a cheek without
     texture) stays near its usual place,
 
@@ -194,7 +194,7 @@ class UVLandmarkDetector(nn.Module):
         return UVLandmarks(pixels, confidence)
 
     def matches(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:
-        """Where a landmark's filters match: pixels (N,2), and how many filters say so (N,).
+        """Where a landmark's filters match: pixels (N,2), and how many filters found each (N,).
 
         Args:
             landmark: which one.
@@ -246,7 +246,7 @@ class UVLandmarkDetector(nn.Module):
         """Whether scores (M,R) of a landmark's filters are likelier among the good than among the bad."""
         mean_good, deviation_good = self.good[landmark, :, :1], self.good[landmark, :, 1:]
         mean_bad, deviation_bad = self.bad[landmark, :, :1], self.bad[landmark, :, 1:]
-        # Above the mean of the good, a score can only be better: a wide Gaussian of bad ones has no say there.
+        # Above the mean of the good, a score can only be better: a wide Gaussian of bad ones is ignored there.
         clipped = torch.minimum(scores, mean_good)
         likely = -0.5 * ((clipped - mean_good) / deviation_good) ** 2 - deviation_good.log()
         unlikely = -0.5 * ((clipped - mean_bad) / deviation_bad) ** 2 - deviation_bad.log()
@@ -261,7 +261,7 @@ class UVLandmarkDetector(nn.Module):
         self.prior_covariance.copy_(covariance + _PRIOR_FLOOR**2 * torch.eye(2, dtype=covariance.dtype))
 
     def _fit_noise(self, best: Tensor, place: Tensor, width: int, landmarks: Tensor) -> None:
-        """How far off landmarks are, from images that are searched with the filters of the others: the squared error a
+        """The usual error of landmarks in images searched with the filters of the others: the squared error a
         coordinate of the clusters, times their share, and the error of the rows in the end. Medians: deaf to single
         failures."""
         images, count = landmarks.shape[:2]

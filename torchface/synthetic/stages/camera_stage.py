@@ -124,7 +124,9 @@ def record_session(
         frames=len(performance.weights),
         performed=performance.performed,
     )
-    frames = film(rig, performance.weights, paint, attachment, camera, rotation, translation, settings.flaws, generator)
+    frames = render_video(
+        rig, performance.weights, paint, attachment, camera, rotation, translation, settings.flaws, generator
+    )
     frames = _counted(frames, len(performance.weights), progress or silent)
     video = write_video(frames, folder / f"{name}.avi", performance.fps)
     take_path, labels_path = folder / f"{name}.c3d", folder / f"{name}.toml"
@@ -205,7 +207,7 @@ def _region_vertices() -> dict[str, Tensor]:
     return regions
 
 
-def film(
+def render_video(
     rig: BlendshapeRig,
     weights: Tensor,
     paint: Tensor,
@@ -243,7 +245,7 @@ def film(
     shade = _vignette(shape, flaws.vignette)
     for t in range(len(weights)):  # an image at a time: each has a surface of its own
         centre = -rotation[t].T @ translation[t]
-        light = scene.picture(weights[t], centre, ways.reshape(-1, 3) @ rotation[t]).view(shape)
+        light = scene.render(weights[t], centre, ways.reshape(-1, 3) @ rotation[t]).view(shape)
         light = flaws.exposure * shade * gaussian_blur(light[None, None], flaws.blur)[0, 0]
         noise = flaws.noise * torch.randn(shape, generator=generator)
         yield (light + noise * (light.clamp(min=0).sqrt() + 1 / 3)).clamp(0, 1)

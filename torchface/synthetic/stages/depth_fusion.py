@@ -180,11 +180,11 @@ def _visible_points(
 def _shell(points: Tensor, normals: Tensor, origin: Tensor, voxel: float, shape: Tensor) -> tuple[Tensor, Tensor]:
     """Grid points within the layers of the surface, ascending, (N,), and a surface normal near each, (N,3)."""
     strides = torch.tensor([int(shape[1] * shape[2]), int(shape[2]), 1])
-    home = ((points - origin) / voxel).round().long()
+    cell = ((points - origin) / voxel).round().long()
     count = int(shape.prod())
     # numpy: where several points share a voxel the last one wins, always; torch's threads would race.
     owner = np.full(count, -1, dtype=np.int32)
-    owner[(home * strides).sum(1).numpy()] = np.arange(len(points), dtype=np.int32)
+    owner[(cell * strides).sum(1).numpy()] = np.arange(len(points), dtype=np.int32)
     for _ in range(_LAYERS):  # grows by one voxel a round
         filled = np.flatnonzero(owner >= 0)
         held = owner[filled]

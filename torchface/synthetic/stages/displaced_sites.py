@@ -31,13 +31,13 @@ def misplaced(
     way = torch.randn(points.shape, generator=generator).double()
     way = torch.nn.functional.normalize(way - (way * normals).sum(-1, keepdim=True) * normals, dim=-1)
     index = SurfaceIndex(vertices, faces)
-    step, off = wanted.clone(), torch.full_like(wanted, torch.inf)
+    step, residual = wanted.clone(), torch.full_like(wanted, torch.inf)
     triangles, barycentric = attachment.triangles.clone(), attachment.barycentric.double()
     for _ in range(_STEPS):  # the skin bends: the step that ends at the wanted distance is found by trying
         found = index.nearest(points + step[:, None] * way)
         reached = (found.points - points).norm(dim=-1)
-        better = (reached - wanted).abs() < off
-        off = torch.where(better, (reached - wanted).abs(), off)
+        better = (reached - wanted).abs() < residual
+        residual = torch.where(better, (reached - wanted).abs(), residual)
         triangles = torch.where(better, found.triangle, triangles)
         barycentric = torch.where(better[:, None], found.barycentric, barycentric)
         step = step * (wanted / reached.clamp(min=0.1)).clamp(0.7, 1.5)

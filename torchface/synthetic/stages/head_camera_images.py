@@ -58,7 +58,7 @@ class HeadCameraRenderer:
             torch.zeros(len(self.faces)), torch.full((count * len(ball_faces),), _MARKER_GREY), plate_greys,
         ])  # fmt: skip
 
-    def picture(self, weights: Tensor, centre: Tensor, ways: Tensor) -> Tensor:
+    def render(self, weights: Tensor, centre: Tensor, ways: Tensor) -> Tensor:
         """Light (R,) that comes back along rays from the camera's centre."""
         skin = self.rest + torch.einsum("n,nvc->vc", weights.double(), self.deltas)
         normals = vertex_normals(skin, self.faces)

@@ -113,7 +113,7 @@ def render_lit_video(
         raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")
     cameras = turning_cameras(rig, len(weights), fps, generator, settings)
 
-    def pictures() -> Iterator[Tensor]:
+    def images() -> Iterator[Tensor]:
         for t, camera in enumerate(cameras):  # an image at a time: each has a surface of its own
             mesh = rig.neutral.with_vertices(rig(weights[t : t + 1])[0])
             linear = lit_picture(mesh, camera, light, settings)
@@ -121,7 +121,7 @@ def render_lit_video(
             yield (to_srgb((linear + noise).clamp(0, 1)) * 255).round().to(torch.uint8)[None]
             progress("rendering the video", t + 1, len(cameras))
 
-    return LitVideo(write_video(pictures(), path, fps), rig, weights, cameras, light)
+    return LitVideo(write_video(images(), path, fps), rig, weights, cameras, light)
 
 
 def turning_cameras(
@@ -180,7 +180,7 @@ def lit_picture(mesh: Mesh, camera: Camera, light: PointLight, settings: LightSt
     half = torch.nn.functional.normalize(toward - ways[seen], dim=-1)
     gloss = settings.gloss * (normal * half).sum(-1).clamp(min=0) ** settings.shininess * (falling > 0)
     ambient, intensity = light.ambient.double(), light.intensity.double()
-    picture = torch.tensor(_WALL, dtype=torch.float64).expand(len(ways), 3).clone()
-    picture[seen] = albedo * (ambient + intensity * falling[:, None]) + intensity * gloss[:, None]
-    rows = picture.view(shape[0] // settings.samples, settings.samples, -1, settings.samples, 3)
+    image = torch.tensor(_WALL, dtype=torch.float64).expand(len(ways), 3).clone()
+    image[seen] = albedo * (ambient + intensity * falling[:, None]) + intensity * gloss[:, None]
+    rows = image.view(shape[0] // settings.samples, settings.samples, -1, settings.samples, 3)
     return rows.mean((1, 3)).permute(2, 0, 1).float()

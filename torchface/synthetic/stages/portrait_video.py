@@ -111,13 +111,13 @@ def render_portrait_video(
         pivot = middle + torch.tensor([0.0, -40.0, -90.0])
         posed = (rig(row[None])[0].double() - pivot) @ rotation.T + pivot + settings.sway * sway
         mesh = rig.neutral.with_vertices(posed.float())
-        picture = render(mesh, camera, lighting=Lighting(occlusion_rays=0), samples=1).mean(0)
+        image = render(mesh, camera, lighting=Lighting(occlusion_rays=0), samples=1).mean(0)
         origins, ways = camera.rays()
         hits = RayCaster(mesh.vertices, mesh.faces).cast(origins.reshape(-1, 3), ways.reshape(-1, 3))
-        picture = torch.where((hits.triangle >= 0).view(size), picture, wall)
-        picture = gaussian_blur(picture[None, None], settings.blur)[0, 0]
-        picture = picture + settings.noise * torch.randn(size, generator=generator)
-        frames.append((255 * picture.clamp(0, 1)).round().to(torch.uint8))
+        image = torch.where((hits.triangle >= 0).view(size), image, wall)
+        image = gaussian_blur(image[None, None], settings.blur)[0, 0]
+        image = image + settings.noise * torch.randn(size, generator=generator)
+        frames.append((255 * image.clamp(0, 1)).round().to(torch.uint8))
         landmarks.append(camera.project(posed[ids]))
         progress("rendering the video", number + 1, len(weights))
     return PortraitVideo(torch.stack(frames), torch.stack(landmarks).float(), weights)

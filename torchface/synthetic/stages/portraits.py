@@ -33,7 +33,7 @@ _REFERENCE = 220  # pixels a side that rays are cast for; the image is then made
 
 
 @dataclass(frozen=True)
-class PictureSettings:
+class FaceImageSettings:
     """What is drawn how widely; angles in degrees.
 
     Args:
@@ -89,7 +89,7 @@ class _Person:
 def face_images(
     count: int,
     seed: int,
-    settings: PictureSettings | None = None,
+    settings: FaceImageSettings | None = None,
     progress: Progress | None = None,
     first: int = 0,
 ) -> Iterator[FaceImage]:
@@ -103,18 +103,18 @@ def face_images(
         first: number of the first image; several calls make what one would.
     """
     progress = progress or silent
-    settings = settings or PictureSettings()
+    settings = settings or FaceImageSettings()
     someone = None
     for number in range(first, first + count):  # each has a surface of its own
         if someone is None or number % settings.each == 0:
             person = torch.Generator().manual_seed(1_000_003 * seed + 500_000_000_000 + number // settings.each)
             someone = _draw_person(settings, person)
         generator = torch.Generator().manual_seed(1_000_003 * seed + number)
-        yield replace(_picture(someone, settings, generator), person=number // settings.each)
+        yield replace(_render(someone, settings, generator), person=number // settings.each)
         progress("rendering portraits", number + 1 - first, count)
 
 
-def _draw_person(settings: PictureSettings, generator: torch.Generator) -> _Person:
+def _draw_person(settings: FaceImageSettings, generator: torch.Generator) -> _Person:
     leaning = torch.tensor([_LEANING.get(parameter.name, 0.0) for parameter in IDENTITY])
     rig = performer(draw_identities(1, generator, settings.spread)[0] + leaning)
     mesh = rig.neutral
@@ -201,7 +201,7 @@ def _draw_weights(names: tuple[str, ...], generator: torch.Generator) -> Tensor:
     return torch.tensor(list(table.values()))
 
 
-def _draw_camera(settings: PictureSettings, generator: torch.Generator) -> Camera:
+def _draw_camera(settings: FaceImageSettings, generator: torch.Generator) -> Camera:
     yaw, pitch, roll = (torch.randn(3, generator=generator).clamp(-2.4, 2.4)).tolist()
     target = torch.tensor([0.0, -22.0, 55.0]) + 16 * torch.randn(3, generator=generator)
     span = uniform(240, 360, generator)
@@ -214,7 +214,7 @@ def _draw_camera(settings: PictureSettings, generator: torch.Generator) -> Camer
     return replace(camera, rotation=tilt @ camera.rotation, translation=tilt @ camera.translation)
 
 
-def _picture(person: _Person, settings: PictureSettings, generator: torch.Generator) -> FaceImage:
+def _render(person: _Person, settings: FaceImageSettings, generator: torch.Generator) -> FaceImage:
     rig = person.rig
     rest = widened(rig.vertices, person.width)
     moved = widened(rig(_draw_weights(rig.names, generator)[None])[0], person.width)
@@ -236,15 +236,15 @@ def _picture(person: _Person, settings: PictureSettings, generator: torch.Genera
     face = scene.part[triangle] == 0
     # The exposure is set for the face, as a photographer's or a camera's would be, better or worse.
     light = light * uniform(0.18, 0.7, generator) / light[face].mean().clamp(min=1e-3)
-    picture = backdrop(_REFERENCE, _REFERENCE, generator).flatten()
-    picture[seen] = light.float()
-    picture = picture.view(_REFERENCE, _REFERENCE)
+    image = backdrop(_REFERENCE, _REFERENCE, generator).flatten()
+    image[seen] = light.float()
+    image = image.view(_REFERENCE, _REFERENCE)
     pixels = camera.project(moved.double())
     if person.glasses is not None:
-        picture = _glasses(picture, camera, moved[head_annotations().landmarks].double(), person.glasses)
+        image = _glasses(image, camera, moved[head_annotations().landmarks].double(), person.glasses)
     curve = math.exp(uniform(-0.35, 0.35, generator))
     height = int(uniform(settings.smallest, settings.largest + 1, generator))
-    stored = photographed(picture.clamp(0, 1) ** curve, height, generator)
+    stored = photographed(image.clamp(0, 1) ** curve, height, generator)
     zoom = height / _REFERENCE
     landmarks = (annotated_landmarks(pixels).float() + 0.5) * zoom - 0.5
     return FaceImage(stored, landmarks, box_around(landmarks), 0)
@@ -331,11 +331,11 @@ def _openness(
     return free.double() / (count * reach)
 
 
-def _glasses(picture: Tensor, camera: Camera, marks: Tensor, form: tuple[float, float, float]) -> Tensor:
+def _glasses(image: Tensor, camera: Camera, marks: Tensor, form: tuple[float, float, float]) -> Tensor:
     """Frames of spectacles drawn over an image (H,W): half their width and height, millimetres, and their grey."""
     half_width, half_height, grey = form
     turn = torch.linspace(0, 2 * math.pi, 40).double()
-    drawn = picture.numpy().copy()
+    drawn = image.numpy().copy()
     curves = []
     for eye in (slice(36, 42), slice(42, 48)):
         middle = marks[eye].mean(0) + torch.tensor([0.0, -2.0, 14.0])

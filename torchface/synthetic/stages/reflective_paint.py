@@ -88,8 +88,8 @@ def _strokes(points: Tensor) -> Tensor:
     lines = torch.tensor(_STROKES)
     start, way = lines[:, :2], lines[:, 2:] - lines[:, :2]
     along = ((place[:, None] - start) * way).sum(-1) / way.square().sum(-1)
-    away = (place[:, None] - start - along.clamp(0, 1)[..., None] * way).norm(dim=-1).amin(1)
-    return 1 - ramp(away, _STROKE_WIDTH - _SOFT, _STROKE_WIDTH + _SOFT)
+    distance = (place[:, None] - start - along.clamp(0, 1)[..., None] * way).norm(dim=-1).amin(1)
+    return 1 - ramp(distance, _STROKE_WIDTH - _SOFT, _STROKE_WIDTH + _SOFT)
 
 
 def _band(ring: Tensor, band: tuple[float, float]) -> Tensor:
@@ -99,8 +99,8 @@ def _band(ring: Tensor, band: tuple[float, float]) -> Tensor:
 def _dashed(place: Tensor, count: int, share: float) -> Tensor:
     """1 on ``count`` dashes over places 0 to 1."""
     step = (place * count).frac()
-    away = (step - 0.5).abs()
-    return 1 - ramp(away, share / 2 - 0.1, share / 2 + 0.1)
+    distance = (step - 0.5).abs()
+    return 1 - ramp(distance, share / 2 - 0.1, share / 2 + 0.1)
 
 
 def _lid_dashes(values: Tensor) -> Tensor:

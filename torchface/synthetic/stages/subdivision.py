@@ -30,10 +30,10 @@ def finely_coloured(mesh: Mesh, edge: float) -> Mesh:
         control = control + (mesh.vertices.double() - finer[: len(vertices)])
     vertices = control
     while len(polygons) * 4 <= _MAX_FACES and _typical_edge(vertices, polygons) > edge:
-        held = vertices if colors is None else torch.cat([vertices, colors.double()], dim=1)
-        held, polygons, uvs = catmull_clark(held, polygons, uvs)
-        vertices = held[:, :3]
-        colors = None if colors is None else held[:, 3:]
+        attributes = vertices if colors is None else torch.cat([vertices, colors.double()], dim=1)
+        attributes, polygons, uvs = catmull_clark(attributes, polygons, uvs)
+        vertices = attributes[:, :3]
+        colors = None if colors is None else attributes[:, 3:]
     if uvs is not None and mesh.texture is not None:
         valid = polygons >= 0
         colors = torch.zeros(len(vertices), 3)
@@ -81,9 +81,9 @@ def catmull_clark(
     on_rim[rim.flatten()] = True
     rim_beside = _mean(middle[uses == 1].repeat_interleave(2, 0), rim.flatten(), count)
     moved = torch.where(on_rim[:, None], (values + rim_beside) / 2, smooth)
-    loose = torch.ones(count, dtype=torch.bool)
-    loose[start] = False
-    moved[loose] = values[loose]
+    free = torch.ones(count, dtype=torch.bool)
+    free[start] = False
+    moved[free] = values[free]
     edge_ids = torch.full_like(polygons, -1)
     edge_ids[valid] = edge + count
     previous = edge_ids.gather(1, before)
