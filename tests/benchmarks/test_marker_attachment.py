@@ -6,13 +6,13 @@ import time
 
 import pytest
 import torch
+from displaced_sites import misplaced, site_distances
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.stages.displaced_sites import misplaced, site_distances
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.synthetic.stages.weight_curves import perform
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from displaced_sites import misplaced, site_distances
 from rich.console import Console
 
 import torchface
@@ -19,7 +20,6 @@ from torchface.io import load_rig, load_take, save_animation, save_mesh, save_ri
 from torchface.io.landmarks.picks import LandmarkVertices, save_landmarks
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.displaced_sites import misplaced, site_distances
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
 from torchface.workflows.attach_markers import load_sites

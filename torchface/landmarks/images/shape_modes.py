@@ -62,7 +62,7 @@ def planar_pose(mean: Tensor, shapes: Tensor) -> PlanarPose:
 
 
 def similarity_modes(mean: Tensor) -> Tensor:
-    """What small similarities do to a centred shape (L,2): orthonormal (4,L,2), scale, rotation, and two shifts."""
+    """What small similarities do to a centred shape (L,2): orthonormal (4,L,2), scale, rotation, and two translations."""
     across = torch.stack([-mean[:, 1], mean[:, 0]], dim=1)
     x, y = torch.zeros_like(mean), torch.zeros_like(mean)
     x[:, 0], y[:, 1] = 1.0, 1.0
@@ -77,8 +77,8 @@ def learn_shape_modes(
 
     .. math:: \Sigma_{ij} = (C_{ij} + \phi^2 I)\, e^{-|\bar x_i - \bar x_j|^2 / 2\ell^2}
 
-    with C the shapes' covariance after Procrustes alignment. What fifteen shapes say of a brow and the chin together
-    is chance: with the distance of two landmarks their correlation fades, so that parts of the face move apart from
+    with C the shapes' covariance after Procrustes alignment. What fifteen shapes show of a brow and the chin together
+    is chance: with the distance of two landmarks their correlation falls, so that parts of the face move apart from
     one another; :math:`\phi` lets them also move as they were never seen to, neighbours together.
 
     Args:
@@ -95,9 +95,9 @@ def learn_shape_modes(
     centred = (aligned - aligned.mean(0)).flatten(1)
     covariance = centred.T @ centred / (len(shapes) - 1)
     apart = (mean[:, None] - mean).square().sum(-1)
-    fading = torch.exp(-apart / (2 * reach**2)).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    locality = torch.exp(-apart / (2 * reach**2)).repeat_interleave(2, 0).repeat_interleave(2, 1)
     axes = torch.eye(2, dtype=mean.dtype).repeat(len(mean), len(mean))
-    covariance = (covariance + flexibility**2 * axes) * fading
+    covariance = (covariance + flexibility**2 * axes) * locality
     rigid = similarity_modes(mean).flatten(1)
     free = torch.eye(mean.numel(), dtype=mean.dtype) - rigid.T @ rigid
     values, vectors = torch.linalg.eigh(free @ covariance @ free)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from displaced_sites import misplaced, site_distances
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
@@ -17,7 +18,6 @@ from torchface.capture.markers.attachment.site_curvature import TakeCurvature, p
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.displaced_sites import misplaced, site_distances
 from torchface.synthetic.stages.marker_stage import StageFlaws, record
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]

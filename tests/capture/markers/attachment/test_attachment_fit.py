@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from displaced_sites import misplaced, site_distances
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
@@ -15,7 +16,6 @@ from torchface.capture.markers.attachment.initial_sites import sites_by_shape
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.synthetic.stages.displaced_sites import misplaced, site_distances
 from torchface.synthetic.stages.marker_stage import StageFlaws, record
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
