@@ -257,7 +257,7 @@ class AppearanceModel(nn.Module):
         return level.error(level.residual(level.sample(crop.features, self._points(crop.pose.undo(landmarks)))))
 
     def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, initial: Tensor) -> Tensor:
-        """The best landmarks, by residual and shape, of an initial guess and those its steps lead to; pixels of the crop."""
+        """The best landmarks, by residual and shape, of an initial guess and what its steps lead to; crop pixels."""
         found = best = initial
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])

@@ -62,7 +62,7 @@ def planar_pose(mean: Tensor, shapes: Tensor) -> PlanarPose:
 
 
 def similarity_modes(mean: Tensor) -> Tensor:
-    """What small similarities do to a centred shape (L,2): orthonormal (4,L,2), scale, rotation, and two translations."""
+    """What small similarities do to a centred shape (L,2): orthonormal (4,L,2), scale, rotation, translations."""
     across = torch.stack([-mean[:, 1], mean[:, 0]], dim=1)
     x, y = torch.zeros_like(mean), torch.zeros_like(mean)
     x[:, 0], y[:, 1] = 1.0, 1.0
