@@ -119,7 +119,7 @@ def test_performers_are_learned_from(tmp_path: Path) -> None:
     _, errors = train(settings)
     assert len(errors) == 2
     record = zoo.describe(tmp_path / "made_up")
-    assert record.data == "4 rendered pictures of the embedded performer; no person's face."
+    assert record.data == "4 rendered images of the embedded performer; no person's face."
     assert record.licence == "MIT"
     assert "--images.smallest 90" not in record.recipe  # the default
     assert "--images.largest 100" in record.recipe

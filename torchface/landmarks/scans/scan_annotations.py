@@ -31,7 +31,9 @@ class ScanAnnotation:
     def ordered(self) -> Tensor:
         """The landmarks in the order of ``UV_LANDMARK_NAMES``, (12,3), NaN where one is not known."""
         missing = torch.full((3,), torch.nan, dtype=torch.float64)
-        return torch.stack([self.points[name].double() if name in self.points else missing for name in UV_LANDMARK_NAMES])
+        return torch.stack(
+            [self.points[name].double() if name in self.points else missing for name in UV_LANDMARK_NAMES]
+        )
 
 
 def save_annotations(annotations: Mapping[str, ScanAnnotation], path: str | Path) -> None:
