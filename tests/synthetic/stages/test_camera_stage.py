@@ -17,8 +17,8 @@ from torchface.synthetic.stages.camera_stage import (
     SIDE_MARKERS,
     RecordedSession,
     StageSettings,
-    film,
     record_session,
+    render_video,
     stage_markers,
 )
 from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
@@ -90,7 +90,9 @@ def test_the_paint_moves_with_the_skin() -> None:
     generator = torch.Generator().manual_seed(0)
     rotation, translation = shaken_cameras(camera, 2, 60.0, STILL, generator)
     markers = stage_markers(rig, 20).select(SIDE_MARKERS)
-    pictures = list(film(rig, weights, reflective_paint(512), markers, camera, rotation, translation, STILL, generator))
+    pictures = list(
+        render_video(rig, weights, reflective_paint(512), markers, camera, rotation, translation, STILL, generator)
+    )
     skin = rig(weights)
     stroke = ((rig.vertices - torch.tensor([14.0, 34.0, 90.0])).norm(dim=1)).argmin()
     pixels = camera.project(skin[:, stroke].double())
@@ -144,7 +146,7 @@ def test_nonsense_is_refused() -> None:
     camera = helmet_camera()
     with pytest.raises(ShapeError, match="as many"):
         next(
-            film(
+            render_video(
                 rig,
                 torch.zeros(3, 51),
                 torch.zeros(8, 8),
