@@ -20,13 +20,8 @@ def gaussian_blur(images: Tensor, sigma: float, truncate: float = 3.0) -> Tensor
 
     if sigma == 0:
         return images
-    size = kernel_size(sigma, truncate)
+    size = 2 * max(1, math.ceil(truncate * sigma)) + 1
     return gaussian_blur2d(images, (size, size), (sigma, sigma), border_type="replicate")
-
-
-def kernel_size(sigma: float, truncate: float = 3.0) -> int:
-    """Pixels across a kernel that ends after so many standard deviations."""
-    return 2 * max(1, math.ceil(truncate * sigma)) + 1
 
 
 def unsharp(images: Tensor, sigma: float, amount: float) -> Tensor:
