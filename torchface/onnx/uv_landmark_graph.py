@@ -129,7 +129,7 @@ def export_landmark_bank(
     """Writes a detector's bank, and checks it.
 
     The graph takes ``images`` (B,C,S,S) in [0,1], three channels for a detector of textures, one for a detector of
-    relief, and gives ``pixels`` (B,L,2), x right and y down, and ``confidence`` (B,L) in [0,1]. The metadata holds
+    curvature, and gives ``pixels`` (B,L,2), x right and y down, and ``confidence`` (B,L) in [0,1]. The metadata holds
     ``landmark_names`` and ``appearance``.
 
     Args:
