@@ -23,7 +23,7 @@ from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.images.ibug import box_around, relative_errors
+from torchface.landmarks.images.ibug_68 import box_around, relative_errors
 from torchface.progress import Progress, silent
 from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train.runner import metric_lines, run
@@ -257,7 +257,7 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
         recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
         card=(
             "iBUG's 68 landmarks of faces in grey images, from boxes as OpenCV's Haar cascade gives them or "
-            "`torchface.landmarks.images.ibug.box_around` makes them of landmarks. Good for faces within 40 degrees of "
+            "`landmarks.images.ibug_68.box_around` makes them of landmarks. Good for faces within 40 degrees of "
             f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
             + (
                 ""

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.portrait_video import (

@@ -18,9 +18,9 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import LandmarkTracker, LandmarkTrees, find_faces, find_landmarks, landmark_jitter
-from torchface.landmarks.images.consensus import ConsensusSettings
 from torchface.landmarks.images.face_box import overlaps
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
+from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.tracking import track_landmarks
 
 

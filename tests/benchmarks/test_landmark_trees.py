@@ -18,7 +18,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.images.ibug import MIRROR_68, relative_errors
+from torchface.landmarks.images.ibug_68 import MIRROR_68, relative_errors
 from torchface.onnx import export_model
 from train.landmarks import Faces, evaluate, load_faces, rendered_faces
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchface.workflows.demo.main_job import DemoResult, embedded_scene, run_demo, scene_from
+from torchface.workflows.demo.run_demo import DemoResult, embedded_scene, run_demo, scene_from
 
 HEADING = (
     "take",

@@ -21,7 +21,7 @@ from torchface.geometry.meshes.deformation import deformation_gradients
 from torchface.geometry.meshes.operators import border_vertices, components, edges, triangle_normals, vertex_normals
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.transfer import CONTACT_WEIGHT, transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, transfer_with_report
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_picture, sheet
 from torchface.rig import BlendshapeRig

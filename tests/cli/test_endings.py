@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchface.cli import main
-from torchface.cli.ending import plain_errors
+from torchface.cli.exit_messages import plain_errors
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import save_rig, save_take

@@ -6,7 +6,7 @@ import torch
 
 from torchface.optim.active_set import projected_newton, solve_free
 from torchface.optim.box_problem import BoxProblem, metric
-from torchface.optim.splitting import prepare_splitting, splitting_steps, start_splitting
+from torchface.optim.operator_splitting import prepare_splitting, splitting_steps, start_splitting
 
 
 def problem(variables: int = 12, problems: int = 30, seed: int = 0) -> BoxProblem:

@@ -12,8 +12,8 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.registration import Registration, register
-from torchface.registration.completion import completed_colors, completed_form
 from torchface.registration.ears import find_ears
+from torchface.registration.scan_completion import completed_colors, completed_form
 from torchface.synthetic.head.performer import performer
 
 SKIN, HAIR = (0.75, 0.55, 0.45), (0.05, 0.04, 0.03)

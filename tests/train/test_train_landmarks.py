@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.compositing import save_picture
 from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train import landmarks as recipe

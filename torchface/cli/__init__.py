@@ -21,8 +21,8 @@ from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
-from torchface.cli.ending import plain_errors
 from torchface.cli.evaluate import evaluate
+from torchface.cli.exit_messages import plain_errors
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit

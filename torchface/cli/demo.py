@@ -33,7 +33,7 @@ def demo(
         quiet: Show no progress.
     """
     from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
-    from torchface.workflows.demo.main_job import run_demo, scene_from
+    from torchface.workflows.demo.run_demo import run_demo, scene_from
 
     with progress_bars(quiet) as progress:
         progress("preparing head and take")

@@ -55,9 +55,9 @@ def evaluate(
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
+    from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings
+    from torchface.workflows.evaluate.compare_with_truth import evaluate as run
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
-    from torchface.workflows.evaluate.evaluate_result import EvaluationSettings
-    from torchface.workflows.evaluate.evaluate_result import evaluate as run
 
     if align and as_is:
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")

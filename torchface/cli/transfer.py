@@ -34,7 +34,7 @@ def transfer(
         quiet: Show no progress.
     """
     from torchface.io import load_mesh, load_rig, save_rig
-    from torchface.modeling.rigging.transfer import transfer_with_report
+    from torchface.modeling.rigging.deformation_transfer import transfer_with_report
     from torchface.workflows.rig.actor_rig import check_out
     from torchface.workflows.rig_names import naming_lines, renamed
 

@@ -11,18 +11,18 @@ from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.image_solve import FitSettings
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
-from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
-from torchface.modeling.rigging.expression_regression import ExpressionRegression, rig_from_neutral
-from torchface.modeling.rigging.open_eyes import open_eyes
-from torchface.modeling.rigging.part_clearance import clear_parts
-from torchface.modeling.rigging.part_placement import place_parts
-from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
-from torchface.modeling.rigging.transfer import (
+from torchface.modeling.rigging.deformation_transfer import (
     TransferredRig,
     TransferReport,
     transfer_deformation,
     transfer_with_report,
 )
+from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
+from torchface.modeling.rigging.expression_regression import ExpressionRegression, rig_from_neutral
+from torchface.modeling.rigging.open_eyed_neutral import open_eyes
+from torchface.modeling.rigging.part_clearance import clear_parts
+from torchface.modeling.rigging.part_placement import place_parts
+from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
 
 __all__ = [
     "BakeStatistics",

@@ -15,7 +15,7 @@ from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.onnx.unrolled_operators import box_splitting, symmetric_inverse
-from torchface.optim.splitting import RELAXATION
+from torchface.optim.operator_splitting import RELAXATION
 
 _SLIDING_STEPS = 3
 _SPLITTING_STEPS = 40

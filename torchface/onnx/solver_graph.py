@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.errors import ShapeError
 from torchface.optim.box_problem import metric
-from torchface.optim.splitting import RELAXATION, RHO, prepare_splitting
+from torchface.optim.operator_splitting import RELAXATION, RHO, prepare_splitting
 
 STEPS = 66
 STEPS_WITH_GAPS = 96
@@ -31,7 +31,7 @@ class SolverGraph(nn.Module):
 
     .. math:: v' = c + z\,(2G + (2 - \alpha) I) - v\,G, \qquad z' = \mathrm{clip}(v', 0, 1)
 
-    (see ``torchface.optim.splitting``; with ``t = 2z - v`` written out a step is two products and a clamp).
+    (see ``torchface.optim.operator_splitting``; with ``t = 2z - v`` written out a step is two products and a clamp).
 
     Missing markers give a frame an H of its own. Its inverse comes from Newton's iteration
     :math:`X' = X (2I - AX)`, :math:`A = H + \rho D` scaled to a unit diagonal, so that A's condition is at most about

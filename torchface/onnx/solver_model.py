@@ -11,7 +11,7 @@ from torchface import __version__
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.solver_graph import NEWTON_SCALE, SolverGraph, stretches
-from torchface.optim.splitting import RELAXATION
+from torchface.optim.operator_splitting import RELAXATION
 
 
 def solver_model(graph: SolverGraph, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:

@@ -52,7 +52,7 @@ def _sweep_inverse(matrix: Any) -> Any:
 def box_splitting(
     constant: Tensor, step: Tensor, double_step: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Steps of operator splitting from zero, see ``torchface.optim.splitting``: the last v and the clipped z, (1,N).
+    """Steps of ``torchface.optim.operator_splitting`` from zero: the last v and the clipped z, (1,N).
 
     Args:
         constant: c, (1,N).

@@ -11,8 +11,8 @@ from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.implicit import BoxSolution
+from torchface.optim.operator_splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 from torchface.optim.prepared_tensors import Prepared
-from torchface.optim.splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 
 # Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
 # ends in the first rounds nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps

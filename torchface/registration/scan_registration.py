@@ -15,7 +15,6 @@ from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
-from torchface.registration.completion import completed_colors, completed_form
 from torchface.registration.hair_and_cloth import Cover
 from torchface.registration.model_fit import HasShape, ModelFit, ShapeModel, fit_to_scan, shape_model
 from torchface.registration.nonrigid.correspondence import evenly_spread, exposed_vertices
@@ -33,6 +32,7 @@ from torchface.registration.scan_colors import (
     skin_base,
     vertex_colors,
 )
+from torchface.registration.scan_completion import completed_colors, completed_form
 from torchface.registration.scan_preparation import (
     Landmarks,
     PreparedScan,

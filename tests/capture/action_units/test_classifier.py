@@ -25,7 +25,7 @@ from torchface.capture.action_units.classifier_training import TrainingSettings,
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.intensity_labels import intensity_levels
 from torchface.capture.action_units.intensity_smoothing import smooth_intensities
-from torchface.capture.action_units.one_vs_one import OneVsOne
+from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
 from torchface.synthetic.stages.action_performance import MOVES

@@ -9,7 +9,7 @@ import torch
 
 from torchface.capture.action_units import RegionVideo, read_regions
 from torchface.capture.action_units.local_warps import local_warps
-from torchface.capture.action_units.pattern import otsu_threshold, pattern_levels
+from torchface.capture.action_units.painted_pattern import otsu_threshold, pattern_levels
 from torchface.capture.action_units.pattern_flow import aligned_grid, neutral_flow
 from torchface.capture.action_units.regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError

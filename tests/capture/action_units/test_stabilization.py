@@ -64,7 +64,7 @@ def test_the_similarity_of_three_points_is_recovered() -> None:
 
 
 def test_a_steady_picture_changes_less_at_rest(session: RecordedSession, regions: RegionVideo) -> None:
-    from torchface.capture.action_units.pattern import pattern_levels
+    from torchface.capture.action_units.painted_pattern import pattern_levels
     from torchface.capture.action_units.regions import region_grid, sample_regions
 
     video, labels = session.video, session.labels

@@ -16,7 +16,7 @@ from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.appearance_level import TextureResidual, sample_pixels
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.shape_modes import learn_shape_modes, planar_pose, procrustes_mean, similarity_modes
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer

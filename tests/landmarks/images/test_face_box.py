@@ -24,7 +24,7 @@ from torchface.landmarks.images.face_box import (
     find_faces,
     overlaps,
 )
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer
 

@@ -19,7 +19,7 @@ from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
-from torchface.landmarks.images.ibug import MIRROR_68, box_around, relative_errors
+from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around, relative_errors
 from torchface.landmarks.images.landmark_trees import FAINTEST, initial_shapes, similarity_to
 from torchface.landmarks.images.tree_training import best_test
 from torchface.onnx import export_model

@@ -25,8 +25,8 @@ from torchface.landmarks import (
     landmark_jitter,
     track_landmarks,
 )
-from torchface.landmarks.images.consensus import ConsensusSettings, consensus, tilt_of
-from torchface.landmarks.images.ibug import MIRROR_68, box_around
+from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around
+from torchface.landmarks.images.landmark_consensus import ConsensusSettings, consensus, tilt_of
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import performer
 

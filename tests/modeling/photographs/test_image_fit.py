@@ -17,7 +17,7 @@ from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.image_solve import FitSettings
-from torchface.modeling.rigging.transfer import transfer_deformation
+from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy

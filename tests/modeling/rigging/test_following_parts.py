@@ -13,7 +13,7 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
 from torchface.modeling.rigging.penetration import TOLERANCE
-from torchface.modeling.rigging.shape_transfer import ShapeTransfer
+from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer

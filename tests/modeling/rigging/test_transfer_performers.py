@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.action_units.gabor import GaborBank
-from torchface.capture.action_units.one_vs_one import OneVsOne
+from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.capture.action_units.regions import RegionGroup
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.files.documents import Value

@@ -18,7 +18,7 @@ from torchface.capture.action_units.classifier_training import (
     merged_videos,
     principal_components,
 )
-from torchface.capture.action_units.one_vs_one import OneVsOne
+from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.capture.action_units.region_video import RegionVideo
 from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.errors import ShapeError

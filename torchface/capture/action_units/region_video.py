@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.pattern import pattern_levels
+from torchface.capture.action_units.painted_pattern import pattern_levels
 from torchface.capture.action_units.pattern_flow import Method, aligned_grid, neutral_flow
 from torchface.capture.action_units.regions import region_grid, sample_regions
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms

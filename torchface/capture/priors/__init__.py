@@ -6,7 +6,7 @@ from torchface.capture.priors.dynamics_training import fit_dynamics_prior
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.learned_names import unlearned
 from torchface.capture.priors.motion_features import face_regions, resampled, windows_of
-from torchface.capture.priors.parzen import ParzenDensity, automatic_bandwidth
+from torchface.capture.priors.parzen_window import ParzenDensity, automatic_bandwidth
 from torchface.capture.priors.shape_prior import ReciprocalPrior, ShapePrior, face_halves
 from torchface.capture.priors.student_t import StudentDensity
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.priors.parzen import checked_sizes
+from torchface.capture.priors.parzen_window import checked_sizes
 from torchface.errors import ShapeError, ValueRangeError
 
 _MAX_ITERATIONS, _TOLERANCE = 200, 1e-5

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.learned_names import name_matrices, require_same_names
-from torchface.capture.priors.parzen import ParzenDensity
+from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.priors.parzen import checked_sizes
+from torchface.capture.priors.parzen_window import checked_sizes
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 _ITERATIONS = 50

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.video.light_solve import LampFit, find_lamp, information
+from torchface.capture.video.lamp_search import LampFit, find_lamp, information
 from torchface.capture.video.skin_samples import SeenSkin, seen_skin
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration

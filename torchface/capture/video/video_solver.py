@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.video.face_points import LANDMARKS
-from torchface.capture.video.fixed_point import attach_gradients
+from torchface.capture.video.fixed_point_gradient import attach_gradients
 from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative

@@ -15,10 +15,10 @@ from torchface.errors import FileFormatError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
+from torchface.io.gltf.part_joining import rejoined
 from torchface.io.gltf.primitive_reading import Part, read_part
-from torchface.io.gltf.rejoining import rejoined
 from torchface.io.gltf.scene import Instance, instances
-from torchface.io.gltf.welding import weld
+from torchface.io.gltf.seam_welding import weld
 from torchface.io.images.image_files import decode_image
 from torchface.io.length_units import millimetres_per
 from torchface.mesh import Annotations, Mesh

@@ -12,7 +12,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.appearance_level import AppearanceLevel, sample_pixels
 from torchface.landmarks.images.appearance_model import COUNT, AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.face_warp import FaceGrid, face_grid, face_triangles, with_forehead
-from torchface.landmarks.images.ibug import MIRROR_68
+from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.shape_modes import learn_shape_modes, similarity_modes
 from torchface.progress import Progress, silent
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.consensus import Consensus, ConsensusSettings, consensus, tilt_of
 from torchface.landmarks.images.face_box import FaceDetector, HaarDetector, find_face, find_faces, grey_pixels, overlaps
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
+from torchface.landmarks.images.landmark_consensus import Consensus, ConsensusSettings, consensus, tilt_of
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.progress import Progress, silent
 from torchface.take import Track

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.states import pack_state, read_state
 from torchface.files.whole_files import write_file
-from torchface.landmarks.images.ibug import MIRROR_68
+from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees, initial_shapes, similarity_to
 from torchface.progress import Progress, silent
 

@@ -20,7 +20,7 @@ from torchface.modeling.photographs.image_solve import FitSettings, Problem, Sta
 from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views
 from torchface.modeling.photographs.texture_fit import ColorFit
-from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mirror

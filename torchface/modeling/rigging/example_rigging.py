@@ -12,9 +12,9 @@ from torch import Tensor
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.deformation import deformation_gradients, gradient_operator
 from torchface.mesh import Mesh
+from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.modeling.rigging.example_shapes import example_shares, personal_part, shape_stiffness
-from torchface.modeling.rigging.shape_transfer import ShapeTransfer
-from torchface.modeling.rigging.transfer import CONTACT_WEIGHT, TransferReport, transfer_report
+from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.optim import box_qp
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig

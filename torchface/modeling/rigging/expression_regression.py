@@ -13,7 +13,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.rigging.component_choice import choose_components
-from torchface.modeling.rigging.transfer import transfer_deformation
+from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 

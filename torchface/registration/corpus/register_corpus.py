@@ -18,8 +18,8 @@ from torchface.io.length_units import millimetres_per
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
-from torchface.registration.corpus.cluster import import_ray, on_cluster
 from torchface.registration.corpus.processes import in_processes
+from torchface.registration.corpus.ray_cluster import import_ray, on_cluster
 from torchface.registration.corpus.scan_job import CorpusJob
 from torchface.registration.corpus.scan_record import CorpusEntry, CorpusTask, finished_entry, write_summary
 from torchface.registration.landmark_files import landmark_file

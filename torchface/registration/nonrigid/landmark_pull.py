@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.ibug import INNER
+from torchface.landmarks.images.ibug_68 import INNER
 from torchface.mesh import Mesh
 
 _DISAGREES = 10.0

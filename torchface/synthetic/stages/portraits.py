@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.landmarks.images.ibug import box_around
+from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster

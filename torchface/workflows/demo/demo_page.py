@@ -20,7 +20,7 @@ from torchface.viz.figures.marker_maps import marker_regions
 from torchface.viz.figures.marker_scatter import marker_views
 from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
 from torchface.viz.reports.report_page import Section, Table, write_page
-from torchface.workflows.demo.main_job import FLAWS, DemoResult, Solved
+from torchface.workflows.demo.run_demo import FLAWS, DemoResult, Solved
 
 _POSES: dict[str, dict[str, float]] = {
     "neutral": {},

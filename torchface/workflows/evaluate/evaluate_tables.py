@@ -10,7 +10,7 @@ import torch
 
 from torchface.files.documents import write_json
 from torchface.io.tables.csv_table import write_table
-from torchface.workflows.evaluate.evaluation_result import Evaluation
+from torchface.workflows.evaluate.evaluation_record import Evaluation
 
 _SUMMARY = "torchface.evaluation/1"
 

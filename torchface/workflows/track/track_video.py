@@ -44,7 +44,6 @@ from torchface.workflows.track.track_state import TrackedFrames, TrackState, dig
 
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
-"""Told what is being done, how many frames of it are done, and of how many."""
 
 _VERSION = torchface.__version__  # another one may track and solve differently
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
-from torchface.capture.markers.fit_check import DOUBTFUL_SHARE
+from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.errors import AlignmentError, ValueRangeError
 
 # Median over the markers. With a head's own rig it is 0.02 to 0.06 mm; with a rig whose neutral is 0.5 or 1 mm and

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.images.ibug import MIRROR_68
+from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.landmark_trees import LandmarkTrees, initial_shapes, similarity_to
 
 _AROUND = 0.6  # of the box's side that is shown to the trees on every side

@@ -12,7 +12,7 @@ from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.transfer import transfer_deformation, transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import transfer_deformation, transfer_with_report
 from torchface.rig import BlendshapeRig
 
 SHELLS = ("lacrimal_fluid", "eye_blend", "eye_occlusion")

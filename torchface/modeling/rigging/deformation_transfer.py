@@ -13,7 +13,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.penetration import inner_parts
-from torchface.modeling.rigging.shape_transfer import ShapeTransfer
+from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 

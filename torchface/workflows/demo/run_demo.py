@@ -33,7 +33,7 @@ from torchface.io.rigs.ict_facekit import is_ict_folder
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.transfer import TransferReport, transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import TransferReport, transfer_with_report
 from torchface.onnx import SolverReport, export_solver
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig

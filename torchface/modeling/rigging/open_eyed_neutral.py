@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torchface.errors import NameMismatchError
 from torchface.mesh import Mesh
-from torchface.modeling.rigging.transfer import CONTACT_WEIGHT, transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, transfer_with_report
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchface.geometry.meshes.contact import ContactFinder
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Annotations, Mesh
-from torchface.modeling.rigging.seams import find_seams
-from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.modeling.rigging.lid_and_lip_closing import find_seams
 from torchface.rig import BlendshapeRig
 
 COLUMNS = 31

@@ -19,7 +19,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.mesh import Annotations
-from torchface.workflows.evaluate.evaluate_result import ALL, EvaluationSettings, evaluate
+from torchface.workflows.evaluate.compare_with_truth import ALL, EvaluationSettings, evaluate
 
 FRAMES = 6
 NAMES = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")

@@ -22,7 +22,7 @@ from torchface.geometry.meshes.reconstruction import (
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.following_parts import PartLinks, part_links
-from torchface.modeling.rigging.seams import Seams, find_seams
+from torchface.modeling.rigging.lid_and_lip_closing import Seams, find_seams
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchface.errors import NameMismatchError, TopologyError
-from torchface.modeling.rigging.open_eyes import open_eyes
-from torchface.modeling.rigging.transfer import transfer_with_report
+from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 

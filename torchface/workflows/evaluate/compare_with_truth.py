@@ -24,7 +24,7 @@ from torchface.viz.figures.heat_maps import round_maximum
 from torchface.workflows.evaluate.animated_meshes import AnimatedMesh, load_animated
 from torchface.workflows.evaluate.compared_regions import compared_regions
 from torchface.workflows.evaluate.evaluate_tables import write_tables
-from torchface.workflows.evaluate.evaluation_result import ALL, Compared, Evaluation
+from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation
 from torchface.workflows.evaluate.scan_truth import ScanTruth, scan_truth
 
 _CHUNK = 32

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.markers import check_fit
-from torchface.capture.markers.fit_check import unit_of_scale
+from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.geometry.similarity import Similarity
 from torchface.modeling import transfer_deformation
 from torchface.synthetic import draw_identities, performer

@@ -16,7 +16,7 @@ from torchface.io import load_rig, load_take, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
-from torchface.workflows.demo.main_job import FLAWS, embedded_scene, run_demo, scene_from
+from torchface.workflows.demo.run_demo import FLAWS, embedded_scene, run_demo, scene_from
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
