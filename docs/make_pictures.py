@@ -13,7 +13,7 @@ from torchface.io import load_image, load_rig, save_image
 from torchface.io.video import open_video
 from torchface.registration import register
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, from_pillow, save_picture, sheet
+from torchface.rendering.compositing import caption, from_pillow, save_rendered_image, sheet
 from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
@@ -133,12 +133,12 @@ def _half(image: torch.Tensor) -> torch.Tensor:
 def main() -> None:
     from PIL import Image
 
-    save_picture(performer_sheet(), HERE / "images" / "performer.jpg")
-    save_picture(registration_picture(), HERE / "images" / "registration.jpg")
-    save_picture(fit_picture(), HERE / "images" / "fit.jpg")
-    save_picture(relight_picture(), HERE / "images" / "relight.png")
+    save_rendered_image(performer_sheet(), HERE / "images" / "performer.jpg")
+    save_rendered_image(registration_picture(), HERE / "images" / "registration.jpg")
+    save_rendered_image(fit_picture(), HERE / "images" / "fit.jpg")
+    save_rendered_image(relight_picture(), HERE / "images" / "relight.png")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
-        save_picture(from_pillow(image), HERE / "images" / "demo.jpg")
+        save_rendered_image(from_pillow(image), HERE / "images" / "demo.jpg")
 
 
 if __name__ == "__main__":

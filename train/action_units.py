@@ -20,7 +20,7 @@ from torchface.capture.action_units.classifier_evaluation import cross_validatio
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import headed, save_picture, sheet
+from torchface.rendering.compositing import headed, save_rendered_image, sheet
 from train.runner import metric_lines, run
 
 
@@ -89,7 +89,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
         progress(f"{path.name}: {found['within_one']:.1%} within one level")
     save(classifier, settings, metrics, labels)
     picture = levels_picture(videos[0], labelled_intensities(videos[0], labels[0], groups, settings.training), groups)
-    save_picture(picture, settings.out / "levels.png")
+    save_rendered_image(picture, settings.out / "levels.png")
     return Trained(classifier, metrics)
 
 

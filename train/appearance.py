@@ -17,7 +17,7 @@ from torchface.landmarks.images.annotated_frames import AnnotatedFrame, load_ann
 from torchface.landmarks.images.appearance_level import sample_pixels
 from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from train.runner import run
 
 _OFF = 0.03
@@ -86,7 +86,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
     save(model, settings, frames, before, after)
     if len(after):
         pictures = [_picture(frame, shape) for frame, shape in zip(frames, found, strict=True)]
-        save_picture(sheet(pictures[:15], 5), settings.out / "held_out.png")
+        save_rendered_image(sheet(pictures[:15], 5), settings.out / "held_out.png")
     return Trained(model, before, after)
 
 

@@ -15,7 +15,7 @@ from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
 from train.expression_table import Comparison, People, compare, picture
 from train.runner import run
@@ -206,7 +206,7 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
         folder = settings.out / "pictures"
         folder.mkdir(exist_ok=True)
         for row, name in enumerate(people.names[:3]):
-            save_picture(picture(people, comparison, row), folder / f"{name}.png")
+            save_rendered_image(picture(people, comparison, row), folder / f"{name}.png")
 
 
 if __name__ == "__main__":

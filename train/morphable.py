@@ -20,7 +20,7 @@ from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.streamed_training import fit_sequence
 from torchface.progress import Progress, silent
-from train.head_pictures import draw
+from train.head_figures import draw
 from train.head_samples import Source, balanced_colors, gather, laid, performers, registered
 from train.head_templates import ict_head_model, load_template
 from train.runner import metric_lines, run

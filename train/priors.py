@@ -28,7 +28,7 @@ from torchface.capture.priors import (
 from torchface.errors import ValueRangeError
 from torchface.progress import Progress, silent
 from torchface.synthetic import performer
-from train.prior_pictures import calibration_picture, choice_picture, curves_picture, save_figure
+from train.prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
 from train.prior_takes import PriorTakes, made_up, read_takes, renamed, split
 from train.prior_trials import filmed, one_step, solve_error, with_strength
 from train.runner import metric_lines, run

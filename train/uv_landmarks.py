@@ -27,7 +27,7 @@ from torchface.landmarks import (
 )
 from torchface.landmarks.scans.detector_evaluation import ScanErrors, draw_result, error_table, landmark_errors
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import save_picture, sheet
+from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
 from train.runner import metric_lines, run
@@ -101,7 +101,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
         progress(f"{scan.name}: {errors[-1].mean_pixels:.1f} px")
     save(detector, settings, errors, len(learn))
     if pictures:
-        save_picture(sheet(pictures[:9], 3), settings.out / "held_out.png")
+        save_rendered_image(sheet(pictures[:9], 3), settings.out / "held_out.png")
     return Trained(detector, errors)
 
 

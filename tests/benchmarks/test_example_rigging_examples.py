@@ -26,7 +26,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.optim import box_qp
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
+from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
@@ -199,7 +199,7 @@ def pictures(case: Case, made: ExampleRig) -> None:
         for name, pose in list(poses.items())[1:]:
             heat = heat_colors((pose - goal).norm(dim=-1), 2.0)
             cells.append(caption(render(neutral.with_vertices(goal), camera, heat), f"{name}, 2 mm is red"))
-    save_picture(sheet(cells, 5), PICTURES / f"{case.name.replace(' ', '_')}.png")
+    save_rendered_image(sheet(cells, 5), PICTURES / f"{case.name.replace(' ', '_')}.png")
 
 
 def hold(rows: list[Measured]) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from torchface.modeling import ExpressionRegression
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
+from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.viz.figures.face_views import clay_colors, frame_face
 from train.expression_table import METHODS, People, compare, picture
@@ -50,7 +50,7 @@ def test_table_1_for_the_smile(smile: People) -> None:
     found = compare(smile, fit, keep=3)
     print(f"\n{COUNT} performers, neutral to smile, 14 to 13 components, each left out once\n{found}")
     OUT.mkdir(parents=True, exist_ok=True)
-    save_picture(picture(smile, found), OUT / "figure_49.png")
+    save_rendered_image(picture(smile, found), OUT / "figure_49.png")
     assert found.counts[METHODS.index("regression")] >= 0.72 * COUNT
     assert found.sums[2] <= 0.46 * found.sums[1]
     assert found.sums[2] <= 0.43 * found.sums[0]
@@ -88,7 +88,7 @@ def test_equation_31_leaks_identity(smile: People) -> None:
             truth = smile.template.with_vertices(neutral[0] + smile.offsets[i, 0])
             rows.append(caption(render(truth, camera, clay_colors(truth), samples=2), "truth"))
     OUT.mkdir(parents=True, exist_ok=True)
-    save_picture(sheet(rows, 5), OUT / "figure_47.png")
+    save_rendered_image(sheet(rows, 5), OUT / "figure_47.png")
     means = {form: sum(found) / COUNT for form, found in leaks.items()}
     print(f"\nmean distance of what no smile moves: equation 31 {means['expressions']:.3f} mm, equation 32 "
           f"{means['offsets']:.3f} mm")  # fmt: skip

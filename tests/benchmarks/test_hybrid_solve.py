@@ -23,7 +23,7 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.action_performance import MOVES, PerformanceSettings
 from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
@@ -197,7 +197,7 @@ def test_where_markers_are_blind(classifier: ActionUnitClassifier, number: int) 
         if float((found.alone - true)[:, i].abs().mean()) > 0.005
     }
     print("others worse by more than 5 %:", {name: round(ratio, 2) for name, ratio in grown.items() if ratio > 1.05})
-    save_picture(side_by_side(found), OUT / f"blind{number}.png")
+    save_rendered_image(side_by_side(found), OUT / f"blind{number}.png")
 
 
 def test_54_markers_on_the_upper_face(classifier: ActionUnitClassifier) -> None:
@@ -205,7 +205,7 @@ def test_54_markers_on_the_upper_face(classifier: ActionUnitClassifier) -> None:
     print(f"\n{len(one.attachment.triangles)} markers, 54 of them on the upper face")
     found = solved(classifier, one, None)
     led, others = shares(found)
-    save_picture(side_by_side(found), OUT / "upper.png")
+    save_rendered_image(side_by_side(found), OUT / "upper.png")
     assert led <= 1
     assert others <= 1.05
     assert jerk(found.hybrid) <= jerk(found.alone)

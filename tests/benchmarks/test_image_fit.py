@@ -33,7 +33,7 @@ from torchface.modeling.photographs.image_solve import Problem, State, solve, wh
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LinearPoints, Views, chosen_points, linearised
 from torchface.optim import box_qp
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
+from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
@@ -317,7 +317,7 @@ def test_contour_at_seventy_degrees(faces: Faces) -> None:
             heat = render(faces.rig.neutral.with_vertices(truth.rest), camera, heat_colors(away, 5.0), samples=1)
             pair = torch.cat([overlay(fit, 1, blank, truth.landmarks[1])[:, :, 480:], heat], dim=2)
             cells.append(caption(pair, f"head {seed}, {'sliding' if slides else 'vertices'}: {away.mean():.2f} mm"))
-    save_picture(sheet(cells, 2), PICTURES / "seventy_degrees.png")
+    save_rendered_image(sheet(cells, 2), PICTURES / "seventy_degrees.png")
 
 
 def test_real_photographs(faces: Faces, data: Path) -> None:
@@ -348,7 +348,7 @@ def test_real_photographs(faces: Faces, data: Path) -> None:
         )
         cells.append(caption(overlay(fit, 0, image, marks), f"{name}: {off:.2f} pixels, {off / eyes:.1%}"))
     for page in range(0, len(cells), 5):
-        save_picture(sheet(cells[page : page + 5], 1), PICTURES / f"real_{page // 5}.png")
+        save_rendered_image(sheet(cells[page : page + 5], 1), PICTURES / f"real_{page // 5}.png")
     assert float(torch.tensor(shares).median()) < 0.06
     assert max(shares) < 0.12
 

@@ -26,7 +26,7 @@ from torchface.landmarks import (
 )
 from torchface.registration import register
 from torchface.registration.scan_preparation import Landmarks
-from torchface.rendering.compositing import headed, save_picture, sheet
+from torchface.rendering.compositing import headed, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, neutral_head, performer
 from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
 from torchface.synthetic.stages.subdivision import finely_coloured
@@ -97,7 +97,7 @@ def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
     table = {way: {part: float(error[rows].mean()) for part, rows in parts.items()} for way, error in mean.items()}
     for way, row in table.items():
         print(f"{way:16}" + "".join(f"{value:12.2f}" for value in row.values()))
-    save_picture(sheet([heated(template, error, way) for way, error in mean.items()], 1), PICTURE)
+    save_rendered_image(sheet([heated(template, error, way) for way, error in mean.items()], 1), PICTURE)
     for part in ("face", "lids", "lid edges"):
         assert table["twelve"][part] <= table["none"][part] + 0.02
         assert table["twelve, lines"][part] <= table["twelve"][part] + 0.02

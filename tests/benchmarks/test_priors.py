@@ -21,7 +21,7 @@ from torchface.capture.priors.dynamics_training import fitted_kernel
 from torchface.capture.priors.gaussian_process import Evidence, GaussianProcesses, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.onnx import export_model
-from train.prior_pictures import calibration_picture, curves_picture, save_figure
+from train.prior_figures import calibration_picture, curves_picture, save_figure
 from train.prior_trials import filmed, one_step, solve_error
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"

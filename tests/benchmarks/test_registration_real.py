@@ -9,7 +9,7 @@ import pytest
 from torchface.io import load_identity_modes, load_mesh
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.registration import register
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.viz.figures.registration_views import registration_sheet
 
 OUT = Path(__file__).parents[2] / "out" / "registration"
@@ -36,7 +36,7 @@ def test_a_real_scan_with_landmarks_and_without(data: Path, ict_folder: Path) ->
         )
         for kind in (False, True):
             picture = registration_sheet(scan, result, clay=kind, width=400, height=500)
-            save_picture(picture, OUT / f"real_{name}{'_form' * kind}.png")
+            save_rendered_image(picture, OUT / f"real_{name}{'_form' * kind}.png")
         assert float(distance.median()) <= 0.5
         shares.append(result.record.shown)
         print(f"{'':>14}{result.record.figures()}")

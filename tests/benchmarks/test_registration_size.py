@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from torchface.rendering.compositing import from_figure, save_picture
+from torchface.rendering.compositing import from_figure, save_rendered_image
 
 CHILD = """
 import json, resource, sys, time
@@ -82,7 +82,7 @@ def test_time_and_memory_up_to_large_meshes(ict_folder: Path) -> None:
         axes.plot([r["scan"] for r in mine], [r["seconds"] for r in mine], "o-", label=f"{template:,} vertices")
     axes.set(xlabel="vertices of the scan", ylabel="seconds", ylim=(0, None))
     axes.legend(title="template")
-    save_picture(from_figure(figure), Path(__file__).parents[2] / "out" / "registration" / "time.png")
+    save_rendered_image(from_figure(figure), Path(__file__).parents[2] / "out" / "registration" / "time.png")
     plt.close(figure)
     assert max(row["peak"] for row in rows) < 2048
     growth = np.polyfit(np.log([r["scan"] for r in rows[:3]]), np.log([r["seconds"] for r in rows[:3]]), 1)[0]

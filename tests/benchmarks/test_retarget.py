@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface import BlendshapeRig, load_rig, load_take
 from torchface.capture.retargeting import shape_map
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.synthetic import performer
 from torchface.viz.figures.face_views import face_views
 
@@ -73,4 +73,4 @@ def test_one_performance_on_three_rigs(ict_folder: Path, performances: list[Path
             for mesh, frame in zip(posed, frames, strict=True)
         ]
     PICTURES.mkdir(parents=True, exist_ok=True)
-    save_picture(sheet(cells, 3), PICTURES / "rigs.png")
+    save_rendered_image(sheet(cells, 3), PICTURES / "rigs.png")

@@ -23,7 +23,7 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, transfer_with_report
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 
 pytestmark = pytest.mark.real
@@ -165,7 +165,7 @@ def test_lids_and_lips_of_twenty_random_heads(template: BlendshapeRig, ict_folde
             flips[weight].append(sum(flipped(template, rig, lid.blink) for lid in lids))
             if seed in (6, 14):
                 pictures += close_ups(rig, f"head {seed}, {'with' if weight else 'without'}", lids[0], lips)
-    save_picture(sheet(pictures, 5), PICTURES / "contact.png")
+    save_rendered_image(sheet(pictures, 5), PICTURES / "contact.png")
     heading = ["lids, left", "lids, right", *LIP_POSES]
     print(f"\nexcess over the template's gap, mm: 20 heads ({len(lips.upper)} pairs of lip vertices)")
     print(f"{'':28s}{'without contact':>32s}{'with contact':>32s}")

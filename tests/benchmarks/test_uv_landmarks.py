@@ -21,7 +21,7 @@ from torchface.landmarks import (
     uv_landmarks_from_ibug,
 )
 from torchface.landmarks.scans.detector_evaluation import draw_result, error_table, landmark_errors
-from torchface.rendering.compositing import save_picture, sheet
+from torchface.rendering.compositing import save_rendered_image, sheet
 from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
 
 LEARN, TEST = 30, 20
@@ -59,7 +59,7 @@ def test_landmarks_of_scanned_performers(
     each = torch.stack([one.pixels for one in errors]).nanmean(0)
     for name, value in zip(UV_LANDMARK_NAMES, each.tolist(), strict=True):
         print(f"    {name:30}{value:8.2f}")
-    save_picture(sheet(pictures[:6], 3), PICTURES / f"performers_{kind}.png")
+    save_rendered_image(sheet(pictures[:6], 3), PICTURES / f"performers_{kind}.png")
     assert table["mean error, pixels"] <= 8.0
     if line_limit is not None:
         assert max(table[f"{line}, pixels"] for line in ("right_lids", "left_lids", "lips")) <= line_limit
@@ -86,5 +86,5 @@ def test_landmarks_of_a_real_scan(kind: str, data: Path, detectors: dict[str, UV
         UV_LANDMARK_NAMES, errors.millimetres.tolist(), found.confidence.tolist(), strict=True
     ):
         print(f"    {name:24}{value:8.2f} mm, confidence {sure:.3f}")
-    save_picture(draw_result(found, truth), PICTURES / f"real_scan_{kind}.png")
+    save_rendered_image(draw_result(found, truth), PICTURES / f"real_scan_{kind}.png")
     assert mean <= 6.0

@@ -36,7 +36,7 @@ from torchface.io import load_take
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.modeling import transfer_deformation
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_picture, sheet
+from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
@@ -472,7 +472,7 @@ def test_pictures(faces: Faces, learned: Learned) -> None:
         mesh = shot.rig.neutral.with_vertices(truth)
         cells.append(caption(render(mesh, front, samples=2), "truth", 13))
         cells.append(caption(render(mesh, camera, samples=2), "side", 13))
-    save_picture(sheet(cells, 8), PICTURES / "heat.png")
+    save_rendered_image(sheet(cells, 8), PICTURES / "heat.png")
     take = Take(60.0, weights=Track(shot.rig.names, found["default + dynamics"][:, :, None].float()))
     others = [head(faces, 90), head(faces, 91), performer()]
     cells = []
@@ -487,4 +487,4 @@ def test_pictures(faces: Faces, learned: Learned) -> None:
             for yaw in (0, 60):
                 view = look_at(middle, yaw, span=240.0, width=240, height=300)
                 cells.append(caption(render(mesh, view, samples=2), name, 13))
-    save_picture(sheet(cells, 8), PICTURES / "retargeted.png")
+    save_rendered_image(sheet(cells, 8), PICTURES / "retargeted.png")

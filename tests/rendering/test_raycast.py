@@ -10,7 +10,7 @@ from torchface.errors import FileFormatError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import Lighting, render, sample_texture
-from torchface.rendering.compositing import heat_colors, save_picture, sheet
+from torchface.rendering.compositing import heat_colors, save_rendered_image, sheet
 from torchface.rendering.raycast import RayCaster
 
 
@@ -76,7 +76,7 @@ def test_texture_is_sampled_with_its_first_row_on_top() -> None:
 
 def test_pictures_of_other_kinds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"found the ending '.gif', expected .png or .jpg"):
-        save_picture(torch.zeros(3, 4, 4), tmp_path / "a.gif")
+        save_rendered_image(torch.zeros(3, 4, 4), tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 
 

@@ -13,7 +13,7 @@ from torchface import zoo
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train import landmarks as recipe
 from train.landmarks import Faces, Settings, evaluate, load_faces, rendered_faces, train
@@ -34,7 +34,7 @@ def folder(pictures: list[FaceImage], tmp_path_factory: pytest.TempPathFactory) 
     entries = []
     for number, picture in enumerate(pictures):
         name = f"{'more/' if number == 8 else ''}face{number}"
-        save_picture(picture.image.float().expand(3, -1, -1) / 255, path / f"{name}.png")
+        save_rendered_image(picture.image.float().expand(3, -1, -1) / 255, path / f"{name}.png")
         rows = "\n".join(f"{x + 1} {y + 1}" for x, y in picture.landmarks.tolist())
         (path / f"{name}.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
         parts = "".join(
@@ -68,7 +68,7 @@ def test_large_pictures_are_made_smaller_with_their_landmarks(folder: Path, tmp_
     image = torch.zeros(3, 1500, 1500)
     points = torch.stack([200 + 15.0 * (torch.arange(68) % 9), 300 + 120.0 * (torch.arange(68) // 9)], dim=1)
     image[:, points[40, 1].long(), points[40, 0].long()] = 1.0  # one white pixel
-    save_picture(image, tmp_path / "large.png")
+    save_rendered_image(image, tmp_path / "large.png")
     rows = "\n".join(f"{x + 1} {y + 1}" for x, y in points.tolist())
     (tmp_path / "large.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
     faces = load_faces(tmp_path)

@@ -28,13 +28,13 @@ def annotate(
     """Correct the landmarks of a few frames of a video by hand, in the browser, for an appearance model to learn from.
 
     The video is tracked, and frames are proposed that span what the face does in it. On the page every landmark can be
-    dragged; Save writes the frame as a picture and iBUG's .pts beside it into OUT and turns to the next. Started again,
+    dragged; Save writes the frame as an image and iBUG's .pts beside it into OUT and turns to the next. Started again,
     it goes on where it was. Then: python -m train.appearance --data OUT --out models/NAME. The page is at 127.0.0.1 and
     no other machine can open it; it needs the extra: pip install '.[viewer]' in a checkout.
 
     Args:
         video: A video of the actor, extreme faces among what it shows.
-        out: The folder for pictures and .pts files.
+        out: The folder for images and .pts files.
         landmarks: The model that finds landmarks to start from, of the zoo by name or its folder.
         count: How many frames.
         face: Which face, from 0, the largest first, where there are several.

@@ -34,7 +34,7 @@ def evaluate(
     (.safetensors), a mesh, or a folder of meshes, a frame each; both of one topology. Or the truth is raw scans
     (--scans), which are registered first; killed and started again, what is registered is kept.
 
-    Writes OUT/index.html with its pictures, OUT/regions.csv, frames.csv, shapes.csv where both have weights, and
+    Writes OUT/index.html with its images, OUT/regions.csv, frames.csv, shapes.csv where both have weights, and
     summary.json.
 
     Args:

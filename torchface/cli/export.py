@@ -118,7 +118,7 @@ def video_solver(
 
     Inputs of the graph: `landmarks` (68,2), pixels, NaN where not seen, `confidence` (68,), and what the frame before
     gave, `previous_` and its name; all NaN for the first frame. Outputs: `weights` (N,), `rotation` (3,3),
-    `translation` (3,), millimetres, and with a dynamics prior `window`, `mean` and `covariance`. Pixels are of pictures
+    `translation` (3,), millimetres, and with a dynamics prior `window`, `mean` and `covariance`. Pixels are of images
     without distortion. ONNX Runtime is compared with PyTorch, and the graph with the exact solve over a video. The
     settings are those of `torchface track`, and in the file's metadata.
 

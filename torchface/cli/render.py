@@ -1,4 +1,4 @@
-"""``torchface render``: pictures of a mesh or a rig in a pose."""
+"""``torchface render``: images of a mesh or a rig in a pose."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def render(
     part: str | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a mesh or rig from several sides into one picture, by ray casting; no graphics driver is needed.
+    """Render a mesh or rig from several sides into one image, by ray casting; no graphics driver is needed.
 
     Args:
         path: A mesh or rig: .glb, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
@@ -31,12 +31,12 @@ def render(
         take: Pose of a rig from a weight take instead.
         frame: Which frame of the take.
         yaw: Directions to look from, degrees; 0 is the front, 90 the viewer's right.
-        height: Of the picture, pixels.
+        height: Of the image, pixels.
         clay: Leave texture and vertex colours out.
         part: Keep this region only, such as face.
         quiet: Show no progress.
     """
-    from torchface.rendering.compositing import save_picture
+    from torchface.rendering.compositing import save_rendered_image
     from torchface.viz.figures.face_views import clay_colors, face_views
     from torchface.workflows.posed_mesh import load_posed, pose_weights
 
@@ -45,6 +45,6 @@ def render(
         posed = load_posed(path, pose_weights(weights), take, frame, part)
         progress("rendering")
         colors = clay_colors(posed.mesh) if clay else None
-        picture = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
-        save_picture(picture, out)
+        image = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
+        save_rendered_image(image, out)
     print(out)

@@ -29,7 +29,7 @@ def rig(
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
 
-    A picture beside it, NAME_registration.png, shows how the neutral scan was met: distances (blue 0 to red 1 mm,
+    An image beside it, NAME_registration.png, shows how the neutral scan was met: distances (blue 0 to red 1 mm,
     grey where the scan shows no skin) and the mesh's lines. Hair, cloth and ears in pieces are taken from the template.
 
     The neutral scan gives the actor's face in the template's topology, deformation transfer its shapes. Scans of

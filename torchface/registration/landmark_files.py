@@ -36,7 +36,7 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
         unit: of the scan's file, where it is another.
 
     Raises:
-        FileFormatError: a broken file, or points in a picture.
+        FileFormatError: a broken file, or points in an image.
         TopologyError: correspondences of another template.
         ValueRangeError: points only, and a template without annotated landmarks.
         ShapeError: another number of points than the template has landmarks.
@@ -48,7 +48,7 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
         return pairs.vertices, pairs.points
     found = load_landmark_points(path)
     if found.points.shape[1] != 3:
-        raise FileFormatError(f"{path}: found points in a picture, two numbers each; expected places on the scan")
+        raise FileFormatError(f"{path}: found points in an image, two numbers each; expected places on the scan")
     if template.annotations is None or template.annotations.landmarks is None:
         raise ValueRangeError(
             f"{path}: found points without vertices and a template without annotated landmarks; expected "

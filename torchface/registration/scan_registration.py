@@ -292,7 +292,7 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
         notes.append(f"{folded} triangles of the result are turned over")
     if not has_colors(scan):
         notes.append(
-            "the scan has neither a texture with coordinates nor vertex colours (is the picture that its material "
+            "the scan has neither a texture with coordinates nor vertex colours (is the image that its material "
             "names beside it?); the result has no colours"
         )
     elif template.uvs is None and texture_size:

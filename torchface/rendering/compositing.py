@@ -71,7 +71,7 @@ def from_figure(figure: Figure) -> Tensor:
     return torch.from_numpy(np.asarray(canvas.buffer_rgba())[..., :3].copy()).permute(2, 0, 1).float() / 255
 
 
-def save_picture(image: Tensor, path: str | Path) -> None:
+def save_rendered_image(image: Tensor, path: str | Path) -> None:
     """Writes (3,H,W) as PNG or JPEG by the path's ending; the file appears only when it is complete.
 
     Raises:

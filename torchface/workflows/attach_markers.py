@@ -18,7 +18,7 @@ from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import save_picture, sheet
+from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.figures.site_views import errors_by_iteration, site_views
@@ -184,5 +184,7 @@ def attach(
     make_folder(out.parent)
     fit.attachment.save(out)
     if picture is not None:
-        save_picture(sheet([site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)], 1), picture)
+        save_rendered_image(
+            sheet([site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)], 1), picture
+        )
     return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))

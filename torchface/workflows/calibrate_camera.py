@@ -19,7 +19,7 @@ from torchface.io.camera_files import save_calibration
 from torchface.io.images.image_files import load_image
 from torchface.io.video import open_video
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 
 _VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
 _MIN_VIEWS, _MAX_FRAMES = 5, 60
@@ -144,7 +144,9 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     progress("writing the calibration and the overlay")
     overlay_path = out.with_suffix(".png")
     save_calibration(report.calibration, out)
-    save_picture(overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path)
+    save_rendered_image(
+        overlay([view for view in views if view.name in report.used], report.calibration, board), overlay_path
+    )
     return replace(report, overlay_path=overlay_path)
 
 

@@ -20,7 +20,7 @@ from torchface.progress import Progress, silent
 from torchface.registration.corpus.register_corpus import CorpusReport, register_corpus
 from torchface.registration.corpus.scan_record import CorpusEntry, read_distances
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.viz.figures.face_views import frame_face
 from torchface.viz.figures.heat_maps import error_colors
 from torchface.viz.figures.wireframe import lines_on_clay
@@ -91,7 +91,7 @@ def register_scans(
         texture_size=texture_size,
     )
     picture = contact_sheet(report, mesh, progress)
-    save_picture(picture, report.out / CONTACT_SHEET)
+    save_rendered_image(picture, report.out / CONTACT_SHEET)
     if not report.registered:
         raise AlignmentError(
             f"{out}: none of {len(report.entries)} scans could be registered, see {report.summary.name}; the first, "

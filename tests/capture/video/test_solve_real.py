@@ -13,7 +13,7 @@ from torchface.io import load_rig, load_take, save_animation
 from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_picture, sheet
+from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
@@ -61,4 +61,4 @@ def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performa
         low, high = landmarks[t].amin(0).long() - 60, landmarks[t].amax(0).long() + 60
         cut = picture[:, max(int(low[1]), 0) : int(high[1]), max(int(low[0]), 0) : int(high[0])]
         cells.append(caption(cut, f"frame {t}"))
-    save_picture(sheet(cells, 4), pictures / "openface.png")
+    save_rendered_image(sheet(cells, 4), pictures / "openface.png")

@@ -111,7 +111,7 @@ class FacePoints:
             return rows
         image = self.at(weights) @ (intrinsics @ rotation).transpose(-1, -2) + (translation @ intrinsics.T)[:, None]
         pixels = (image[..., :2] / image[..., 2:])[:, self.rows]
-        # The picture's direction at right angles to the face's vertical, toward its positive x.
+        # The image's direction at right angles to the face's vertical, toward its positive x.
         across = torch.stack([-rotation[:, 1, 1], rotation[:, 0, 1]], dim=-1)
         across = torch.where((across * rotation[:, :2, 0]).sum(-1, keepdim=True) < 0, -across, across)
         best = outermost(pixels, self.valid, across[:, None] * self.side[:, None])

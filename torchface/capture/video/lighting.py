@@ -88,7 +88,7 @@ def estimate_light(
             answer: that is refused.
         camera: one, or one a frame.
         weights: how much each vertex counts, (V,); 0 leaves out eyes or hair. Equal if absent.
-        calibration: of a lens that bends the picture; none if absent.
+        calibration: of a lens that bends the image; none if absent.
 
     Returns:
         See :class:`LightFit`. Where the frames show no lamp, its strength is 0.
@@ -104,10 +104,10 @@ def estimate_light(
     cameras = [camera] * len(frames) if isinstance(camera, Camera) else list(camera)
     count = torch.ones(albedo.shape[:1], dtype=torch.float64) if weights is None else weights.detach().cpu().double()
     _check(frames, posed, faces, albedo, cameras, count)
-    pictures = frames.detach().cpu()
-    pictures = pictures.float() / 255 if pictures.dtype == torch.uint8 else pictures.float()
+    images = frames.detach().cpu()
+    images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
     seen = seen_skin(
-        pictures, posed.detach().cpu(), faces.cpu(), albedo.detach().cpu().float(), cameras, count, calibration
+        images, posed.detach().cpu(), faces.cpu(), albedo.detach().cpu().float(), cameras, count, calibration
     )
     return _result(seen, find_lamp(seen), len(frames), len(albedo))
 

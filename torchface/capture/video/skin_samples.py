@@ -99,7 +99,7 @@ def seen_skin(
         albedo: (V,3) sRGB.
         cameras: one a frame.
         weights: of the vertices, (V,); 0 leaves one out.
-        calibration: of a lens that bends the picture.
+        calibration: of a lens that bends the image.
 
     Raises:
         AlignmentError: too few are to be seen.
@@ -130,7 +130,7 @@ def seen_skin(
 def _check_seen(colors: Tensor, albedo: Tensor, count: int) -> None:
     if len(colors) < FEWEST:
         raise AlignmentError(
-            f"estimate_light: found {len(colors)} of {count} vertices in the picture, seen squarely and not blown out, "
+            f"estimate_light: found {len(colors)} of {count} vertices in the image, seen squarely and not blown out, "
             f"expected at least {FEWEST}; is the face in the frame?"
         )
     if float(colors.amax(-1).quantile(0.95)) < _BLACK:

@@ -63,7 +63,7 @@ class VideoSettings:
 
     @classmethod
     def of_found_landmarks(cls, remembers: bool = False, refined: bool = False) -> VideoSettings:
-        """For landmarks that a model has found in pictures, as ``torchface track`` solves them.
+        """For landmarks that a model has found in images, as ``torchface track`` solves them.
 
         Models of landmarks err alike in frames that look alike. A dynamics prior takes each frame's errors for new
         ones: it would soon be sure of what they have in common, so with one the noise is reckoned larger and the prior

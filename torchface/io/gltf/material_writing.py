@@ -1,4 +1,4 @@
-"""Materials and pictures of a head's primitives."""
+"""Materials and images of a head's primitives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class MaterialWriter:
 
     Args:
         mesh: on the CPU.
-        buffers: where pictures go.
+        buffers: where images go.
     """
 
     def __init__(self, mesh: Mesh, buffers: BufferWriter) -> None:

@@ -16,7 +16,7 @@ class PartMaterial:
         color: sRGB in [0,1].
         roughness: 0 a mirror, 1 chalk.
         opacity: of the whole part, in [0,1].
-        alpha: glTF's mode: "OPAQUE"; "MASK", with holes where its picture has no opacity; "BLEND", clear.
+        alpha: glTF's mode: "OPAQUE"; "MASK", with holes where its image has no opacity; "BLEND", clear.
     """
 
     name: str

@@ -213,10 +213,10 @@ class AppearanceModel(nn.Module):
         before, after = initial.new_full((2, len(initial)), torch.inf)
         seen = torch.isfinite(initial).flatten(1).all(1) & (initial.flatten(1).std(1) > 0)
         if seen.any():
-            pictures, points = grey[seen], initial[seen].to(self.mean_shape)
+            crops, points = grey[seen], initial[seen].to(self.mean_shape)
             first = points
             for level in self.levels:
-                crop = self.crop(pictures, points, float(level.scale))
+                crop = self.crop(crops, points, float(level.scale))
                 points = crop.pose.apply(self._refine_level(level, crop, crop.pose.undo(points)))
             # Both in the last crop: what is compared has been seen alike, and was computed once.
             before[seen] = self._error_in(crop, first).to(initial)
@@ -245,12 +245,12 @@ class AppearanceModel(nn.Module):
         width, height = ((high - low) * resolution).ceil().long().tolist()
         # Several samples a pixel where the image is finer than the crop: skipping pixels would alias.
         samples = pose.scale.round().long().clamp(1, _MAX_SAMPLES)
-        pictures = images.new_empty(len(images), 1, height, width)
+        crops = images.new_empty(len(images), 1, height, width)
         for count in samples.unique().tolist():
             rows = samples == count
             some = PlanarPose(pose.rotation[rows], pose.translation[rows])
-            pictures[rows] = _cut_out(images[rows], some, (width, height), count)
-        return FaceCrop(dense_features(pictures, self.settings.features), pose)
+            crops[rows] = _cut_out(images[rows], some, (width, height), count)
+        return FaceCrop(dense_features(crops, self.settings.features), pose)
 
     def _error_in(self, crop: FaceCrop, landmarks: Tensor) -> Tensor:
         level = self.levels[-1]

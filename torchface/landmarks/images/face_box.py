@@ -150,7 +150,7 @@ class YuNetDetector:
 
     def __call__(self, image: Tensor) -> FaceBoxes:
         pixels = image if image.ndim == 3 else image.expand(3, *image.shape[-2:])
-        _check_picture(pixels)
+        _check_image(pixels)
         colors = np.ascontiguousarray(pixels.flip(0).permute(1, 2, 0).cpu().numpy())
         height, width = colors.shape[:2]
         scale = min(1.0, self.longest / max(height, width))
@@ -185,7 +185,7 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
     Raises:
         ShapeError: no such image.
     """
-    _check_picture(image)
+    _check_image(image)
     return (detector or HaarDetector(profiles="always"))(image)
 
 
@@ -222,7 +222,7 @@ def overlaps(first: Tensor, second: Tensor) -> Tensor:
 
 def grey_pixels(image: Tensor) -> np.ndarray:
     """An image's grey values, uint8 (H,W), as OpenCV weighs colours."""
-    _check_picture(image)
+    _check_image(image)
     if image.ndim == 2:
         return image.cpu().numpy()
     return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
@@ -234,7 +234,7 @@ def sorted_boxes(boxes: Tensor, scores: Tensor) -> FaceBoxes:
     return FaceBoxes(boxes[order], scores[order])
 
 
-def _check_picture(image: Tensor) -> None:
+def _check_image(image: Tensor) -> None:
     if image.dtype != torch.uint8 or not (image.ndim == 2 or (image.ndim == 3 and len(image) == 3)) or 0 in image.shape:
         raise ShapeError(f"image: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W) or (3,H,W)")
 

@@ -102,9 +102,9 @@ def consensus(
     seen = torch.from_numpy(resized)[None, None].to(trees.mean) / 255
     middle = ((box[:2] + box[2:] / 2).to(trees.mean) + 0.5 - corner.to(trees.mean)) * scale.to(trees.mean) - 0.5
     starts = _starts(trees.mean, middle, settings, tilt)
-    pictures = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (seen, seen.flip(-1))])
+    mirrored_pair = torch.cat([one.expand(len(starts), -1, -1, -1) for one in (seen, seen.flip(-1))])
     last = seen.shape[-1] - 1
-    found = trees.refine(pictures, torch.cat([starts, _mirrored(starts, last)]))
+    found = trees.refine(mirrored_pair, torch.cat([starts, _mirrored(starts, last)]))
     found = torch.cat([found[: len(starts)], _mirrored(found[len(starts) :], last)])
     found = (found + 0.5) / scale.to(found) + corner.to(found) - 0.5
     median = found.median(0).values

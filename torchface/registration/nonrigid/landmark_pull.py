@@ -22,7 +22,7 @@ class LandmarkPull:
         vertices: (L,) int64.
         points: (L,3) float64.
         contour: which of them outline the jaw, (L,) bool: annotators set these along the outline that they see, in
-            a picture or from a side, and not at a place of the skin.
+            an image or from a side, and not at a place of the skin.
     """
 
     vertices: Tensor

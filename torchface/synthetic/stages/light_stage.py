@@ -116,7 +116,7 @@ def render_lit_video(
     def images() -> Iterator[Tensor]:
         for t, camera in enumerate(cameras):  # an image at a time: each has a surface of its own
             mesh = rig.neutral.with_vertices(rig(weights[t : t + 1])[0])
-            linear = lit_picture(mesh, camera, light, settings)
+            linear = lit_image(mesh, camera, light, settings)
             noise = settings.noise * linear.sqrt() * torch.randn(linear.shape, generator=generator)
             yield (to_srgb((linear + noise).clamp(0, 1)) * 255).round().to(torch.uint8)[None]
             progress("rendering the video", t + 1, len(cameras))
@@ -151,7 +151,7 @@ def turning_cameras(
     return tuple(cameras)
 
 
-def lit_picture(mesh: Mesh, camera: Camera, light: PointLight, settings: LightStageSettings) -> Tensor:
+def lit_image(mesh: Mesh, camera: Camera, light: PointLight, settings: LightStageSettings) -> Tensor:
     """What the camera sees of a mesh with skin, linear light, (3,H,W): Lambert, Blinn's gloss, cast shadows.
 
     Raises:

@@ -10,7 +10,7 @@ from pathlib import Path
 from torch import Tensor
 
 from torchface.files.whole_files import make_folder, write_file
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222 }
@@ -37,17 +37,17 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading, a paragraph, ready-made HTML, then tables and pictures (3,H,W) by file name, in this order."""
+    """A heading, a paragraph, ready-made HTML, then tables and figures (3,H,W) by file name, in this order."""
 
     title: str
     text: str = ""
     tables: Sequence[Table] = ()
-    pictures: Sequence[tuple[str, Tensor]] = ()
+    figures: Sequence[tuple[str, Tensor]] = ()
     markup: str = ""
 
 
 def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
-    """Writes ``index.html`` and its pictures into a folder; the page appears last, complete.
+    """Writes ``index.html`` and its figures into a folder; the page appears last, complete.
 
     Returns:
         The page's path.
@@ -63,9 +63,9 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
             parts.append(f"<p>{html.escape(section.text)}</p>\n")
         parts.append(section.markup)
         parts.extend(_table(table) for table in section.tables)
-        for name, picture in section.pictures:
-            save_picture(picture, folder / name)
-            size = f'width="{picture.shape[2]}" height="{picture.shape[1]}"'
+        for name, figure in section.figures:
+            save_rendered_image(figure, folder / name)
+            size = f'width="{figure.shape[2]}" height="{figure.shape[1]}"'
             parts.append(f'<img src="{html.escape(name)}" alt="{html.escape(section.title)}" {size}>\n')
     page = folder / "index.html"
     write_file(page, "".join(parts).encode())

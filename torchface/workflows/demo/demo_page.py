@@ -128,7 +128,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         Section(
             "One frame",
             "The true and the solved face, and the distance between them. No marker tells where eyes look.",
-            pictures=[("frame_1.png", frame_figure)],
+            figures=[("frame_1.png", frame_figure)],
         ),
         Section(
             "How close it came",
@@ -142,18 +142,18 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         Section(
             "Curves",
             f"{_CURVE_SECONDS:g} s of the {len(active)} most active shapes that the markers tell apart.",
-            pictures=[("curves.png", curves)],
+            figures=[("curves.png", curves)],
         ),
         Section(
             "Markers",
             _layout_text(result),
             [Table(("the markers", "shapes"), _seen_rows(result))],
-            _layout_pictures(result),
+            _layout_figures(result),
         ),
         Section(
             "Markers against the solved face",
             f"Their distance; noise alone makes {(3**0.5) * FLAWS.noise:.2f} mm.",
-            pictures=[
+            figures=[
                 ("markers.png", marker_views(markers.values[shown], on_mesh, f"frame {shown},")),
                 ("marker_rmse.png", error_curve(solved.marker_rmse, scene.fps)),
             ],
@@ -161,12 +161,12 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
         Section(
             "The rig",
             "Above the template, below the same shapes transferred to the new head.",
-            pictures=[("rig.png", rig_figure)],
+            figures=[("rig.png", rig_figure)],
         ),
         Section(
             "Error of each shape",
             "Of the shapes that the markers tell apart.",
-            pictures=[
+            figures=[
                 (
                     "weight_error.png",
                     named_bars(solved.weight_error.mean[distinct], [names[i] for i in distinct], "mean absolute error"),
@@ -215,7 +215,7 @@ def _layout_text(result: DemoResult) -> str:
     return "Set by muscles, as a make-up artist sets them for facial action coding; attachment.json has their names."
 
 
-def _layout_pictures(result: DemoResult) -> list[tuple[str, Tensor]]:
+def _layout_figures(result: DemoResult) -> list[tuple[str, Tensor]]:
     points = result.attachment.on(result.scene.head.faces, result.scene.truth.vertices)
     regions = ("markers",) * len(points) if result.layout is None else result.layout.regions
     return [("layout.png", marker_regions(result.scene.head, points, regions))]

@@ -35,11 +35,11 @@ def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) 
     ]
     text = "Distances from vertex to true vertex, millimetres; the total is the sum over a frame's vertices."
     sections.append(Section("By region", text, [Table(heading, rows)]))
-    sections.append(Section("Heat maps", _scale_text(evaluation), pictures=_heat_maps(evaluation, height)))
+    sections.append(Section("Heat maps", _scale_text(evaluation), figures=_heat_maps(evaluation, height)))
     if len(evaluation.frames) > 1:
         curve = error_curve(evaluation.frame_mean, evaluation.fps or _RATE, "mean error (mm)")
         text = "" if evaluation.fps else f"No frame rate is known; {_RATE:g} a second are assumed."
-        sections.append(Section("Error over time", text, pictures=[("frames.png", curve)]))
+        sections.append(Section("Error over time", text, figures=[("frames.png", curve)]))
     if evaluation.aligned and evaluation.rotation is not None and evaluation.translation is not None:
         rotation, translation = evaluation.rotation, evaluation.translation
         sections.append(
@@ -64,13 +64,13 @@ def _heat_maps(evaluation: Evaluation, height: int) -> list[tuple[str, Tensor]]:
     maximum = evaluation.maximum
     compared = int(torch.isfinite(evaluation.frame_mean).sum())
     title = f"mean over {compared} frames"
-    pictures = []
+    figures = []
     if len(evaluation.frames) > 1:
-        pictures.append(("heat_mean.png", error_views(evaluation.mesh, evaluation.vertex_mean, maximum, title, height)))
+        figures.append(("heat_mean.png", error_views(evaluation.mesh, evaluation.vertex_mean, maximum, title, height)))
     for shown in evaluation.shown:
         name = f"heat_frame_{shown.frame}.png"
-        pictures.append((name, _one_frame(evaluation, shown, height)))
-    return pictures
+        figures.append((name, _one_frame(evaluation, shown, height)))
+    return figures
 
 
 def _one_frame(evaluation: Evaluation, shown: Compared, height: int) -> Tensor:

@@ -16,7 +16,7 @@ from torchface.io.landmarks.landmark_points import save_pts
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
@@ -157,7 +157,7 @@ def fit_photographs(
     save_rig(renamed(transferred.rig, names), out)
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
-        save_picture(overlay(fit, i, image, marks[i]), path)
+        save_rendered_image(overlay(fit, i, image, marks[i]), path)
     for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
         calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
         save_calibration(calibration, path.with_suffix(".toml"))

@@ -34,7 +34,7 @@ from torchface.modeling.rigging.scanned_examples import seen_example
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
@@ -195,7 +195,7 @@ def rig_actor(
     save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
     progress("drawing the registration")
     figure = out.with_name(f"{out.stem}{FIGURE_ENDING}")
-    save_picture(registration_sheet(load_mesh(scan, options.unit), registration), figure)
+    save_rendered_image(registration_sheet(load_mesh(scan, options.unit), registration), figure)
     names = {label: baked for label, (_, baked) in maps.items()}
     return ActorReport(
         actor,

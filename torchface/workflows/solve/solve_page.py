@@ -59,7 +59,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
         Section(
             "The performance",
             "The solved face with the markers as the solve used them, coloured by their distance from their sites.",
-            pictures=[("frames.png", _strip(rig, weights))],
+            figures=[("frames.png", _strip(rig, weights))],
             markup=_player(folder, rig, solution, weights, errors, take.fps),
         ),
         Section("What was done", done),
@@ -72,15 +72,15 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
     if report.motion is not None:
         curves = motion_curves(report.motion.translation, report.motion.degrees(), take.fps)
         text = "How the helmet moved against the head, in rig space; none of it is in the weights."
-        sections.append(Section("Helmet", text, pictures=[("helmet.png", curves)]))
+        sections.append(Section("Helmet", text, figures=[("helmet.png", curves)]))
     order = weights.amax(0).argsort(descending=True).tolist()
-    pictures = []
+    figures = []
     for number, first in enumerate(range(0, len(order), _CURVES_A_FIGURE)):
         rows_of_page = order[first : first + _CURVES_A_FIGURE]
         part = weights[:, rows_of_page]
         label = [names[i] for i in rows_of_page]
-        pictures.append((f"weights{number + 1}.png", weight_curves(part, None, label, take.fps, len(label))))
-    sections.append(Section("Weights", "Every shape's curve, the strongest first.", pictures=pictures))
+        figures.append((f"weights{number + 1}.png", weight_curves(part, None, label, take.fps, len(label))))
+    sections.append(Section("Weights", "Every shape's curve, the strongest first.", figures=figures))
     return write_page(folder, f"Solve of {title}", sections)
 
 
@@ -144,7 +144,7 @@ def _marker_sections(
     ]
     heading = ("marker", "RMSE", "constant part", "95th percentile", "seen")
     points = solution.attachment.on(rig.neutral.faces, rig.vertices)
-    picture = marker_map(rig.neutral, points, each, round_maximum(1.5 * float(each.nanmedian())), labels)
+    figure = marker_map(rig.neutral, points, each, round_maximum(1.5 * float(each.nanmedian())), labels)
     text = (
         "Worst first. A constant part that makes up most of an error speaks of a site that is wrong (see torchface "
         "attach), the rest of noise, swaps and shapes that the rig lacks."
@@ -153,8 +153,8 @@ def _marker_sections(
     if len(rows) > _WORST_MARKERS:
         tables.append(Table(heading, rows[_WORST_MARKERS:], f"the other {len(rows) - _WORST_MARKERS} markers"))
     return [
-        Section("Error of each marker", text, tables, [("marker_map.png", picture)]),
-        Section("Marker error over time", pictures=[("error.png", error_curve(rmse, fps))]),
+        Section("Error of each marker", text, tables, [("marker_map.png", figure)]),
+        Section("Marker error over time", figures=[("error.png", error_curve(rmse, fps))]),
     ]
 
 

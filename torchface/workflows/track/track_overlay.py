@@ -40,7 +40,7 @@ def write_overlay(tracked: Tracked, path: Path, texture: Path | None, progress: 
     Args:
         tracked: what was solved.
         path: of the video to write.
-        texture: a picture to put on the face; without, the mesh is shown and the landmarks on it.
+        texture: an image to put on the face; without, the mesh is shown and the landmarks on it.
         progress: told each step and how far it is.
     """
     progress = progress or silent
@@ -66,10 +66,10 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     def draw(t: int, frame: Tensor) -> Tensor:
         if not tracked.seen[t]:
             return frame
-        picture = undistorted(frame, tracked.calibration)
+        straight = undistorted(frame, tracked.calibration)
         vertices = rig(weights[t : t + 1])[0].double()
         camera = camera_at(tracked, t)
-        shaded = shade_over(picture, vertices, rig.neutral.faces, camera)
+        shaded = shade_over(straight, vertices, rig.neutral.faces, camera)
         here = weights[t : t + 1].double()
         rows = points.chosen(here, camera.rotation[None], camera.translation[None], camera.intrinsics)[0]
         return with_dots(shaded, tracked.pinhole[t], camera.project(points.at(here)[0, rows]))
@@ -124,8 +124,8 @@ def video_light(tracked: Tracked) -> PointLight:
     skin[rig.neutral.faces[skin_faces(rig.neutral)].flatten()] = 1.0
     vertices = rig(tracked.solution.weights.detach()[wanted].to(rig.deltas))
     cameras = [camera_at(tracked, t) for t in wanted]
-    picture = torch.stack(frames)
-    fit = estimate_light(picture, vertices, rig.neutral.faces, albedo, cameras, skin, tracked.calibration)
+    image = torch.stack(frames)
+    fit = estimate_light(image, vertices, rig.neutral.faces, albedo, cameras, skin, tracked.calibration)
     return fit.light
 
 
@@ -145,8 +145,8 @@ def undistorted(frame: Tensor, calibration: CameraCalibration) -> Tensor:
     """What a camera without distortion would have seen, uint8 (3,H,W)."""
     if not calibration.distortion.any():
         return frame
-    picture = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
-    straight = cv2.undistort(picture, calibration.intrinsics.numpy(), calibration.distortion.numpy())
+    image = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
+    straight = cv2.undistort(image, calibration.intrinsics.numpy(), calibration.distortion.numpy())
     return torch.from_numpy(straight).permute(2, 0, 1)
 
 
@@ -162,7 +162,7 @@ def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -
     x0, y0, x1, y1 = low[0], low[1], min(high[0], width), min(high[1], height)
     if x1 - x0 < 2 or y1 - y0 < 2:
         return frame
-    # Large pictures are drawn at a part of their resolution: rays cost, and the mesh is shown half through anyway.
+    # Large images are drawn at a part of their resolution: rays cost, and the mesh is shown half through anyway.
     step = max(1, -(-max(x1 - x0, y1 - y0) // _MAX_SIDE))
     part = _part_of(camera, x0, y0, x1, y1, step)
     origins, ways = part.rays()
@@ -179,16 +179,16 @@ def shade_over(frame: Tensor, vertices: Tensor, faces: Tensor, camera: Camera) -
     if step > 1:
         layer = torch.nn.functional.interpolate(layer, scale_factor=step, mode="bilinear", align_corners=False)
     layer = layer[0, :, : y1 - y0, : x1 - x0]
-    picture = frame.float() / 255
-    under = picture[:, y0 : y0 + layer.shape[1], x0 : x0 + layer.shape[2]]
+    image = frame.float() / 255
+    under = image[:, y0 : y0 + layer.shape[1], x0 : x0 + layer.shape[2]]
     strength = layer[3:]
     colors = layer[:3] / (strength / _STRENGTH).clamp(min=1e-6)
     under.copy_(under * (1 - strength) + colors * strength)
-    return (255 * picture.clamp(0, 1)).round().to(torch.uint8)
+    return (255 * image.clamp(0, 1)).round().to(torch.uint8)
 
 
 def _part_of(camera: Camera, x0: int, y0: int, x1: int, y1: int, step: int) -> Camera:
-    """A camera that sees a part of the picture at a part of its resolution."""
+    """A camera that sees a part of the image at a part of its resolution."""
     scale = torch.tensor([1 / step, 1 / step, 1.0], dtype=torch.float64)
     shifted = camera.intrinsics.double().clone()
     shifted[:2, 2] -= torch.tensor([x0, y0], dtype=torch.float64)

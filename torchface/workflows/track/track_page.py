@@ -42,19 +42,19 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
         Section(
             "Frames",
             "The solved face over the video; found landmarks are green, those of the solved rig red.",
-            pictures=[("frames.png", frames_sheet(tracked, mesh_drawer(tracked)))],
+            figures=[("frames.png", frames_sheet(tracked, mesh_drawer(tracked)))],
         ),
         Section(
             "Reprojection error",
             "Root mean square distance from the landmarks found to those of the solved rig, a frame; gaps are frames "
             "without a face.",
-            pictures=[("error.png", error_curve(solution.errors.detach(), fps, "error (px)"))],
+            figures=[("error.png", error_curve(solution.errors.detach(), fps, "error (px)"))],
         ),
     ]
     if texture is not None:
         painted = ("painted.png", frames_sheet(tracked, paint_drawer(tracked, texture)))
         text = f"{texture.name} on the face, in the light of the video."
-        sections.insert(3, Section("Texture", text, pictures=[painted]))
+        sections.insert(3, Section("Texture", text, figures=[painted]))
     angles = torch.rad2deg(head_angles(solution.rotation.detach().double()))
     moved = solution.translation.detach().double()
     still = moved - moved.mean(0)
@@ -64,15 +64,15 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
         "Where the head is before the camera, about its mean place (x right, y down, z away from the camera), and how "
         "it is rotated: pitch about x, yaw about y, roll about z."
     )
-    sections.append(Section("Head", text, pictures=[("head.png", head)]))
+    sections.append(Section("Head", text, figures=[("head.png", head)]))
     weights, names = solution.weights.detach(), tracked.rig.names
     order = weights.amax(0).argsort(descending=True).tolist()
-    pictures = []
+    curves = []
     for number, first in enumerate(range(0, len(order), _CURVES_A_PICTURE)):
         rows = order[first : first + _CURVES_A_PICTURE]
         curve = weight_curves(weights[:, rows], None, [names[i] for i in rows], fps, len(rows))
-        pictures.append((f"weights{number + 1}.png", curve))
-    sections.append(Section("Weights", "Every shape's curve, the strongest first.", [_bounds(tracked)], pictures))
+        curves.append((f"weights{number + 1}.png", curve))
+    sections.append(Section("Weights", "Every shape's curve, the strongest first.", [_bounds(tracked)], curves))
     return write_page(out, f"Tracking of {tracked.video.path.name}", sections)
 
 

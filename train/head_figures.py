@@ -12,7 +12,7 @@ from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.model_quality import ModelQuality
 from torchface.progress import Progress
-from torchface.rendering.compositing import save_picture
+from torchface.rendering.compositing import save_rendered_image
 from torchface.viz.figures.model_figures import (
     color_modes_figure,
     extrapolation_figure,
@@ -64,4 +64,4 @@ def draw(
         pictures["quality"] = lambda: quality_figure(quality)
     for number, (name, picture) in enumerate(pictures.items()):
         progress("drawing pictures", number, len(pictures))
-        save_picture(picture(), folder / f"{name}.png")
+        save_rendered_image(picture(), folder / f"{name}.png")
