@@ -161,8 +161,8 @@ def settle(neutral: Tensor, expression: Tensor) -> Tensor:
     """An expression (V,3) moved onto its neutral by what stays: far-off vertices lose their say, round by round."""
     moved = expression
     for half in _HALF:
-        away = (moved - neutral).norm(dim=-1)
-        weights = 1 / (1 + (away / half) ** 2) ** 2
+        distance = (moved - neutral).norm(dim=-1)
+        weights = 1 / (1 + (distance / half) ** 2) ** 2
         pose = similarity_transform(expression[None], neutral[None], weights[None], scale=False)
         moved = pose.apply(expression[None])[0]
     return expression if float((moved - expression).norm(dim=-1).max()) < _NOTHING else moved

@@ -108,7 +108,7 @@ def compare(
         fit: learns from those who are left.
         template: whose shapes are transferred; the mean of those who are left, if absent.
         keep: for how many people, the first, predictions are kept for pictures.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Source: thesis 3.3.4, table 1.
     """
@@ -144,10 +144,10 @@ def picture(people: People, comparison: Comparison, expression: int = 0) -> Tens
         neutral = people.template.with_vertices(people.neutrals[i])
         camera = frame_face(neutral, 20.0, width=300, height=360)
         for method, offsets in zip(METHODS, predictions[:, expression], strict=True):
-            away = (offsets - people.offsets[i, expression]).norm(dim=-1)
+            residual = (offsets - people.offsets[i, expression]).norm(dim=-1)
             face = neutral.with_vertices(neutral.vertices + offsets)
-            shown = render(face, camera, heat_colors(away, worst), samples=2)
-            rows.append(caption(shown, f"{method}: worst {away.max():.2f} mm"))
+            shown = render(face, camera, heat_colors(residual, worst), samples=2)
+            rows.append(caption(shown, f"{method}: worst {residual.max():.2f} mm"))
         truth = neutral.with_vertices(neutral.vertices + people.offsets[i, expression])
         rows.append(caption(render(truth, camera, clay_colors(truth), samples=2), "truth"))
         rows.append(caption(render(neutral, camera, clay_colors(neutral), samples=2), "neutral"))

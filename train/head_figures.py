@@ -41,7 +41,7 @@ def draw(
         seed: draws random heads.
         quality: its curves, if it was measured.
         learn, test: the heads that it has learned from and others, where there are any.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
     """
     folder.mkdir(parents=True, exist_ok=True)
     known, others = (

@@ -82,7 +82,7 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
         held_out: how many of them, the last, are kept for the test.
         work: the folder of the files.
         template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         TopologyError: a mesh has another topology than the template.
@@ -125,9 +125,9 @@ def upright(mesh: Mesh) -> Mesh:
     across = torch.nn.functional.normalize(marks[45] - marks[36], dim=0)
     up = marks[27] - marks[8]
     up = torch.nn.functional.normalize(up - (up @ across) * across, dim=0)
-    turn = torch.stack([across, up, torch.linalg.cross(across, up)])
+    head_rotation = torch.stack([across, up, torch.linalg.cross(across, up)])
     vertices = mesh.vertices.double()
-    return mesh.with_vertices(((vertices - vertices.mean(0)) @ turn.T).to(mesh.vertices))
+    return mesh.with_vertices(((vertices - vertices.mean(0)) @ head_rotation.T).to(mesh.vertices))
 
 
 def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:

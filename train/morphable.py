@@ -166,10 +166,10 @@ def cross_validated(heads: Samples, folds: int, components: int | None) -> dict[
     All heads were laid on each other together.
     """
     samples = torch.cat([heads.read(*block) for block in blocks(heads)])
-    turn = torch.arange(len(samples)) % folds
+    fold_of = torch.arange(len(samples)) % folds
     far, mean = [], []
     for fold in range(folds):  # a model a turn
-        others, left = samples[turn != fold], samples[turn == fold]
+        others, left = samples[fold_of != fold], samples[fold_of == fold]
         model = MorphableModel.fit(others, None if components is None else min(components, len(others) - 1))
         far.append((model(model.project(left)) - left).norm(dim=-1).mean(1))
         mean.append((left - model.mean).norm(dim=-1).mean(1))

@@ -60,7 +60,7 @@ def read_takes(
         fps: frame rate to bring all takes to; that of the first if absent.
         rig: of the performer of marker takes.
         attachment: where the markers sit on the rig.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         FileFormatError: there are no takes, or one cannot be read.
@@ -108,7 +108,7 @@ def read_takes(
     return PriorTakes(names, fps, weights, [path.stem for path in paths], solved)
 
 
-def made_up(count: int, frames: int, seed: int, fps: float | None = None) -> PriorTakes:
+def synthetic_takes(count: int, frames: int, seed: int, fps: float | None = None) -> PriorTakes:
     """Takes of the embedded performer; each draws from a seed of its own."""
     rate = 60.0 if fps is None else fps
     takes = [perform(frames, torch.Generator().manual_seed(seed + number), rate) for number in range(count)]

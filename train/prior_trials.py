@@ -65,7 +65,7 @@ def one_step(prior: DynamicsPrior, takes: Sequence[Tensor], noise: float = 0.0, 
 
 
 @dataclass(frozen=True, eq=False)
-class Filmed:
+class SyntheticVideo:
     """Held-out frames as one camera sees them.
 
     Args:
@@ -83,9 +83,9 @@ class Filmed:
     truth: Tensor
 
 
-def filmed(
+def synthetic_video(
     rig: BlendshapeRig, names: Sequence[str], takes: Sequence[Tensor], pixel_noise: float, frames: int, seed: int = 0
-) -> Filmed | None:
+) -> SyntheticVideo | None:
     """Takes on a rig whose head nods and turns before a camera of 640 by 480 pixels.
 
     Args:
@@ -109,24 +109,24 @@ def filmed(
     points = own.vertices[landmarks] + torch.einsum("bn,nlc->blc", truth, own.deltas[:, landmarks])
     center = own.vertices[landmarks].mean(0)
     time = torch.arange(len(truth)) / 25
-    turns = torch.stack([0.12 * torch.sin(time), 0.25 * torch.sin(0.7 * time), 0.05 * torch.sin(1.3 * time)], dim=1)
+    angles = torch.stack([0.12 * torch.sin(time), 0.25 * torch.sin(0.7 * time), 0.05 * torch.sin(1.3 * time)], dim=1)
     skew = torch.zeros(len(truth), 3, 3)
     for axis, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
-        skew[:, row, column], skew[:, column, row] = turns[:, axis], -turns[:, axis]
+        skew[:, row, column], skew[:, column, row] = angles[:, axis], -angles[:, axis]
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0])) @ torch.linalg.matrix_exp(skew)
     seen = (points - center) @ rotation.transpose(1, 2) + torch.tensor([0.0, 0.0, _DISTANCE])
     intrinsics = torch.tensor([[_FOCAL, 0.0, 320.0], [0.0, _FOCAL, 240.0], [0.0, 0.0, 1.0]])
     pixels = _FOCAL * seen[..., :2] / seen[..., 2:] + torch.tensor([320.0, 240.0])
     noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(seed))
-    return Filmed(own, intrinsics, pixels + pixel_noise * noise, rotation, truth)
+    return SyntheticVideo(own, intrinsics, pixels + pixel_noise * noise, rotation, truth)
 
 
-def solve_error(film: Filmed, prior: ShapePrior | None, pixel_noise: float) -> float:
+def solve_error(clip: SyntheticVideo, prior: ShapePrior | None, pixel_noise: float) -> float:
     """Root mean square error of weights solved from the landmarks of each frame, the head's pose with them."""
-    # The landmarks were filmed as vertices, so they do not slide.
+    # The landmarks are projected vertices, so they do not slide.
     settings = VideoSettings(pixel_noise=pixel_noise, contour_slide=1.0)
-    solver = VideoSolver(film.rig, None, film.intrinsics, prior, settings=settings)
-    return _rms(solver(film.landmarks).weights - film.truth)
+    solver = VideoSolver(clip.rig, None, clip.intrinsics, prior, settings=settings)
+    return _rms(solver(clip.landmarks).weights - clip.truth)
 
 
 def with_strength(prior: ShapePrior, strength: float) -> ShapePrior:

@@ -29,8 +29,8 @@ from torchface.errors import ValueRangeError
 from torchface.progress import Progress, silent
 from torchface.synthetic import performer
 from train.prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
-from train.prior_takes import PriorTakes, made_up, read_takes, renamed, split
-from train.prior_trials import filmed, one_step, solve_error, with_strength
+from train.prior_takes import PriorTakes, read_takes, renamed, split, synthetic_takes
+from train.prior_trials import one_step, solve_error, synthetic_video, with_strength
 from train.runner import metric_lines, run
 
 Kind = Literal["shape", "reciprocal", "dynamics", "both"]
@@ -138,7 +138,7 @@ def _shape(settings: Settings, out: Path, material: Material, progress: Progress
     learn, test, names = material.learn, material.test, material.learn.names
     fitting, choosing = _for_choice(learn)
     noise, count = settings.pixel_noise, settings.trial_frames
-    trial = filmed(material.rig, names, choosing.weights, noise, 2 * count, settings.seed)
+    trial = synthetic_video(material.rig, names, choosing.weights, noise, 2 * count, settings.seed)
     points: dict[str, list[tuple[float, float]]] = {}
     strength = 1.0 if settings.strength is None else settings.strength
     width = settings.bandwidth
@@ -170,7 +170,7 @@ def _shape(settings: Settings, out: Path, material: Material, progress: Progress
         metrics["held out, log density a frame"] = float(prior.double().log_density(together).mean())
         single = ShapePrior(names, prior.groups, [_gaussian(learn, group) for group in prior.groups])
         metrics["held out, log density of one Gaussian"] = float(single.log_density(together).mean())
-    tested = filmed(material.rig, names, test.weights, noise, count, settings.seed + 1)
+    tested = synthetic_video(material.rig, names, test.weights, noise, count, settings.seed + 1)
     if tested is not None:
         metrics |= {
             "held out, error of a weight without a prior": solve_error(tested, None, noise),
@@ -257,7 +257,7 @@ def _material(settings: Settings, progress: Progress) -> Material:
         )
     rig = None if settings.rig is None else load_rig(settings.rig, part=settings.part)
     if settings.takes is None:
-        takes = made_up(settings.performances, settings.frames, settings.seed, settings.fps)
+        takes = synthetic_takes(settings.performances, settings.frames, settings.seed, settings.fps)
     else:
         attachment = None if settings.attachment is None else Attachment.load(settings.attachment)
         takes = read_takes(settings.takes, settings.fps, rig, attachment, progress)

@@ -22,7 +22,7 @@ from torchface.capture.priors.gaussian_process import Evidence, GaussianProcesse
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.onnx import export_model
 from train.prior_figures import calibration_picture, curves_picture, save_figure
-from train.prior_trials import filmed, one_step, solve_error
+from train.prior_trials import one_step, solve_error, synthetic_video
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
 SPLITS = ((4, 5), (0, 1), (2, 3), (0, 5), (1, 4))
@@ -174,11 +174,11 @@ def test_shape_priors(real_capture: Capture) -> None:
         "the paper's 1/P": ReciprocalPrior.fit(learn, rig.names),
         "default": ShapePrior.fit(learn, rig.names),
     }
-    film = filmed(rig, rig.names, test, 1.0, 40)
+    clip = synthetic_video(rig, rig.names, test, 1.0, 40)
     print("\nheld-out takes: log density a frame; error of weights solved from 68 landmarks, 1 pixel of noise")
     for label, prior in forms.items():
         density = float("nan")
         if prior is not None and not isinstance(prior, ReciprocalPrior):
             density = float(prior.double().log_density(held_out).mean())
-        error = float("nan") if film is None else solve_error(film, prior, 1.0)
+        error = float("nan") if clip is None else solve_error(clip, prior, 1.0)
         print(f"  {label:30} {density:10.2f} {error:8.4f}")

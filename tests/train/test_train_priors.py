@@ -17,7 +17,7 @@ from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.take import Track
-from train.prior_takes import made_up, read_takes, renamed, split
+from train.prior_takes import read_takes, renamed, split, synthetic_takes
 from train.priors import Settings, train
 
 ICT_LIKE = ("browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "eyeBlink_R", "jawOpen", "cheekRaiser_L")
@@ -141,7 +141,7 @@ def test_bad_input(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="found no take"):
         read_takes(tmp_path)
     with pytest.raises(ShapeError, match="expected at least one to learn from"):
-        split(made_up(2, 30, 0), 2)
+        split(synthetic_takes(2, 30, 0), 2)
     with pytest.raises(TorchfaceError, match="for a window of 40"):
         train(Settings(performances=2, frames=30, kind="dynamics", window=40, out=tmp_path / "own"))
     take = saved(tmp_path, "a", 20)

@@ -43,9 +43,9 @@ def export_expression_regression(
     generator = torch.Generator().manual_seed(0)
     for batch in (1, 3):
         neutrals = model.neutral_mean + torch.randn(batch, *model.neutral_mean.shape, generator=generator)
-        turn = torch.linalg.qr(torch.randn(batch, 3, 3, generator=generator))[0]
-        turn = turn * torch.linalg.det(turn)[:, None, None]
-        neutrals = neutrals @ turn + 100 * torch.randn(batch, 1, 3, generator=generator)
+        orthonormal = torch.linalg.qr(torch.randn(batch, 3, 3, generator=generator))[0]
+        orthonormal = orthonormal * torch.linalg.det(orthonormal)[:, None, None]
+        neutrals = neutrals @ orthonormal + 100 * torch.randn(batch, 1, 3, generator=generator)
         # Where positions are rounded to float32 is no affair of the graph's.
         cases.append(({"neutrals": neutrals}, {"offsets": model.offsets(neutrals.double()).float()}))
     return write_checked(graph, path, cases, {"offsets": _PARITY}, {"offsets": "millimetres"})

@@ -38,7 +38,7 @@ def projected_newton(
         tolerance: on ``problem.residual``; a problem that reaches it is left alone.
         iterations: at most so many steps.
         careful: search where the full step does not descend, and so descend always; otherwise leave such a problem
-            where it stands, too far from its solution for Newton steps to be worth their price.
+            where it stands, too far from its solution for Newton steps to be worth their cost.
     """
     numbers = _CHUNK_NUMBERS.get(start.device.type, _CHUNK_NUMBERS["other"])
     chunk = max(1, numbers // problem.f.shape[1] ** 2)

@@ -15,9 +15,9 @@ from torchface.optim.operator_splitting import SplittingFactors, prepare_splitti
 from torchface.optim.prepared_tensors import Prepared
 
 # Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
-# ends in the first rounds nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps
-# follow the first round at once. Later rounds are for an H that is singular or close to it: splitting brings such
-# problems near enough for Newton steps to end them, and the last ones make sure.
+# ends in the first iterations nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps
+# follow the first iteration at once. Later iterations are for an H that is singular or close to it: splitting brings
+# such problems near enough for Newton steps to end them, and the last ones make sure.
 _COARSE_ROUNDS = ((0, 48), (0, 32), (0, 32), (0, 32))
 _FINE_ROUNDS = ((0, 60),)
 _LATER_ROUNDS = ((4, 100), (4, 200), (4, 400), (4, 400))

@@ -168,15 +168,15 @@ def _jacobian(modes: Tensor, current: Tensor, ids: Tensor, pose: Similarity, cen
     arm = current[ids] - centre
     zero = torch.zeros(len(ids), dtype=torch.float64)
     x, y, z = arm.unbind(1)
-    turn = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=1).reshape(-1, 3, 3)
-    shift = torch.eye(3, dtype=torch.float64).expand(len(ids), 3, 3)
+    rotation_step = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=1).reshape(-1, 3, 3)
+    translation_step = torch.eye(3, dtype=torch.float64).expand(len(ids), 3, 3)
     moved = pose.apply_vectors(modes[:, ids].reshape(1, -1, 3))[0].reshape(len(modes), len(ids), 3)
-    return torch.cat([turn, shift, arm[:, :, None], moved.permute(1, 2, 0)], dim=2)
+    return torch.cat([rotation_step, translation_step, arm[:, :, None], moved.permute(1, 2, 0)], dim=2)
 
 
 def _moved(pose: Similarity, step: Tensor, centre: Tensor) -> Similarity:
     x, y, z = step[:3].tolist()
-    turn = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
+    rotation_step = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
     grow = math.exp(min(max(float(step[6]), -0.1), 0.1))
-    translation = centre + grow * (turn @ (pose.translation[0] - centre)) + step[3:6]
-    return Similarity(pose.scale * grow, turn @ pose.rotation, translation[None])
+    translation = centre + grow * (rotation_step @ (pose.translation[0] - centre)) + step[3:6]
+    return Similarity(pose.scale * grow, rotation_step @ pose.rotation, translation[None])

@@ -116,14 +116,16 @@ def rigid_icp(
         size = matrix.diagonal(dim1=1, dim2=2)
         matrix = matrix + torch.diag_embed(_DAMPING * size + 1e-9 * size.amax(1, keepdim=True) + 1e-12)
         step = torch.linalg.solve(matrix, (weighted * left[..., None]).sum(1))
-        turn = torch.linalg.matrix_exp(_skew(step[:, :3]))
+        rotation_step = torch.linalg.matrix_exp(_skew(step[:, :3]))
         grow = (1 + step[:, 6]).clamp(0.9, 1.1) if scale else torch.ones_like(s)
         grow = (s * grow).clamp(lowest, highest) / s
         # About the centre: x -> c + g T (x - c) + t.
         translation = (
-            centre[:, 0] + grow[:, None] * (turn @ (translation - centre[:, 0])[..., None])[..., 0] + step[:, 3:6]
+            centre[:, 0]
+            + grow[:, None] * (rotation_step @ (translation - centre[:, 0])[..., None])[..., 0]
+            + step[:, 3:6]
         )
-        rotation, s = turn @ rotation, s * grow
+        rotation, s = rotation_step @ rotation, s * grow
     pose = Similarity(s, rotation, translation)
     return Fit(pose, _planes(samples, scan, pose, reaches[-1])[3].mean(1))
 
@@ -136,11 +138,11 @@ def find_pose(samples: Samples, scan: ScanPoints) -> Fit:
     Raises:
         AlignmentError: even the best fits badly.
     """
-    turns = _rotations(_ROTATIONS)
-    one = torch.ones(len(turns), dtype=torch.float64)
+    all_rotations = _rotations(_ROTATIONS)
+    one = torch.ones(len(all_rotations), dtype=torch.float64)
     middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
     own = (samples.points.amax(0) + samples.points.amin(0)) / 2
-    start = Similarity(one, turns, middle - turns @ own)
+    start = Similarity(one, all_rotations, middle - all_rotations @ own)
     few = rigid_icp(samples.first(120), scan, start, _falling(80, 40, 8)).best(40)
     more = rigid_icp(samples.first(400), scan, few.pose, _falling(40, 15, 12)).best(8)
     most = rigid_icp(samples.first(1500), scan, more.pose, _falling(20, 8, 20), scale=True).best(1)

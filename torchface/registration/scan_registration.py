@@ -109,7 +109,7 @@ def register(
         schedule: which steps, see ``Schedule``.
         texture_size: texels a side of the texture that is made where the scan has colours and the template
             texture coordinates; 0 makes none.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         ``Registration(mesh, pose, distance (V,), matched (V,), record)``.

@@ -219,7 +219,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ValueRangeError, match="fading 2"):
         PoseFilterSettings(fading=2.0)
     with pytest.raises(ValueRangeError, match="at least 4"):
-        PoseSettings(fewest=3)
+        PoseSettings(min_landmarks=3)
 
 
 @pytest.mark.real

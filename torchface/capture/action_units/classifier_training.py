@@ -82,7 +82,7 @@ def fit_classifier(
         labels: of each video, with what was performed.
         groups: which regions show which units.
         settings: of the training.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: videos and labels differ in number or length.

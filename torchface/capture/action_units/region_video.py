@@ -60,7 +60,7 @@ def read_regions(
         reference: another performer's neutral patterns (R,h,w), to which these are warped; none if absent.
         size: pixels a side of a region.
         method: of the flow to the reference.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         FileFormatError: the video cannot be decoded.

@@ -70,7 +70,7 @@ def action_unit_curves(
         units: which of the classifier's are used in the solve; all if absent.
         windows: frames at 60 a second over which each unit is smoothed.
         at_rest: also use predictions where no unit is active; otherwise only the markers count, as in the source.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.

@@ -74,7 +74,7 @@ def fit_dynamics_prior(
         input_noise: standard deviation of noise that is added to the windows, not to what follows them: a prior
             for windows of solved weights should expect as much noise as these have, or it keeps their errors.
         settings: of the learning.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: no takes, of another number of shapes, or too short for the window.

@@ -30,21 +30,21 @@ class PoseSettings:
     Args:
         threshold: how far a stable landmark may be off before it counts as an outlier, millimetres on the head; twice
             that for the temples. The rig is not the person to the millimetre, so this is more than landmarks are noisy.
-        fewest: stable landmarks that a pose needs.
+        min_landmarks: stable landmarks that a pose needs.
         filter: what is reckoned with along time.
         seed: of the random draws.
     """
 
     threshold: float = 8.0
-    fewest: int = 6
+    min_landmarks: int = 6
     filter: PoseFilterSettings = field(default_factory=PoseFilterSettings)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 < self.threshold < float("inf") or self.fewest < 4:
+        if not 0 < self.threshold < float("inf") or self.min_landmarks < 4:
             raise ValueRangeError(
-                f"pose: found threshold {self.threshold} and fewest {self.fewest}, expected positive millimetres and "
-                "at least 4"
+                f"pose: found threshold {self.threshold} and min_landmarks {self.min_landmarks}, expected positive "
+                "millimetres and at least 4"
             )
 
 
@@ -264,7 +264,7 @@ def _measured(
 
 def _judged(x: Tensor, intrinsics: Tensor, found: RobustPose, weights: Tensor, settings: PoseSettings) -> HeadPoses:
     """Poses that rest on enough landmarks, with their covariance."""
-    enough = found.inliers.sum(1) >= settings.fewest
+    enough = found.inliers.sum(1) >= settings.min_landmarks
     w = torch.where(found.inliers, weights, 0.0)
     rotation = torch.where(enough[:, None, None], found.pose.rotation, torch.nan)
     translation = torch.where(enough[:, None], found.pose.translation, torch.nan)
@@ -314,5 +314,5 @@ def _check_found(poses: HeadPoses, landmarks: Tensor, settings: PoseSettings) ->
         seen = torch.isfinite(landmarks[:, list(STABLE_LANDMARKS)]).all(-1).sum(1)
         raise AlignmentError(
             f"head pose: found at most {int(seen.max())} of the {len(STABLE_LANDMARKS)} stable landmarks in any of "
-            f"{len(seen)} frames, expected {settings.fewest} that agree with one pose in some frame"
+            f"{len(seen)} frames, expected {settings.min_landmarks} that agree with one pose in some frame"
         )

@@ -92,8 +92,8 @@ def _starts(seen: SeenSkin) -> tuple[list[LampFit], float]:
     """The best of directions all round, some degrees apart, and the robust estimator's width at the very best."""
     number = torch.arange(_STARTS, dtype=torch.float64)
     z = 1 - 2 * (number + 0.5) / _STARTS
-    turn = number * math.pi * (3 - math.sqrt(5))
-    directions = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], dim=1)
+    azimuth = number * math.pi * (3 - math.sqrt(5))
+    directions = torch.stack([(1 - z * z).sqrt() * azimuth.cos(), (1 - z * z).sqrt() * azimuth.sin(), z], dim=1)
     lamps = [Lamp(direction, 1 / _USUAL) for direction in directions]
     tried = [_with_factors(seen, lamp) for lamp in lamps]  # a lamp at a time: each casts its own shadows
     width = min(_width(one.residuals, seen) for one in tried)
@@ -136,8 +136,8 @@ def _refined(seen: SeenSkin, start: LampFit, width: float) -> LampFit:
 
 def _moved(lamp: Lamp, step: Tensor, least: float, most: float) -> Lamp:
     """Across the direction by at most half a radian, and in nearness within bounds."""
-    turn = step[:2] * min(1.0, 0.5 / max(float(step[:2].norm()), 1e-12))
-    direction = torch.nn.functional.normalize(lamp.direction + turn @ _tangents(lamp.direction), dim=0)
+    direction_step = step[:2] * min(1.0, 0.5 / max(float(step[:2].norm()), 1e-12))
+    direction = torch.nn.functional.normalize(lamp.direction + direction_step @ _tangents(lamp.direction), dim=0)
     return Lamp(direction, min(max(lamp.nearness + float(step[2]) / _USUAL, least), most))
 
 

@@ -178,8 +178,8 @@ class PoseFilter:
             return self._steps.new_full((3, 3), torch.nan), self._steps.new_full((3,), torch.nan)
         share = self._shares()
         best = self.estimate.rotation[int(share.argmax())]
-        turns = rotation_vector(self.estimate.rotation @ best.T)
-        return rotation_matrix(share @ turns) @ best, share @ self.estimate.place
+        rotation_vectors = rotation_vector(self.estimate.rotation @ best.T)
+        return rotation_matrix(share @ rotation_vectors) @ best, share @ self.estimate.place
 
     def likeliest(self) -> tuple[Tensor, Tensor]:
         """Rotation (3,3) and translation (3,) of the model that has foretold best; NaN where the head is lost."""

@@ -37,9 +37,9 @@ class HeadState:
 
     def motion_from(self, rotation: Tensor, translation: Tensor) -> Tensor:
         """What moves a pose (B,3,3), (B,3) here, (B,6); turns are below half a turn."""
-        turn = self.rotation @ rotation.transpose(-1, -2)
-        axis = 0.5 * (turn - turn.transpose(-1, -2)).flatten(1)[:, [7, 2, 3]]
-        cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
+        relative_rotation = self.rotation @ rotation.transpose(-1, -2)
+        axis = 0.5 * (relative_rotation - relative_rotation.transpose(-1, -2)).flatten(1)[:, [7, 2, 3]]
+        cosine = 0.5 * (relative_rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
         sine_squared = axis.square().sum(-1, keepdim=True)
         small = sine_squared < 1e-8
         safe = torch.where(small, 0.5, sine_squared).sqrt()

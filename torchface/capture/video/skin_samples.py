@@ -17,7 +17,7 @@ from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.point_light import in_camera_frame, lit_by
 from torchface.rendering.raycast import RayCaster
 
-FEWEST = 60
+MIN_VERTICES = 60
 """Vertices that the frames have to show at least: nine numbers are wanted, and much of a face may shine or be hairy."""
 
 _SQUARELY = 0.25  # cosine; what is seen more obliquely is mixed with what stands behind
@@ -128,10 +128,10 @@ def seen_skin(
 
 
 def _check_seen(colors: Tensor, albedo: Tensor, count: int) -> None:
-    if len(colors) < FEWEST:
+    if len(colors) < MIN_VERTICES:
         raise AlignmentError(
             f"estimate_light: found {len(colors)} of {count} vertices in the image, seen squarely and not blown out, "
-            f"expected at least {FEWEST}; is the face in the frame?"
+            f"expected at least {MIN_VERTICES}; is the face in the frame?"
         )
     if float(colors.amax(-1).quantile(0.95)) < _BLACK:
         raise ValueRangeError("frame: found the face black, expected one that is lit")

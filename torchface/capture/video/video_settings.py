@@ -10,7 +10,7 @@ from torchface.errors import ValueRangeError
 # Of the eyes' distance: what models of landmarks are measured to be off, any face's and the actor's own.
 _FOUND, _REFINED = 0.025, 0.015
 _LEAST_FOUND = 0.5
-# By the error of films of the embedded performer, of strengths 1, 0.1, 0.03 and noises 1, 3, 6, 12 times as large.
+# By the error of videos of the embedded performer, of strengths 1, 0.1, 0.03 and noises 1, 3, 6, 12 times as large.
 _ALIKE, _FOUND_DYNAMICS = 3.0, 0.03
 # With a prior the energy is flat along its valley, and a frame's last steps creep there. The next frame begins where
 # they end, so a few do, and a graph that takes as many gives the same weights.

@@ -69,12 +69,14 @@ def look_at(
     """
     distance = span / 2 / math.tan(math.radians(field_of_view) / 2)
     a, b = math.radians(yaw), math.radians(pitch)
-    away = torch.tensor([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)], dtype=torch.float64)
-    forward = -away
+    viewing_direction = torch.tensor(
+        [math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)], dtype=torch.float64
+    )
+    forward = -viewing_direction
     right = torch.tensor([math.cos(a), 0.0, -math.sin(a)], dtype=torch.float64)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward])
-    centre = target.double() + distance * away
+    centre = target.double() + distance * viewing_direction
     focal = height / 2 / math.tan(math.radians(field_of_view) / 2)
     intrinsics = torch.tensor(
         [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64

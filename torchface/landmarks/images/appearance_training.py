@@ -33,7 +33,7 @@ def learn_appearance(
         images: (H,W) or (3,H,W), uint8, or floats in [0,1]; sizes may differ.
         landmarks: (M,68,2) pixels.
         settings: how.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: images and landmarks do not fit each other, or fewer than three images.

@@ -236,11 +236,11 @@ class LandmarkTracker:
         """Which of the faces (F,4), the largest first, is the one that was tracked; the one asked for at the start."""
         if self._place is not None and len(boxes):
             middle = boxes[:, :2] + boxes[:, 2:] / 2
-            away = (middle - self._place[:2] - self._place[2:] / 2).norm(dim=1) / self._place[2]
+            distance = (middle - self._place[:2] - self._place[2:] / 2).norm(dim=1) / self._place[2]
             ratio = boxes[:, 2] / self._place[2]
-            away = torch.where((ratio > 0.6) & (ratio < 1.6), away, torch.inf)
-            nearest = int(away.argmin())
-            if float(away[nearest]) < 0.75:
+            distance = torch.where((ratio > 0.6) & (ratio < 1.6), distance, torch.inf)
+            nearest = int(distance.argmin())
+            if float(distance[nearest]) < 0.75:
                 return boxes[nearest]
             if self._missed < self.settings.patience:
                 return None
@@ -266,7 +266,7 @@ def track_landmarks(
     Args:
         video: a file, or frames, uint8 (H,W) or (3,H,W) each.
         tracker: what finds them; it goes on from its last frame.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         Names ``"0"`` to ``"67"``, values (T,68,2) in pixels, NaN where the face is lost, confidence (T,68).
@@ -337,8 +337,8 @@ def _refined(trees: LandmarkTrees, grey: Tensor, box: Tensor, starts: ConsensusS
 
 def _relation(box: Tensor, other: Tensor) -> Tensor:
     """Where another box (4,) lies: its middle from the box's (2,) in sides of that, and its size by that's; (3,)."""
-    away = (other[:2] + other[2:] / 2 - box[:2] - box[2:] / 2) / box[2]
-    return torch.cat([away.clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
+    offset = (other[:2] + other[2:] / 2 - box[:2] - box[2:] / 2) / box[2]
+    return torch.cat([offset.clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
 
 
 @torch.no_grad()

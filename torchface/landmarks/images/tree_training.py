@@ -107,7 +107,7 @@ def fit_trees(
         boxes: x, y, width, height of the faces, (M,4) pixels.
         landmarks: (M,L,2), pixels; NaN where one is not known.
         settings: how trees are grown.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         mirror: which landmark each becomes in a mirrored image; iBUG's where there are 68, else nothing is mirrored.
         checkpoint: a file that is written after every cascade; where it is there, from the same images and settings,
             learning goes on from it, to the same result. It may be deleted afterwards.

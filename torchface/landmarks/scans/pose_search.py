@@ -45,8 +45,8 @@ def hypotheses(nose: Tensor, direction: Tensor, found: NoseCandidates, search: P
     across = _frame(found.directions)
     for axis, angle in ((0, 0.0), (0, lean), (0, -lean), (1, lean), (1, -lean)):
         for k in range(search.rolls):
-            turn = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(angle, axis)
-            rotations.append(across @ turn @ base.T)
+            roll_and_tilt = _turn(2 * math.pi * k / search.rolls, 2) @ _turn(angle, axis)
+            rotations.append(across @ roll_and_tilt @ base.T)
     rotation = torch.cat(rotations)
     target = found.points.repeat(len(rotations), 1)
     translation = target - (rotation @ nose)
@@ -95,10 +95,10 @@ def refine(
         step = torch.linalg.solve(normal_matrix, (weighted * residual[..., None]).sum(1))
         change = torch.linalg.matrix_exp(_skew(step[:, :3].clamp(-0.3, 0.3)))
         grown = (scale * (1 + step[:, 6].clamp(-0.1, 0.1))).clamp(1 / largest_scale, largest_scale)
-        # Turn and grow about the moved points' centre, then shift.
+        # Turn and grow about the moved points' centre, then translate.
         ratio = (grown / scale)[:, None, None]
-        shift = centre + step[:, None, 3:6]
-        translation = (ratio * ((translation[:, None] - centre) @ change.transpose(-1, -2)) + shift)[:, 0]
+        translation_step = centre + step[:, None, 3:6]
+        translation = (ratio * ((translation[:, None] - centre) @ change.transpose(-1, -2)) + translation_step)[:, 0]
         rotation, scale = change @ rotation, grown
     return Similarity(scale, rotation, translation)
 

@@ -51,7 +51,7 @@ def score_statistics(
         filters: (L,M,bins,side,side).
         landmarks: pixels, (M,L,2); NaN where one is not known.
         settings: thresholds.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Source: thesis 3.2.2.
     """

@@ -93,7 +93,7 @@ def register_corpus(
             asks for more must call under ``if __name__ == "__main__"``.
         cluster: the address of a Ray cluster, or ``"auto"`` on one of its machines, instead of ``jobs``; scans and
             ``out`` must lie where all its machines see them.
-        progress: told how many scans are done, and of how many; those of an earlier run count at once.
+        progress: called with how many scans are done, and of how many; those of an earlier run count at once.
         finished: called with each scan's entry, those of an earlier run first.
         landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
             is registered without landmarks.

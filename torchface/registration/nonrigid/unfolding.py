@@ -37,7 +37,7 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
         current: (V,3) float64.
         faces: (F,3) int64.
     """
-    best, fewest = current, int(turned_over(rest, current, faces).sum())
+    best, min_count = current, int(turned_over(rest, current, faces).sum())
     for circle in range(_MAX_CIRCLES):
         folded = turned_over(rest, best, faces)
         if not folded.any():
@@ -53,8 +53,8 @@ def unfolded(rest: Tensor, current: Tensor, faces: Tensor) -> Tensor:
             if int(around.sum()) >= 4:
                 moved[own] = _by_neighbours(rest[own], rest[around], best[around])
         left = int(turned_over(rest, moved, faces).sum())
-        if left < fewest:
-            best, fewest = moved, left
+        if left < min_count:
+            best, min_count = moved, left
     return best
 
 

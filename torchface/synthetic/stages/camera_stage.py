@@ -102,7 +102,7 @@ def record_session(
         identity: of the performer, (K,); the mean if absent.
         generator: where all randomness comes from.
         settings: how.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
 
     Raises:

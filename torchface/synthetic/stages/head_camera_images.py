@@ -84,11 +84,11 @@ class HeadCameraRenderer:
 def _ball(radius: float, rings: int = 4, segments: int = 6) -> tuple[Tensor, Tensor]:
     """A sphere round the origin: vertices (V,3), faces (F,3)."""
     down = torch.pi * torch.arange(1, rings, dtype=torch.float64) / rings
-    turn = 2 * torch.pi * torch.arange(segments, dtype=torch.float64) / segments
+    angle = 2 * torch.pi * torch.arange(segments, dtype=torch.float64) / segments
     belt = torch.stack([
-        torch.outer(down.sin(), turn.cos()),
+        torch.outer(down.sin(), angle.cos()),
         down.cos()[:, None].expand(-1, segments),
-        torch.outer(down.sin(), turn.sin()),
+        torch.outer(down.sin(), angle.sin()),
     ], dim=-1).view(-1, 3)  # fmt: skip
     poles = torch.tensor([[0.0, 1, 0], [0, -1, 0]], dtype=torch.float64)
     ids = torch.arange(len(belt)).view(rings - 1, segments)

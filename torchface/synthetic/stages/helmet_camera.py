@@ -85,7 +85,7 @@ def shaken_cameras(
     angle = math.radians(flaws.shake_rotation) * motion[:, :3]
     skew = torch.zeros(frames, 3, 3, dtype=torch.float64)
     skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -angle[:, 2], angle[:, 1], -angle[:, 0]
-    turn = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))
-    rotation = turn @ camera.rotation.double()
-    translation = turn @ camera.translation.double() + flaws.shake_translation * motion[:, 3:]
+    rotation_step = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))
+    rotation = rotation_step @ camera.rotation.double()
+    translation = rotation_step @ camera.translation.double() + flaws.shake_translation * motion[:, 3:]
     return rotation, translation

@@ -102,7 +102,7 @@ def render_lit_video(
         fps: frames a second.
         generator: of motion and noise.
         settings: how.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: the weights are not (T,N), or the rig has no skin.

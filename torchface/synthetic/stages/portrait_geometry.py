@@ -135,8 +135,8 @@ def _curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[
     x = wide * bulge * angle.sin()
     z = (front - far) / 2 + radius_z * bulge * angle.cos() - 6
     points = torch.stack([x, y.expand_as(x), z], -1).view(-1, 3)
-    away = points * points.new_tensor([1.0, 0.0, 1.0])
-    points = points + 5.0 * _lumps(points, generator)[:, None] * torch.nn.functional.normalize(away, dim=-1)
+    outward = points * points.new_tensor([1.0, 0.0, 1.0])
+    points = points + 5.0 * _lumps(points, generator)[:, None] * torch.nn.functional.normalize(outward, dim=-1)
     return points, _grid_faces(rows, columns)
 
 

@@ -89,7 +89,7 @@ def render_portrait_video(
         weights: (T,N).
         generator: of poses, wall and noise.
         settings: how.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         ShapeError: the weights are not (T,N), or the rig has no landmarks.

@@ -99,7 +99,7 @@ def face_images(
         count: how many images.
         seed: decides them; an image does not depend on how many are asked for.
         settings: what is drawn how widely.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         first: number of the first image; several calls make what one would.
     """
     progress = progress or silent

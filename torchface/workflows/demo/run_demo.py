@@ -177,9 +177,9 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
             raise TopologyError(f"target: found {head}, expected the triangles of {rig.neutral}")
         head = rig.neutral.with_vertices(head.vertices)
         truth = BlendshapeRig(head, rig.deltas, rig.names)
-        made_up = perform(1800, generator)
-        assert made_up.weights is not None
-        scene = Scene(title, rig, head, truth, truth.weights_from(made_up.weights), made_up.fps)
+        performed = perform(1800, generator)
+        assert performed.weights is not None
+        scene = Scene(title, rig, head, truth, truth.weights_from(performed.weights), performed.fps)
     if take is None:
         return scene
     played = load_take(take)
@@ -205,7 +205,7 @@ def run_demo(
         out: the folder; made if absent.
         seed: of noise and gaps.
         flaws: of the stage.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Returns:
         A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.

@@ -108,7 +108,7 @@ def scan_truth(
         out: the folder of registered meshes and their records.
         landmarks: a folder of landmark files named as the scans.
         unit: of the scans; each format's own if absent.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         TopologyError: the result is meshes without a rig.

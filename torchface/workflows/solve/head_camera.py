@@ -70,7 +70,7 @@ def predicted_curves(
         camera: video, classifier, labels, table.
         take: whose frames are meant.
         names: of the rig's shapes.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         NameMismatchError: the model is no classifier, or no table fits the rig.

@@ -85,7 +85,7 @@ def solve_markers(
         take: markers, in any space.
         settings: which of these steps.
         predicted: what a head camera saw, for the hybrid solve.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
 
     Raises:
         AlignmentError: the rig does not explain the markers, unless the settings insist.

@@ -41,7 +41,7 @@ def write_overlay(tracked: Tracked, path: Path, texture: Path | None, progress: 
         tracked: what was solved.
         path: of the video to write.
         texture: an image to put on the face; without, the mesh is shown and the landmarks on it.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
     """
     progress = progress or silent
     draw = mesh_drawer(tracked) if texture is None else paint_drawer(tracked, texture)
@@ -131,13 +131,13 @@ def video_light(tracked: Tracked) -> PointLight:
 
 def camera_at(tracked: Tracked, t: int) -> Camera:
     """The camera of frame t, from the rig's space, without distortion."""
-    solution, film = tracked.solution, tracked.video
+    solution, clip = tracked.solution, tracked.video
     return Camera(
         tracked.calibration.intrinsics.double(),
         solution.rotation[t].detach().double(),
         solution.translation[t].detach().double(),
-        film.width,
-        film.height,
+        clip.width,
+        clip.height,
     )
 
 

@@ -15,7 +15,7 @@ from torchface.viz.figures.helmet_motion import motion_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.track_overlay import camera_at, mesh_drawer, paint_drawer
-from torchface.workflows.track.track_result import FEWEST_STABLE, Tracked
+from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 
 SHOWN = 12
 _COLUMNS, _WIDTH = 4, 300
@@ -80,7 +80,7 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
     """Names and numbers for a table."""
     errors, count = tracked.solution.errors.detach(), len(tracked.frames)
     seen, camera = tracked.seen, tracked.calibration
-    few = int((seen & (tracked.stable < FEWEST_STABLE)).sum())
+    few = int((seen & (tracked.stable < MIN_STABLE)).sum())
     weights = tracked.solution.weights.detach()
     rows = [
         ("frames", str(count)),

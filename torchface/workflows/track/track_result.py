@@ -17,7 +17,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.track_state import TrackedFrames
 
-FEWEST_STABLE = 6
+MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
@@ -95,10 +95,10 @@ class Tracked:
             lines.append(f"camera: as given, {self.calibration.error:.2f} px from what it was fitted to")
         if self.faces > 1:
             lines.append(f"{self.faces} faces in the first frame; --face N picks another than the one followed")
-        few = int((self.seen & (self.stable < FEWEST_STABLE)).sum())
+        few = int((self.seen & (self.stable < MIN_STABLE)).sum())
         if few:
             lines.append(
-                f"{few} frames show fewer than {FEWEST_STABLE} stable landmarks; their pose is that of other frames"
+                f"{few} frames show fewer than {MIN_STABLE} stable landmarks; their pose is that of other frames"
             )
         lost = count - seen
         if lost:

@@ -39,7 +39,7 @@ from torchface.workflows.track.track_files import (
 )
 from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
 from torchface.workflows.track.track_overlay import video_light, write_overlay
-from torchface.workflows.track.track_result import FEWEST_STABLE, Tracked
+from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 from torchface.workflows.track.track_state import TrackedFrames, TrackState, digest, file_digest
 
 PIECE = 64
@@ -285,7 +285,7 @@ def _solve(
     if whole_take and solver.dynamics is not None:
         progress("solving for weights")
         return solve_whole_take(solver, landmarks, rotation, translation, confidence)
-    enough = torch.isfinite(landmarks).all(-1).sum(1) >= FEWEST_STABLE
+    enough = torch.isfinite(landmarks).all(-1).sum(1) >= MIN_STABLE
     first = int(enough.nonzero()[0, 0])
     states, state = [], solver.start()
     for t in range(first, len(landmarks)):  # a frame leans on the one before

@@ -80,7 +80,7 @@ def fit_attachment(
         rom: markers (T,M,3) of a range of motion, in any space and scale; NaN for not seen. No frame need be neutral.
         initial: roughly where the markers sit; markers match by label.
         standoff: estimate one distance h of all marker centres from the skin; otherwise it is 0.
-        progress: told each step and how far it is.
+        progress: called with each step and how far it is.
         insist: also return sites that the take leaves mostly uncertain, or that do not explain the markers.
 
     Returns:
