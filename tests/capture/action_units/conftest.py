@@ -26,7 +26,7 @@ def stage_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def session(stage_folder: Path) -> RecordedSession:
     """Three repetitions of each unit, two of a combination, 20 frames a second."""
     performance = PerformanceSettings(3, 2, (("4", "9"),), fps=20.0, pace=1.3)
-    flaws = CameraFlaws(loose_rotation=0.6, loose_translation=1.2)
+    flaws = CameraFlaws(shake_rotation=0.6, shake_translation=1.2)
     settings = StageSettings(128, 170, markers=20, flaws=flaws, performance=performance)
     return record_session(stage_folder, "first", None, torch.Generator().manual_seed(1), settings)
 
