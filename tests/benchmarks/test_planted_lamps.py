@@ -25,7 +25,7 @@ from torchface.mesh import Mesh
 from torchface.rendering.point_light import PointLight, in_camera_frame, vertex_albedo
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, turning_cameras
 from torchface.synthetic.stages.weight_curves import perform
 
 LAMPS = 50
@@ -83,7 +83,7 @@ def test_planted_lamps() -> None:
         mesh = rig.neutral.with_vertices(rig(weights)[0])
         centre = in_camera_frame(camera, mesh.vertices)[mesh.landmarks].mean(0).float()
         truth, albedo = planted(centre, generator), vertex_albedo(mesh)
-        linear = lit_picture(mesh, camera, truth, STAGE)
+        linear = lit_image(mesh, camera, truth, STAGE)
         if brim:
             brows = camera.project(mesh.vertices.double())[mesh.landmarks[17:27], 1].amin()
             linear[:, : int(brows)] *= 0.2

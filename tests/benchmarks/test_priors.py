@@ -18,7 +18,7 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import GaussianMixture, ReciprocalPrior, face_halves, face_regions, windows_of
 from torchface.capture.priors.dynamics_training import fitted_kernel
-from torchface.capture.priors.gaussian_process import Evidence, GaussianProcesses, posterior, whitening_of
+from torchface.capture.priors.gaussian_process import GaussianProcesses, Statistics, posterior, whitening_of
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.onnx import export_model
 from train.prior_figures import calibration_picture, curves_picture, save_figure
@@ -148,7 +148,9 @@ def test_beside_scikit_learn(real_capture: Capture) -> None:
         points = inputs[some[:count]]
         whitening = whitening_of(kernel, points)
         features = kernel.between(inputs[some], points) @ whitening
-        learned = posterior(kernel, points, whitening, Evidence(features.T @ features, features.T @ targets[some]), 1.0)
+        learned = posterior(
+            kernel, points, whitening, Statistics(features.T @ features, features.T @ targets[some]), 1.0
+        )
         mean, variance = GaussianProcesses.stacked([learned], [kernel])(inputs[new])
         away = mean.numpy() - expected
         spread = (variance[:, 0] + kernel.noise).sqrt().numpy() - deviation[:, 0]

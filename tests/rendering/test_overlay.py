@@ -23,7 +23,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, turning_cameras
 
 STAGE = LightStageSettings(width=240, height=240, samples=2, gloss=0.0, noise=0.0)
 LIGHT = PointLight(torch.tensor([0.3, 0.32, 0.35]), torch.tensor([0.65, 0.6, 0.55]), torch.tensor([-500.0, -250, 100]))
@@ -41,7 +41,7 @@ def cameras(rig: BlendshapeRig) -> tuple[Camera, ...]:
 
 
 def film(mesh: Mesh, camera: Camera, light: PointLight) -> Tensor:
-    return to_srgb(lit_picture(mesh, camera, light, STAGE).clamp(0, 1))
+    return to_srgb(lit_image(mesh, camera, light, STAGE).clamp(0, 1))
 
 
 def plain(color: tuple[float, float, float], alpha: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, render_lit_video, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 from torchface.synthetic.stages.weight_curves import perform
 
 STAGE = LightStageSettings(width=200, height=200, samples=1)
@@ -60,7 +60,7 @@ def planted(centre: Tensor, generator: torch.Generator) -> PointLight:
 
 def photograph(mesh: Mesh, camera: Camera, light: PointLight, seed: int) -> Tensor:
     """What a camera writes, uint8 (3,H,W)."""
-    linear = lit_picture(mesh, camera, light, STAGE)
+    linear = lit_image(mesh, camera, light, STAGE)
     noise = torch.randn(linear.shape, generator=torch.Generator().manual_seed(seed))
     return (to_srgb((linear + STAGE.noise * linear.sqrt() * noise).clamp(0, 1)) * 255).round().to(torch.uint8)
 

@@ -18,7 +18,7 @@ from torchface.rendering.point_light import PointLight, in_camera_frame
 from torchface.synthetic import performer
 from torchface.synthetic.head.neutral_head import neutral_head
 from torchface.synthetic.stages.face_paint import face_paint
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_picture, render_lit_video, turning_cameras
+from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 
 PLAIN = LightStageSettings(width=120, height=120, samples=1, gloss=0.0, noise=0.0)
 AMBIENT, INTENSITY = torch.tensor([0.2, 0.3, 0.4]), torch.tensor([0.5, 0.6, 0.7])
@@ -38,7 +38,7 @@ def ball() -> Mesh:
 def test_a_ball_is_shaded_by_the_cosine() -> None:
     mesh, light = ball(), PointLight(AMBIENT, INTENSITY, torch.tensor([400.0, -300, -200]))
     camera = look_at(torch.zeros(3), 15.0, 10.0, 200.0, 120, 120)
-    picture = lit_picture(mesh, camera, light, PLAIN)
+    picture = lit_image(mesh, camera, light, PLAIN)
     origins, ways = (x.reshape(-1, 3) for x in camera.rays())
     middle = (origins * ways).sum(1)
     root = middle.square() - (origins.square().sum(1) - 80.0**2)
@@ -49,7 +49,7 @@ def test_a_ball_is_shaded_by_the_cosine() -> None:
     cosine = (normal * torch.nn.functional.normalize(lamp - point, dim=1)).sum(1).clamp(min=0)
     expected = to_linear(torch.tensor(0.6)) * (AMBIENT + INTENSITY * cosine[:, None])
     torch.testing.assert_close(picture.view(3, -1).T[on_ball].double(), expected, atol=4e-3, rtol=0)
-    glossy = lit_picture(mesh, camera, light, replace(PLAIN, gloss=0.2))
+    glossy = lit_image(mesh, camera, light, replace(PLAIN, gloss=0.2))
     assert 0.15 * 0.7 < float((glossy - picture).max()) <= 0.2 * 0.7 + 1e-6
 
 
@@ -78,7 +78,7 @@ def test_a_film_is_a_file_with_its_truth(tmp_path: Path) -> None:
     assert (video.width, video.height, video.fps, video.count) == (64, 48, 10.0, 3)
     assert told == [(1, 3), (2, 3), (3, 3)]
     frames = torch.cat(list(video.color_chunks(2))).float() / 255
-    truth = lit_picture(rig.neutral, film.cameras[1], light, settings)
+    truth = lit_image(rig.neutral, film.cameras[1], light, settings)
     assert float((to_linear(frames[1]) - truth).abs().mean()) < 0.01
     assert film.vertices.shape == (3, len(rig.vertices), 3)
 
@@ -86,7 +86,7 @@ def test_a_film_is_a_file_with_its_truth(tmp_path: Path) -> None:
 def test_what_cannot_be_filmed_is_said(tmp_path: Path) -> None:
     rig, light = performer(texture=False), PointLight(AMBIENT, INTENSITY, torch.zeros(3))
     with pytest.raises(ShapeError, match="skin"):
-        lit_picture(rig.neutral, look_at(torch.zeros(3), 0.0), light, PLAIN)
+        lit_image(rig.neutral, look_at(torch.zeros(3), 0.0), light, PLAIN)
     with pytest.raises(ShapeError, match="weights"):
         render_lit_video(tmp_path / "a.avi", rig, torch.zeros(3, 2), light, 10.0, torch.Generator(), PLAIN)
     with pytest.raises(ValueRangeError, match="noise"):
