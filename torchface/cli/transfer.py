@@ -25,7 +25,7 @@ def transfer(
 
     Args:
         template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        neutral: The new head: a mesh with the template's topology (.obj, .ply, .glb).
+        neutral: The new head: a mesh with the template's topology (.obj, .ply, .off, .glb).
         out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
         part: Keep this region of the template only, such as face; the neutral then has this part's topology.
         unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
