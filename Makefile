@@ -24,6 +24,7 @@ test: $(VENV)/.installed-test
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s
+	$(RUN) -m pytest -m bench
 
 fuzz: $(VENV)/.installed-test
 	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k mutated

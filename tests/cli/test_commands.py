@@ -340,6 +340,7 @@ def test_attach_finds_the_sites_and_draws_them(
     assert "rom.c3d: " in capsys.readouterr().err
 
 
+@pytest.mark.bench
 def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
     shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

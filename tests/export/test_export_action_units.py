@@ -41,6 +41,7 @@ def folder(classifier: ActionUnitClassifier, tmp_path: Path) -> Path:
     return tmp_path / "units"
 
 
+@pytest.mark.bench
 def test_the_command_and_the_module_write_the_same_file(
     classifier: ActionUnitClassifier, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

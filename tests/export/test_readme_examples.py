@@ -127,12 +127,14 @@ def in_python(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.bench
 def test_python_runs(in_python: dict[str, np.ndarray]) -> None:
     assert set(blocks("python")) == set(blocks("js")) == set(RESULTS)
     for title, values in in_python.items():
         assert np.isfinite(values).all(), title
 
 
+@pytest.mark.bench
 @pytest.mark.browser
 def test_javascript_computes_the_same(folder: Path, node: str, in_python: dict[str, np.ndarray]) -> None:
     """Each example is a module of its own; one node imports them one after the other."""

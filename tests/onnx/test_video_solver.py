@@ -195,6 +195,7 @@ def test_what_has_no_graph_is_refused(rig: BlendshapeRig) -> None:
         VideoGraph(VideoSolver(rig, None, K))(torch.zeros(67, 2), torch.ones(68))
 
 
+@pytest.mark.bench
 def test_the_command_writes_a_solver_of_rig_and_camera(
     rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,6 +73,7 @@ def test_the_same_input_gives_the_same_fit(mask: Mesh, waves: Waves, rescanned: 
     assert torch.equal(runs[0].coefficients, runs[1].coefficients)
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_real_shapes_known_to_the_model_do_not_slide(ict_folder: Path, rescanned: Callable) -> None:
     modes = load_identity_modes(ict_folder, part="face")

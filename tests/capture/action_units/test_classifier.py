@@ -98,6 +98,7 @@ def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, sessio
             assert torch.corrcoef(torch.stack([labelled[:, a], truth[:, a]]))[0, 1] > 0.93, group.units[a]
 
 
+@pytest.mark.bench
 def test_cross_validated_accuracy(regions: RegionVideo, session: RecordedSession) -> None:
     accuracy = cross_validation([regions], [session.labels], folds=3, split="repetitions")
     assert set(accuracy) == {group.name for group in GROUPS}
@@ -127,6 +128,7 @@ def test_planted_intensities_come_back(
     )
 
 
+@pytest.mark.bench
 def test_another_performer_is_understood(classifier: ActionUnitClassifier, other: RecordedSession) -> None:
     video = read_regions(other.video, other.labels, classifier.regions, classifier.neutral, classifier.size)
     found = level_agreement(classify(classifier, video), planted(other, classifier.units))

@@ -20,6 +20,7 @@ from torchface.take import Take, Track
 pytestmark = pytest.mark.real
 
 
+@pytest.mark.bench
 def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")
     takes = [rig.weights_from(load_take(path).weights).clamp(0, 1) for path in performances[:3]]  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ def others() -> list[BlendshapeRig]:
     return [performer(k, texture=False) for k in draw_identities(4, torch.Generator().manual_seed(0))]
 
 
+@pytest.mark.bench
 def test_transferred_shapes_are_nearer_to_the_truth_than_copied_ones(
     template: BlendshapeRig, others: list[BlendshapeRig]
 ) -> None:
@@ -28,6 +29,7 @@ def test_transferred_shapes_are_nearer_to_the_truth_than_copied_ones(
     assert float((transferred - truth).norm()) < 0.8 * float((template.deltas - truth).norm())
 
 
+@pytest.mark.bench
 def test_lids_of_other_performers_close_where_their_own_do(
     template: BlendshapeRig, others: list[BlendshapeRig]
 ) -> None:

@@ -61,6 +61,7 @@ def test_the_embedded_performer_comes_back_and_every_file_says_the_same(tmp_path
     assert len(re.findall(r"[.] ", re.findall(r"<p>(.*?)</p>", text)[0])) == 0  # the story is one sentence
 
 
+@pytest.mark.bench
 def test_a_rig_without_landmarks_and_names_gets_markers_where_it_moves(tmp_path: Path) -> None:
     scene = embedded_scene(seed=1, frames=20)
     some = slice(None, None, 4)
