@@ -10,26 +10,17 @@ Readers of whatever format are tested alike::
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import inspect
-import json
-import multiprocessing
 import os
 import random
 import re
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from multiprocessing.forkserver import ensure_running
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
-SECONDS = 2.0
-MEGABYTES = 500
+from reader_budget import MEGABYTES, SECONDS, find_reader, limit_memory, peak_megabytes, place_of, run_child
 
 _NUMBERS = (
     *(b"-1", b"0", b"1", b"3", b"255", b"65536", b"2147483647", b"2147483648", b"4294967295", b"9999999999"),
@@ -47,8 +38,6 @@ _INSERTS = (
 )
 _NUMBER_TEXT = re.compile(rb"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _KINDS = ("flip", "insert", "delete", "truncate", "splice", "repeat", "number", "number", "number", "word")
-
-_STDERR, _REPORT = "stderr.txt", "report.json"
 
 Operation = tuple[str, int, int, int]
 """What is done, and three numbers that say where and with what (each taken modulo what there is)."""
@@ -131,58 +120,32 @@ def check_reader(
     Raises:
         AssertionError: a case escaped; the message tells which bytes.
     """
-    job = {
-        "file": inspect.getfile(reader),
-        "module": reader.__module__,
-        "reader": reader.__qualname__,
-        "seeds": [str(path) for path in seed_files],
-        "suffix": suffix,
-        "name": name,
-        "cases": cases or int(os.environ.get("TORCHFACE_FUZZ_CASES", "200")),
-    }
     with tempfile.TemporaryDirectory(prefix="mutated-") as folder:
-        child = _children().Process(target=_run_child, args=(job, Path(folder)))
-        child.start()
-        # A child whose every case takes the allowed time is still ended some day.
-        child.join(120 + SECONDS * int(job["cases"]))
-        if child.is_alive():
-            child.kill()
-            child.join()
         case = Path(folder, name + suffix)
-        if child.exitcode != 0:
+        job = {
+            **place_of(reader),
+            "seeds": [str(path) for path in seed_files],
+            "case": str(case),
+            "cases": cases or int(os.environ.get("TORCHFACE_FUZZ_CASES", "200")),
+        }
+        try:
+            # A child whose every case takes the allowed time is still ended some day.
+            return Report(**run_child(_run, job, 120 + SECONDS * int(job["cases"])))
+        except AssertionError as escaped:
             kept = Path(tempfile.gettempdir(), f"torchface-{reader.__qualname__}{suffix}")
             kept.write_bytes(case.read_bytes() if case.is_file() else b"")
-            raise AssertionError(
-                f"{reader.__qualname__}: the child ended with {child.exitcode}; its last case is kept as {kept}\n"
-                f"{Path(folder, _STDERR).read_text(errors='replace')[-6000:]}"
-            )
-        return Report(**json.loads(Path(folder, _REPORT).read_text()))
+            raise AssertionError(f"the last case is kept as {kept}\n{escaped}") from None
 
 
-def _children() -> Any:
-    """Where children are forked from: a process of one thread that has paid for the imports once."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchface.io", "torchface.zoo", "pytest", "hypothesis"])
-    with patch.dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MALLOC_ARENA_MAX="2"):
-        ensure_running()
-    return context
-
-
-def _run_child(job: dict[str, Any], folder: Path) -> None:
-    os.dup2(os.open(folder / _STDERR, os.O_WRONLY | os.O_CREAT), sys.stderr.fileno())
-    (folder / _REPORT).write_text(json.dumps(_run(job, folder).__dict__))
-
-
-def _run(job: dict[str, Any], folder: Path) -> Report:
+def _run(job: dict[str, Any], folder: Path) -> dict[str, Any]:
     from torchface.errors import TorchfaceError
 
-    reader = _find_reader(job)
+    reader, case = find_reader(job), Path(job["case"])
     seeds = [Path(path).read_bytes() for path in job["seeds"]]
-    case = folder / (job["name"] + job["suffix"])
     for good in seeds:  # imports, thread pools and caches are paid for before the limits hold
         case.write_bytes(good)
         reader(case)
-    _limit_memory()
+    limit_memory(MEGABYTES)
     outcome = {"cases": 0, "read": 0, "refused": 0}
     slowest = 0.0
 
@@ -199,38 +162,4 @@ def _run(job: dict[str, Any], folder: Path) -> Report:
         outcome["cases"] += 1
         slowest = max(slowest, taken)
         assert taken <= SECONDS, f"the case took {taken:.1f} s, expected at most {SECONDS} s"
-    return Report(**outcome, slowest_seconds=slowest, peak_megabytes=_peak_megabytes())
-
-
-def _find_reader(job: dict[str, Any]) -> Callable[[Path], Any]:
-    if job["module"].startswith("torchface."):
-        module = importlib.import_module(job["module"])
-    else:  # a test file is no importable module
-        spec = importlib.util.spec_from_file_location("reader_under_test", job["file"])
-        if spec is None or spec.loader is None:
-            raise ImportError(job["file"])
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return getattr(module, job["reader"])
-
-
-def _limit_memory() -> None:
-    status = Path("/proc/self/status")
-    if not status.exists():  # only Linux both tells the size and keeps the limit
-        return
-    import resource
-
-    now = int(re.findall(r"VmSize:\s+(\d+) kB", status.read_text())[0]) * 1024
-    resource.setrlimit(resource.RLIMIT_AS, (now + MEGABYTES * 2**20, now + MEGABYTES * 2**20))
-    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
-    _START["resident"] = float(re.findall(r"VmRSS:\s+(\d+) kB", status.read_text())[0])
-
-
-_START: dict[str, float] = {}
-
-
-def _peak_megabytes() -> float:
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return float("nan")
-    return (float(re.findall(r"VmHWM:\s+(\d+) kB", status.read_text())[0]) - _START["resident"]) / 1024
+    return asdict(Report(**outcome, slowest_seconds=slowest, peak_megabytes=peak_megabytes()))
