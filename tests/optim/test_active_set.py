@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from torchface.errors import ValueRangeError
 from torchface.optim.active_set import projected_newton, solve_free
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.operator_splitting import prepare_splitting, splitting_steps, start_splitting
@@ -81,3 +83,16 @@ def test_splitting_with_an_h_each_is_splitting_of_each() -> None:
         one = BoxProblem.of(H[row], given.f[row : row + 1], given.lower, given.upper)
         alone = splitting_steps(one, prepare_splitting(H[row]), start_splitting(one, None), 7).z
         torch.testing.assert_close(together[row : row + 1], alone, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [float("nan"), float("inf"), -1e-9])
+def test_newton_steps_need_a_tolerance(tolerance: float) -> None:
+    given = problem(problems=2)
+    with pytest.raises(ValueRangeError, match="tolerance: found"):
+        projected_newton(given, torch.zeros(2, 12, dtype=torch.float64), tolerance)
+
+
+@pytest.mark.parametrize(("rho", "relaxation"), [(0.0, 1.5), (float("nan"), 1.5), (0.1, 0.0), (0.1, 2.5)])
+def test_splitting_needs_a_metric_and_a_relaxation(rho: float, relaxation: float) -> None:
+    with pytest.raises(ValueRangeError, match="prepare_splitting: r"):
+        prepare_splitting(torch.eye(3, dtype=torch.float64), rho, relaxation)

@@ -191,12 +191,46 @@ def broken(**changes: object) -> tuple[tuple[Tensor, Tensor], dict[str, object]]
         ({"lower": INF, "upper": INF}, ValueRangeError, "nothing can meet"),
         ({"start": torch.zeros(1, 3)}, ShapeError, "found start"),
         ({"H": torch.zeros(3, 3), "f": torch.ones(2, 3), "lower": -INF}, ValueRangeError, "no minimum"),
+        ({"H": torch.zeros(3, 3), "f": torch.ones(2, 3), "lower": -1e30}, ValueRangeError, r"bounds reach 1e\+30"),
+        ({"H": torch.ones(3, 3), "f": torch.eye(3)[:2], "lower": -1e12, "upper": 1e12}, ValueRangeError, "falls"),
+        ({"f": torch.full((2, 3), 1e35)}, ValueRangeError, "times the diagonal of H"),
+        *(
+            ({"tolerance": bad}, ValueRangeError, "tolerance: found")
+            for bad in (math.nan, INF, -1e-6, 1e300, 1.0, True, "fine")
+        ),
     ],
 )
 def test_bad_input_says_what_is_wrong(changes: dict[str, object], error: type[Exception], says: str) -> None:
     arguments, rest = broken(**changes)
     with pytest.raises(error, match=says):
         box_qp(*arguments, **rest)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("tolerance", [math.nan, INF, -1.0])
+def test_a_module_checks_its_tolerance(tolerance: float) -> None:
+    with pytest.raises(ValueRangeError, match="tolerance: found"):
+        BoxQP(torch.eye(3), tolerance=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bound", [1e4, 1e12, 1e30, INF])
+def test_wide_bounds_agree_with_scipy(bound: float, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(5)
+    A = torch.randn(20, 6, generator=generator, dtype=torch.float64)
+    targets = 3 * torch.randn(5, 20, generator=generator, dtype=torch.float64)
+    lower = torch.tensor([-bound, -bound, 0.0, -0.1, -bound, -1.0], dtype=torch.float64)
+    upper = torch.tensor([bound, 0.0, bound, 0.1, bound, 1.0], dtype=torch.float64)
+    found = box_qp((A.T @ A).to(dtype), (-targets @ A).to(dtype), lower, upper)
+    for target, x in zip(targets, found, strict=True):
+        reference = lsq_linear(A.numpy(), target.numpy(), (lower.numpy(), upper.numpy()), method="bvls", tol=1e-14).x
+        np.testing.assert_allclose(x.numpy(), reference, atol=1e-9 if dtype == torch.float64 else 3e-5)
+
+
+@pytest.mark.parametrize("steepness", [1e12, 1e20, 1e29])
+def test_a_steep_slope_leads_to_the_bounds(steepness: float) -> None:
+    H = hessian(6, 0.5, 20.0)
+    f = torch.randn(10, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.equal(box_qp(H, f * steepness), (f < 0).double())
 
 
 def test_the_module_follows_its_hessian() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from sklearn.cluster import MeanShift
 
-from torchface.errors import ShapeError
+from torchface.errors import ShapeError, ValueRangeError
 from torchface.optim.mean_shift import mean_shift
 
 
@@ -52,3 +52,19 @@ def test_labels_name_the_nearest_centre() -> None:
 def test_no_point_is_refused() -> None:
     with pytest.raises(ShapeError, match="at least one"):
         mean_shift(torch.zeros(0, 2), 10.0)
+
+
+@pytest.mark.parametrize("bandwidth", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_bandwidth_that_is_no_length_is_refused(bandwidth: float) -> None:
+    with pytest.raises(ValueRangeError, match="bandwidth: found"):
+        mean_shift(blobs(0), bandwidth)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_points_and_weights_are_numbers(bad: float) -> None:
+    points = blobs(0)
+    with pytest.raises(ValueRangeError, match="weights hold"):
+        mean_shift(points, 10.0, torch.full((len(points),), bad))
+    points[3, 1] = bad
+    with pytest.raises(ValueRangeError, match="points hold"):
+        mean_shift(points, 10.0)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from torchface.errors import ValueRangeError
 from torchface.optim import warm_active_set
 from torchface.optim.warm_active_set import solve_from_active_set
 
@@ -54,3 +55,21 @@ def test_singular_programs_and_sets_that_do_not_settle_are_solved_too(monkeypatc
     wanted = solve_from_active_set(H, f, lower, upper, start, 1e-9)
     monkeypatch.setattr(warm_active_set, "_CHANGES", 0)
     torch.testing.assert_close(solve_from_active_set(H, f, lower, upper, start, 1e-9), wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"tolerance": float("nan")}, "tolerance: found nan"),
+        ({"tolerance": -1.0}, "tolerance: found -1"),
+        ({"iterations": -3}, "iterations: found -3"),
+        ({"iterations": 2.5}, "iterations: found 2.5"),
+        ({"lower": torch.full((4,), torch.nan)}, "lower holds NaN"),
+        ({"lower": torch.full((4,), 2.0)}, "lower 2.0 above upper 1.0"),
+    ],
+)
+def test_settings_and_bounds_are_checked(changes: dict[str, Tensor | float], says: str) -> None:
+    H, f, _, _, start = program(0, 4, 8)
+    given = {"lower": torch.zeros(4), "upper": torch.ones(4), "tolerance": 1e-9, "iterations": 50, **changes}
+    with pytest.raises(ValueRangeError, match=says):
+        solve_from_active_set(H, f, start=start, **given)  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.number_checks import checked_count, checked_number
 from torchface.optim.box_problem import BoxProblem
 
 # Numbers in the matrices factored at once: 2 MB of float64 stay in a CPU's cache; an accelerator wants more.
@@ -39,7 +40,12 @@ def projected_newton(
         iterations: at most so many steps.
         careful: search where the full step does not descend, and so descend always; otherwise leave such a problem
             where it stands, too far from its solution for Newton steps to be worth their cost.
+
+    Raises:
+        ValueRangeError: ``tolerance`` or ``iterations`` is negative or no number.
     """
+    checked_number("projected_newton: tolerance", tolerance)
+    checked_count("projected_newton: iterations", iterations)
     numbers = _CHUNK_NUMBERS.get(start.device.type, _CHUNK_NUMBERS["other"])
     chunk = max(1, numbers // problem.f.shape[1] ** 2)
     x = start.clone()

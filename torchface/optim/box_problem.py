@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.errors import ValueRangeError
+
 # Below this share of the largest, a diagonal entry counts as zero: the variable is as good as linear.
 _SMALLEST_DIAGONAL = 1e-12
 
@@ -71,9 +73,33 @@ class BoxProblem:
         open_ = residuals.amax(-1) > tolerance
         if not bool(open_.any()):
             return open_
+        gradient = self.gradient(x) if gradient is None else gradient
         sums = BoxProblem(self.H.abs(), self.f.abs(), self.lower, self.upper, self.diagonal).gradient(x.abs())
-        rounding = 4 * torch.finfo(x.dtype).eps * sums / self.diagonal / (1 + x.abs())
-        return (residuals > rounding.clamp(min=tolerance)).any(-1)
+        rounding = 4 * torch.finfo(x.dtype).eps * sums
+        above = residuals > (rounding / self.diagonal / (1 + x.abs())).clamp(min=tolerance)
+        # What rounding may have added to a steep gradient is longer than a box, and its sign still certain.
+        certain = self.residuals(x, gradient.sign() * (gradient.abs() - rounding).clamp(min=0)) > tolerance
+        return (above | certain).any(-1)
+
+
+def check_box(name: str, lower: Tensor, upper: Tensor) -> None:
+    """Checks bounds (N,): numbers, or infinite for none, and none above the other.
+
+    Raises:
+        ValueRangeError: a bound is NaN, ``lower`` exceeds ``upper``, or no number can meet one.
+    """
+    if bool(((lower <= upper) & (lower < torch.inf) & (upper > -torch.inf)).all()):
+        return
+    for which, bound in (("lower", lower), ("upper", upper)):
+        if torch.isnan(bound).any():
+            raise ValueRangeError(f"{name}: {which} holds NaN, expected numbers or infinity")
+    crossed = (lower > upper).nonzero()[:, 0]
+    if len(crossed):
+        where = int(crossed[0])
+        raise ValueRangeError(
+            f"{name}: found lower {float(lower[where])} above upper {float(upper[where])} at variable {where}"
+        )
+    raise ValueRangeError(f"{name}: found a lower bound of inf or an upper bound of -inf, which nothing can meet")
 
 
 def metric(H: Tensor) -> Tensor:

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, TraceError, ValueRangeError
+from torchface.number_checks import checked_number
 from torchface.optim.active_set import projected_newton
-from torchface.optim.box_problem import BoxProblem, metric
+from torchface.optim.box_problem import BoxProblem, check_box, metric
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.operator_splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
 from torchface.optim.prepared_tensors import Prepared
@@ -26,6 +27,12 @@ _COARSE = 1e-7
 # The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
 # variable alone would go, or where the residual itself is still this share of that way.
 _RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
+# A tolerance above it calls nearly every start a solution.
+_COARSEST = 0.5
+# Bounds within it end any run before the residual, relative to x, can call it solved.
+_NEAR_BOUND = 1e3
+# Splitting runs in float32, whose numbers end at 3e38.
+_STEEPEST = 1e30
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # Numbers in one chunk of frames: three buffers of it stay in a CPU's second-level cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**23}
@@ -53,7 +60,7 @@ def box_qp(
         upper: a number or (N,); ``inf`` for none.
         start: a guess, (B,N), such as the frame before; the answer does not depend on it where it is unique.
         tolerance: on the residual :math:`\max |x - clip(x - (Hx+f)/\mathrm{diag} H)|`, relative to :math:`1 + |x|`;
-            3e-6 for float32 and 1e-11 for float64 if absent.
+            3e-6 for float32 and 1e-11 for float64 if absent; at most 0.5, and 0 for as near as rounding lets it.
 
     Returns:
         x, (B,N), within the bounds exactly. Where H is singular and the minimiser not unique, one of them.
@@ -61,7 +68,8 @@ def box_qp(
     Raises:
         ShapeError: the shapes do not fit each other.
         ValueRangeError: H or f is not finite, H is not symmetric or has a negative eigenvalue, ``lower`` exceeds
-            ``upper``, or infinite bounds leave the objective unbounded below.
+            ``upper``, f is more than 1e30 times H's diagonal, ``tolerance`` is not in [0,0.5], or the objective falls
+            without end because bounds are infinite or, where H is singular, so wide that no solution comes near them.
 
     Source: thesis 4.1.4 and appendix, equations 67 and 68.
 
@@ -73,6 +81,7 @@ def box_qp(
     with torch.no_grad():
         prepared = _PreparedHessian.of(H)
         bounds = _checked_bounds(lower, upper, prepared.exact)
+        tolerance = _checked_tolerance(tolerance, H.dtype)
     return _minimiser(H, prepared, f, *bounds, start, tolerance)
 
 
@@ -107,7 +116,7 @@ class BoxQP(nn.Module):
         tolerance: float | None = None,
     ) -> None:
         super().__init__()
-        self.tolerance = tolerance
+        self.tolerance = tolerance if tolerance is None else _checked_tolerance(tolerance, H.dtype)
         if isinstance(H, nn.Parameter):
             self.H = H
         else:
@@ -119,7 +128,8 @@ class BoxQP(nn.Module):
 
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
-        return _minimiser(self.H, self._prepare(), f, self.lower, self.upper, start, self.tolerance)
+        tolerance = _TOLERANCE[self.H.dtype] if self.tolerance is None else self.tolerance
+        return _minimiser(self.H, self._prepare(), f, self.lower, self.upper, start, tolerance)
 
     def _prepare(self) -> _PreparedHessian:
         return self._prepared.get((self.H,), lambda: _PreparedHessian.of(self.H))
@@ -148,7 +158,7 @@ def _minimiser(
     lower: Tensor,
     upper: Tensor,
     start: Tensor | None,
-    tolerance: float | None,
+    tolerance: float,
 ) -> Tensor:
     """The minimisers (B,N), differentiable in H and f where these ask for it."""
     if torch.jit.is_tracing():
@@ -157,7 +167,6 @@ def _minimiser(
             "expected an ONNX graph made by `torchface export solver` (or torchface.onnx), which fixes the iterations"
         )
     _check_vectors(H, f, start)
-    tolerance = _TOLERANCE[H.dtype] if tolerance is None else tolerance
     lower, upper = lower.double(), upper.double()
     if torch.is_grad_enabled() and (H.requires_grad or f.requires_grad):
         solution: Tensor = BoxSolution.apply(
@@ -180,6 +189,7 @@ def _solve_in_chunks(
         rows = slice(first, first + chunk)
         H = prepared.exact if shared else prepared.exact[rows]
         problem = BoxProblem.of(H, f[rows].double(), lower, upper)
+        _check_slope(problem)
         factors = prepare_splitting(H) if prepared.factors is None else prepared.factors
         x = _solve(problem, factors, None if start is None else start[rows].double(), tolerance)
         # Rounding to float32 must not step over a bound.
@@ -250,18 +260,14 @@ def _checked_bounds(lower: float | Tensor, upper: float | Tensor, H: Tensor) -> 
         bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
         if bound.ndim and bound.shape != (variables,):
             raise ShapeError(f"box_qp: found {name} {tuple(bound.shape)}, expected a number or ({variables},)")
-        if torch.isnan(bound).any():
-            raise ValueRangeError(f"box_qp: {name} holds NaN, expected numbers or infinity")
         bounds.append(bound.expand(variables).contiguous())
     low, high = bounds
-    if (low > high).any():
-        where = int((low > high).nonzero()[0, 0])
-        raise ValueRangeError(
-            f"box_qp: found lower {float(low[where])} above upper {float(high[where])} at variable {where}"
-        )
-    if (low == torch.inf).any() or (high == -torch.inf).any():
-        raise ValueRangeError("box_qp: found a lower bound of inf or an upper bound of -inf, which nothing can meet")
+    check_box("box_qp", low, high)
     return low, high
+
+
+def _checked_tolerance(tolerance: float | None, dtype: torch.dtype) -> float:
+    return _TOLERANCE[dtype] if tolerance is None else checked_number("box_qp: tolerance", tolerance, 0.0, _COARSEST)
 
 
 def _check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
@@ -278,13 +284,28 @@ def _check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
             raise ValueRangeError(f"box_qp: {name} holds NaN or infinite entries in rows {bad[:5]}")
 
 
+def _check_slope(problem: BoxProblem) -> None:
+    steep = problem.f.abs() > _STEEPEST * problem.diagonal
+    if bool(steep.any()):
+        found = float((problem.f.abs() / problem.diagonal).amax())
+        raise ValueRangeError(
+            f"box_qp: found f {found:.2g} times the diagonal of H, expected at most {_STEEPEST:.0e} times: beyond it "
+            "numbers overflow; is a weight of a term far too large or too small?"
+        )
+
+
 def _check_bounded(problem: BoxProblem, x: Tensor) -> None:
-    if torch.isfinite(problem.lower).all() and torch.isfinite(problem.upper).all():
+    wide = torch.maximum(problem.lower.abs(), problem.upper.abs()).amax()
+    if wide <= _NEAR_BOUND:
         return
     scale = 1 + (problem.f / problem.diagonal).abs().amax(-1)
     step = x - problem.clip(x - problem.gradient(x) / problem.diagonal)
-    lost = (x.abs().amax(-1) > _RUN_AWAY * scale) | (step.abs().amax(-1) > _STILL_MOVING * scale)
+    far = torch.where((x > problem.lower) & (x < problem.upper), x.abs(), 0.0).amax(-1)
+    lost = (far > _RUN_AWAY * scale) | (step.abs().amax(-1) > _STILL_MOVING * scale)
     if lost.any():
         raise ValueRangeError(
             f"box_qp: the objective of {int(lost.sum())} problems has no minimum: H is singular, bounds infinite"
+            if torch.isinf(wide)
+            else f"box_qp: the objective of {int(lost.sum())} problems falls farther than numbers carry: H is "
+            f"singular, bounds reach {float(wide):g}; expected bounds near the solutions, or a ridge on H"
         )

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import checked_number
 
 _ROUNDS = 100
 
@@ -33,14 +34,21 @@ def mean_shift(points: Tensor, bandwidth: float, weights: Tensor | None = None) 
         weights: how often each point counts, (N,); once if absent.
 
     Raises:
-        ShapeError: there is no point.
+        ShapeError: there is no point, or another number of weights.
+        ValueRangeError: a point is NaN or infinite, a weight negative or NaN, or ``bandwidth`` not positive.
 
     Source: Comaniciu and Meer 2002; the same rules as scikit-learn's ``MeanShift(bin_seeding=True)``.
     """
     if points.ndim != 2 or len(points) == 0:
         raise ShapeError(f"mean_shift: found points {tuple(points.shape)}, expected (N,D) with at least one")
+    checked_number("mean_shift: bandwidth", bandwidth, above=True)
     positions = points.double()
     weight = torch.ones(len(points), dtype=torch.float64) if weights is None else weights.double()
+    if weight.shape != (len(points),):
+        raise ShapeError(f"mean_shift: found weights {tuple(weight.shape)}, expected ({len(points)},)")
+    for name, numbers, least in (("points", positions, -torch.inf), ("weights", weight, 0.0)):
+        if not bool((torch.isfinite(numbers) & (numbers >= least)).all()):
+            raise ValueRangeError(f"mean_shift: {name} hold NaN, infinite or negative entries, expected numbers")
     seeds = (positions / bandwidth).round().unique(dim=0) * bandwidth
     moving = torch.arange(len(seeds))
     for _ in range(_ROUNDS):  # each round starts where the last one ended

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.number_checks import checked_count, checked_number
 from torchface.optim.box_problem import BoxProblem, metric
 
 # Measured on a real rig of 53 shapes, whose eigenvalues span five decades.
@@ -70,7 +71,13 @@ class SplittingState:
 
 
 def prepare_splitting(H: Tensor, rho: float = RHO, relaxation: float = RELAXATION) -> SplittingFactors:
-    """Factors H (N,N) or (B,N,N), float64."""
+    """Factors H (N,N) or (B,N,N), float64.
+
+    Raises:
+        ValueRangeError: ``rho`` is not positive, or ``relaxation`` not in (0,2].
+    """
+    checked_number("prepare_splitting: rho", rho, above=True)
+    checked_number("prepare_splitting: relaxation", relaxation, 0.0, 2.0, above=True)
     diagonal = metric(H)
     lifted = H.clone()
     lifted.diagonal(dim1=-2, dim2=-1).add_(rho * diagonal)
@@ -106,7 +113,11 @@ def splitting_steps(
         steps: how many.
         gradient: of the problem at ``state.z``, (B,N), if it is at hand.
         dtype: in which the steps run; what goes in and comes out is float64.
+
+    Raises:
+        ValueRangeError: ``steps`` is negative or no whole number.
     """
+    checked_count("splitting_steps: steps", steps)
     gradient = problem.gradient(state.z) if gradient is None else gradient
     constant = factors.constant(state.z, gradient).to(dtype)
     lower, upper, step = problem.lower.to(dtype), problem.upper.to(dtype), factors.step.to(dtype)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchface.number_checks import checked_count, checked_number
 from torchface.optim.active_set import projected_newton
-from torchface.optim.box_problem import BoxProblem, metric
+from torchface.optim.box_problem import BoxProblem, check_box, metric
 
 _CHANGES = 12
 
@@ -31,8 +32,14 @@ def solve_from_active_set(
     Returns:
         (N,), without gradients.
 
+    Raises:
+        ValueRangeError: a bound is NaN or above the other, or ``tolerance`` or ``iterations`` is out of range.
+
     Source: Hintermüller, Ito and Kunisch 2002, The primal-dual active set strategy as a semismooth Newton method.
     """
+    check_box("solve_from_active_set", lower, upper)
+    checked_number("solve_from_active_set: tolerance", tolerance)
+    checked_count("solve_from_active_set: iterations", iterations)
     H, f = H.detach(), f.detach()
     slope = torch.addmv(f, H, start)
     at_lower, at_upper = (start <= lower) & (slope > 0), (start >= upper) & (slope < 0)
