@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from typing import TypeVar
+from pathlib import Path
+from typing import Protocol, TypeVar
 
 import tyro
 
 from torchface.cli.progress import progress_bars
 from torchface.errors import TorchfaceError
+from torchface.files.job_lock import job_lock
 from torchface.progress import Progress
 
-Settings = TypeVar("Settings")
+
+class HasOut(Protocol):
+    """Settings of a recipe: they say at least where its results go."""
+
+    @property
+    def out(self) -> Path: ...
+
+
+Settings = TypeVar("Settings", bound=HasOut)
 Trained = TypeVar("Trained")
 
 
@@ -25,14 +35,14 @@ def run(
     """Parses flags, trains, prints; a mistake of the user ends it with one line.
 
     Args:
-        settings: the recipe's dataclass.
+        settings: the recipe's dataclass; ``out`` is held for this run.
         train: learns, evaluates and saves.
         description: of the recipe, for ``--help``.
         lines: what is printed of the settings and the trained model.
     """
     chosen = tyro.cli(settings, description=description)
     try:
-        with progress_bars() as progress:
+        with job_lock(chosen.out), progress_bars() as progress:
             trained = train(chosen, progress)
         for line in lines(chosen, trained):
             print(line)

@@ -42,42 +42,46 @@ def annotate(
         port: The first port to try.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
 
     if browser:
         from torchface.viz.browser.browser_page import import_viser
 
         import_viser()
-    with progress_bars(quiet) as progress:
+    with job_lock(out):
+        with progress_bars(quiet) as progress:
 
-        def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
-            from torchface import zoo
-            from torchface.errors import NameMismatchError
-            from torchface.landmarks import LandmarkTrees
-            from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
+            def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
+                from torchface import zoo
+                from torchface.errors import NameMismatchError
+                from torchface.landmarks import LandmarkTrees
+                from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
 
-            model = zoo.get_model(landmarks)
-            if not isinstance(model, LandmarkTrees):
-                raise NameMismatchError(
-                    f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
-                )
-            found = track_landmarks(video, LandmarkTracker(model, face=face), progress)
-            return found.values, found.confidence
+                model = zoo.get_model(landmarks)
+                if not isinstance(model, LandmarkTrees):
+                    raise NameMismatchError(
+                        f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
+                    )
+                found = track_landmarks(video, LandmarkTracker(model, face=face), progress)
+                return found.values, found.confidence
 
-        progress("reading")
-        annotation = prepare_annotation(video, out, track, count)
-    if not browser:
-        for path in write_proposals(annotation):
-            print(path)
-        return
-    from torchface.viz.browser.annotation_session import AnnotationSession
-    from torchface.viz.browser.landmark_editor import LandmarkEditor
+            progress("reading")
+            annotation = prepare_annotation(video, out, track, count)
+        if not browser:
+            for path in write_proposals(annotation):
+                print(path)
+            return
+        from torchface.viz.browser.annotation_session import AnnotationSession
+        from torchface.viz.browser.landmark_editor import LandmarkEditor
 
-    session = AnnotationSession(annotation.frames, annotation.folder, annotation.saved)
-    editor = LandmarkEditor(session, video.stem, port)
-    console.print(f"{len(annotation.saved)} of {len(annotation.frames)} frames are saved. Open this page; Ctrl+C ends.")
-    print(editor.url, flush=True)
-    try:
-        editor.wait()
-    except KeyboardInterrupt:
-        editor.stop()
+        session = AnnotationSession(annotation.frames, annotation.folder, annotation.saved)
+        editor = LandmarkEditor(session, video.stem, port)
+        console.print(
+            f"{len(annotation.saved)} of {len(annotation.frames)} frames are saved. Open this page; Ctrl+C ends."
+        )
+        print(editor.url, flush=True)
+        try:
+            editor.wait()
+        except KeyboardInterrupt:
+            editor.stop()

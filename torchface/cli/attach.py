@@ -47,10 +47,11 @@ def attach(
             uncertain.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.workflows.attach_markers import attach as find_sites
     from torchface.workflows.marker_input import MarkerOptions
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out), progress_bars(quiet) as progress:
         options = MarkerOptions(unit, labels, frames)
         report = find_sites(rig, rom, out, initial, standoff, picture, part, progress, options, insist)
     print_lines(report.lines())

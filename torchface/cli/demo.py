@@ -32,10 +32,11 @@ def demo(
         seed: Decides the random head, the noise and the gaps.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
     from torchface.workflows.demo.run_demo import run_demo, scene_from
 
-    with progress_bars(quiet) as progress:
+    with job_lock(out), progress_bars(quiet) as progress:
         progress("preparing head and take")
         scene = scene_from(template, take, target, seed)
         result = run_demo(scene, out, seed, progress=progress)

@@ -55,6 +55,7 @@ def evaluate(
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings
     from torchface.workflows.evaluate.compare_with_truth import evaluate as run
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
@@ -63,7 +64,7 @@ def evaluate(
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     choice = True if align else False if as_is else None
     settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
-    with progress_bars(quiet) as progress:
+    with job_lock(out), progress_bars(quiet) as progress:
         found = run(result, truth, out, settings, progress)
         progress("drawing")
         page = write_evaluation_page(found, out, height)

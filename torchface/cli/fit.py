@@ -58,12 +58,13 @@ def fit(
         insist: Write a rig also where the photographs do not seem to show one person.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.modeling import FitSettings
     from torchface.workflows.fit.photograph_rig import fit_photographs
     from torchface.workflows.rig_names import naming_lines
 
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
-    with progress_bars(quiet) as progress:
+    with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(
             photographs,
             landmarks,

@@ -76,6 +76,7 @@ def solve(
         quiet: Show no progress.
     """
     from torchface.errors import FileFormatError, ValueRangeError
+    from torchface.files.job_lock import file_lock
     from torchface.workflows.marker_input import MarkerOptions
     from torchface.workflows.solve.head_camera import HeadCamera
     from torchface.workflows.solve.solve_take import SolveSettings, solve_take
@@ -89,7 +90,7 @@ def solve(
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
     options = MarkerOptions(unit, labels, frames)
-    with progress_bars(quiet) as progress:
+    with file_lock(out), progress_bars(quiet) as progress:
         done = solve_take(
             rig, take, attachment, out, animation, settings, part, report, stream, camera, progress, options, live_link
         )

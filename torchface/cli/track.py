@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -74,11 +75,12 @@ def track(
 
 
 def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> None:
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.track.track_page import write_track_page
     from torchface.workflows.track.track_video import TrackSettings, track_video
 
     assert isinstance(settings, TrackSettings)
-    with progress_bars(quiet) as progress:
+    with job_lock(out), progress_bars(quiet) as progress:
         tracked = track_video(video, rig, out, settings, progress)
         progress("writing the report")
         page = write_track_page(tracked, out, settings.texture)
@@ -91,11 +93,12 @@ def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> N
 def _live(
     camera: str, rig: Path, address: str, out: Path | None, settings: object, seconds: float | None, quiet: bool
 ) -> None:
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.live.live_track import track_live
     from torchface.workflows.track.track_video import TrackSettings
 
     assert isinstance(settings, TrackSettings)
-    with progress_bars(quiet) as progress:
+    with nullcontext() if out is None else job_lock(out), progress_bars(quiet) as progress:
         report = track_live(camera, rig, address, out, settings, seconds, progress)
     for line in report.lines():
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -60,7 +60,7 @@ def make_folder(folder: str | Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
         raise FileFormatError(
-            f"{folder}: found no folder, and none can be made ({getattr(error, 'strerror', error)}); expected a place "
+            f"{folder}: found no folder, and it cannot be made ({getattr(error, 'strerror', error)}); expected a place "
             "that can be written to"
         ) from error
     return folder

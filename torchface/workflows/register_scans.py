@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError
+from torchface.files.job_lock import job_lock
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, load_rig
 from torchface.io.rigs.ict_facekit import region
@@ -74,24 +75,25 @@ def register_scans(
         AlignmentError: not one scan could be registered; table and contact sheet are written all the same.
         TorchfaceError: the template, ``out`` or a setting is of no use.
     """
-    mesh = load_template(template, part)
-    learned = None if model is None else load_shape_model(model)
-    report = register_corpus(
-        mesh,
-        scans,
-        out,
-        jobs,
-        cluster,
-        progress,
-        finished=finished,
-        landmarks=landmarks,
-        unit=unit,
-        detector=None if detector is None else zoo.find(detector),
-        model=learned,
-        texture_size=texture_size,
-    )
-    picture = contact_sheet(report, mesh, progress)
-    save_rendered_image(picture, report.out / CONTACT_SHEET)
+    with job_lock(out):
+        mesh = load_template(template, part)
+        learned = None if model is None else load_shape_model(model)
+        report = register_corpus(
+            mesh,
+            scans,
+            out,
+            jobs,
+            cluster,
+            progress,
+            finished=finished,
+            landmarks=landmarks,
+            unit=unit,
+            detector=None if detector is None else zoo.find(detector),
+            model=learned,
+            texture_size=texture_size,
+        )
+        picture = contact_sheet(report, mesh, progress)
+        save_rendered_image(picture, report.out / CONTACT_SHEET)
     if not report.registered:
         raise AlignmentError(
             f"{out}: none of {len(report.entries)} scans could be registered, see {report.summary.name}; the first, "

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.whole_files import write_file
+from torchface.files.job_lock import within_job
 from torchface.io.length_units import millimetres_per
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.mesh import Mesh
@@ -26,11 +24,6 @@ from torchface.registration.landmark_files import landmark_file
 from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.scan_preparation import check_template
-
-try:
-    import fcntl
-except ImportError:  # Windows has none; two runs into one folder then go unnoticed
-    fcntl = None  # type: ignore[assignment]
 
 SCAN_ENDINGS = (*MESH_ENDINGS, ".glb", ".gltf")
 SUMMARY = "summary.csv"
@@ -124,7 +117,6 @@ def register_corpus(
     folder = Path(out).resolve()
     marks = None if landmarks is None else _folder("landmarks", landmarks)
     _check_apart(folder, files, marks)
-    _make(folder)
     job = CorpusJob(
         template,
         folder,
@@ -136,7 +128,7 @@ def register_corpus(
     )
     tasks = _tasks(job, files, marks)
     progress = progress or silent
-    with _only_run(folder):
+    with within_job(folder):
         for left_over in folder.glob(".*.part"):
             left_over.unlink(missing_ok=True)
         kept = [entry for task in tasks if (entry := finished_entry(task, job.out)) is not None]
@@ -256,33 +248,3 @@ def _check_apart(folder: Path, files: list[Path], marks: Path | None) -> None:
     """Results and records must not fall onto scans or landmarks of the same name."""
     if marks == folder or any(path.parent == folder for path in files):
         raise ValueRangeError(f"out: found {folder}, which holds scans or landmarks; expected another folder")
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
-    trial = folder / ".writable"
-    write_file(trial, b"1")
-    trial.unlink()
-
-
-@contextmanager
-def _only_run(folder: Path) -> Iterator[None]:
-    """Holds the folder for this run; the system lets go of it however the run ends."""
-    try:
-        handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be written to ({error.strerror})") from error
-    try:
-        if fcntl is not None:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ValueRangeError(f"out: found another run writing into {folder}, expected none") from None
-            except OSError:  # a file system without locks
-                pass
-        yield
-    finally:
-        os.close(handle)

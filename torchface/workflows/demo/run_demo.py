@@ -18,6 +18,7 @@ from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.capture.markers import Observability, observability
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error, weight_jitter
+from torchface.files.job_lock import within_job
 from torchface.io import (
     IdentityModes,
     load_identity_modes,
@@ -210,8 +211,11 @@ def run_demo(
     Returns:
         A ``DemoResult``; ``torchface.workflows.demo.demo_page.write_demo_page`` makes the report of it.
     """
-    progress = progress or silent
-    out.mkdir(parents=True, exist_ok=True)
+    with within_job(out):
+        return _run_demo(scene, out, seed, flaws, progress or silent)
+
+
+def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: Progress) -> DemoResult:
     files = {
         "template rig": out / "template.glb",
         "new head": out / "neutral.obj",

@@ -18,6 +18,7 @@ from torchface.evaluation import (
     shape_errors,
     vertex_errors,
 )
+from torchface.files.job_lock import within_job
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.viz.figures.heat_maps import round_maximum
@@ -79,7 +80,13 @@ def evaluate(
         ValueRangeError: there is nothing to compare, or too much.
         TorchfaceError: any file is broken.
     """
-    progress = progress or silent
+    with within_job(out):
+        return _evaluate(result, truth, out, settings, progress or silent)
+
+
+def _evaluate(
+    result: Path, truth: Sequence[Path], out: Path, settings: EvaluationSettings, progress: Progress
+) -> Evaluation:
     progress("reading result and truth")
     found = load_animated(result, settings.rig, settings.part)
     scans: ScanTruth | None = None
@@ -94,7 +101,6 @@ def evaluate(
     progress("comparing")
     evaluation = compare(found, true, settings, scans)
     progress("writing")
-    out.mkdir(parents=True, exist_ok=True)
     write_tables(evaluation, out)
     return evaluation
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
+from torchface.files.job_lock import file_lock
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.landmarks.scans.detector_files import load_detector
@@ -164,8 +165,21 @@ def rig_actor(
         AlignmentError: not one example, or not one scan of details, could be used.
         TorchfaceError: neutral scan, template or an option is of no use.
     """
-    options, progress = options or RigOptions(), progress or silent
     check_out(out)
+    with file_lock(out):
+        return _rig_actor(scan, template, out, landmarks, examples, detail, options or RigOptions(), progress or silent)
+
+
+def _rig_actor(
+    scan: Path,
+    template: Path,
+    out: Path,
+    landmarks: Path | None,
+    examples: Path | None,
+    detail: Path | None,
+    options: RigOptions,
+    progress: Progress,
+) -> ActorReport:
     progress("reading the template")
     rig = load_rig(template, part=options.part)
     shown = weights_row(options.pose, rig.names, "pose") if options.pose else torch.zeros(len(rig.names))

@@ -16,6 +16,7 @@ from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_
 from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.documents import write_json
+from torchface.files.job_lock import within_job
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io import load_rig
@@ -86,10 +87,14 @@ def track_video(
         FileFormatError: the video cannot be decoded, changes its size or has a variable frame rate; or another file
             is broken.
         ValueRangeError: there is no face in the video, never six stable landmarks, the rig has no 68 landmarks, or
-            the take is too short for the dynamics prior.
+            the take is too short for the dynamics prior; or another run is writing into ``out``.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
-    progress = progress or silent
+    with within_job(out):
+        return _track_video(video, rig, out, settings, progress or silent)
+
+
+def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, progress: Progress) -> Tracked:
     clip = open_video(video)
     clip.check()
     actor = load_actor(rig, settings.part)
