@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import trimesh
+from browser import forbid_real_time_scheduling
 
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -79,7 +80,9 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     for switch in (*_SWITCHES, f"--user-data-dir={profile}"):
         options.add_argument(switch)
     environment = {**os.environ, "SE_OFFLINE": "true"}
-    service = webdriver.ChromeService(executable_path=driver, env=environment)
+    service = webdriver.ChromeService(
+        executable_path=driver, env=environment, popen_kw={"preexec_fn": forbid_real_time_scheduling}
+    )
     running = webdriver.Chrome(options=options, service=service)
     yield running
     running.quit()
