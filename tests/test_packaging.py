@@ -1,6 +1,7 @@
 """What a user installs: the wheel brings the command, the type marker and the zoo, and nothing of tests or recipes."""
 
 import json
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -31,7 +32,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Python of an empty environment with the wheel in it; what torchface depends on is borrowed from here."""
+    """The Python of an empty environment with the wheel in it; what torchface depends on is borrowed from here.
+
+    Beside the package lies what careless packages leave there: a project file, and a folder of models of their own.
+    """
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     python = folder / "bin" / "python"
@@ -44,6 +48,8 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     # A path in a .pth file is looked through after the environment's own, and its .pth files (an editable install's
     # among them) are not read.
     Path(own, "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    Path(own, "pyproject.toml").write_bytes((REPOSITORY / "pyproject.toml").read_bytes())
+    shutil.copytree(REPOSITORY / "models" / "head", Path(own, "models", "strangers_head"))
     return python
 
 

@@ -8,7 +8,8 @@ import json
 import re
 import shutil
 import tomllib
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -129,23 +130,116 @@ def test_the_description_is_what_was_said(home: Path) -> None:
         assert words in card
 
 
-def test_the_checkouts_models_go_before_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package = tmp_path / "checkout" / "torchface"
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
+    """Where models may lie, none there yet: a checkout's folder, the package's, the user's."""
+    package = tmp_path / "site" / "torchface"
     package.mkdir(parents=True)
     monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
     monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
-    folders = [package / "_models", tmp_path / "home", tmp_path / "checkout" / "models"]
-    for folder in folders:
+    return {"checkout": package.parent / "models", "package": package / "_models", "home": tmp_path / "home"}
+
+
+def project(folder: Path, name: str) -> None:
+    (folder / "pyproject.toml").write_text(f'[project]\nname = "{name}"\n')
+
+
+def test_the_checkouts_models_go_before_the_packages_before_the_users_and_each_loser_is_named(
+    places: dict[str, Path], tmp_path: Path
+) -> None:
+    for folder in places.values():
         zoo.save_model(morphable(), folder / "face", **FACTS)
-    zoo.save_model(morphable(), folders[1] / "own", **FACTS)
+    zoo.save_model(morphable(), places["home"] / "own", **FACTS)
     assert zoo.list_models() == ["face", "own"]
-    assert zoo.find("face") == folders[0] / "face"
-    (tmp_path / "checkout" / "pyproject.toml").touch()
-    assert zoo.find("face") == folders[2] / "face"
-    assert zoo.find("own") == folders[1] / "own"
+    package, home = places["package"] / "face", places["home"] / "face"
+    with pytest.warns(UserWarning, match=re.escape(f"model 'face': {package} goes before {home}; ")) as told:
+        assert [zoo.find("face") for _ in range(3)] == [package] * 3
+    assert len(told) == 1
+    assert (zoo.describe("face").folder, zoo.describe("face").shadowed) == (package, (home,))
+    project(tmp_path / "site", "torchface")
+    with pytest.warns(UserWarning, match=re.escape(f"goes before {package}, {home}; ")):
+        assert zoo.find("face") == places["checkout"] / "face"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert zoo.find("own") == places["home"] / "own"
+        assert zoo.describe("own").shadowed == ()
+        assert zoo.describe(home).folder == home  # a path is what was asked for
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "../mine", "mine/..", "a b", "-x", "m\0ine", "x" * 65, "nobody"])
+@pytest.mark.parametrize(
+    "text", ["", "[project]\n", '[project]\nname = "other"\n', "name = [", "[tool.x]\nproject = 1\n"]
+)
+def test_a_project_file_beside_the_installed_package_hides_nothing_and_adopts_no_strangers(
+    places: dict[str, Path], tmp_path: Path, text: str
+) -> None:
+    for place in ("checkout", "package"):
+        zoo.save_model(morphable(), places[place] / place, **FACTS)
+    (tmp_path / "site" / "pyproject.toml").write_text(text)
+    assert zoo.list_models() == ["package"]
+    project(tmp_path / "site", "torchface")
+    assert "checkout" in zoo.list_models()
+    (tmp_path / "site" / "torchface-0.1.0.dist-info").mkdir()  # an installer's: this is no checkout, whatever lies here
+    assert zoo.list_models() == ["package"]
+
+
+def test_one_damaged_model_is_named_and_the_others_load(home: Path) -> None:
+    names = zoo.list_models()
+    damage: dict[str, Callable[[Path], object]] = {
+        "cut": _state(lambda data: data[:-4]),
+        "empty": lambda folder: (folder / "model.toml").write_bytes(b""),
+        "foreign": _text(lambda text: text.replace('"morphable"', '"os.system"')),
+        "newer": _text(lambda text: text.replace("format = 1", "format = 2")),
+        "stateless": lambda folder: (folder / zoo.STATE).unlink(),
+        "torn": lambda folder: (folder / "model.toml").write_bytes(b"\xff = ["),
+    }
+    for name, change in damage.items():
+        shutil.copytree(home / "mine", home / name)
+        change(home / name)
+    with pytest.warns(UserWarning, match="is left out") as told:
+        assert zoo.list_models() == names
+    for name, warning in zip(damage, told, strict=True):
+        assert f"model {name!r} is left out: {home / name}" in str(warning.message)
+        with pytest.raises(FileFormatError, match=name):
+            zoo.get_model(name)
+    assert list(zoo.damaged_models()) == list(damage)
+    for name in ("empty", "newer", "torn"):
+        with pytest.raises(FileFormatError, match=name):
+            zoo.describe(name)
+    assert zoo.describe("mine").folder == home / "mine"
+    hub = {"repo_or_dir": str(REPOSITORY), "source": "local"}
+    assert torch.equal(torch.hub.load(model="mine", **hub).mean, morphable().mean)
+    with pytest.raises(FileFormatError, match=r"torn/model\.toml: not TOML"):
+        torch.hub.load(model="torn", **hub)
+
+
+def test_a_models_name_cannot_break_the_hub(home: Path) -> None:
+    shutil.copytree(home / "mine", home / "dependencies")
+    assert isinstance(torch.hub.load(str(REPOSITORY), "mine", source="local"), MorphableModel)
+
+
+def test_a_home_that_cannot_be_used_is_named(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    iterdir = Path.iterdir
+
+    def locked(folder: Path) -> Iterator[Path]:
+        if folder == home:
+            raise PermissionError(13, "Permission denied", str(folder))
+        return iterdir(folder)
+
+    shipped = [name for name in zoo.list_models() if name != "mine"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", locked)
+        with pytest.warns(UserWarning, match=f"{home} cannot be listed"):
+            assert zoo.list_models() == shipped
+    for odd in (tmp_path / "nowhere", home / "mine" / "model.toml", tmp_path / ("x" * 300)):
+        monkeypatch.setenv(zoo.HOME, str(odd))
+        assert zoo.list_models() == shipped
+        with pytest.raises(NameMismatchError, match=r"TORCHFACE_HOME is .*, which is no folder"):
+            zoo.find("nobody")
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../mine", "mine/..", "a b", "-x", "m\0ine", "x" * 65, "x" * 300, "x/" * 300, "nobody"]
+)
 def test_a_name_that_is_none_is_refused(home: Path, name: str) -> None:
     with pytest.raises(TorchfaceError, match=r"expected one"):
         zoo.get_model(name)
@@ -159,8 +253,11 @@ def test_a_folder_beside_the_user_goes_by_its_bare_name(
     assert zoo.find("model12").resolve() == tmp_path / "model12"
     assert torch.equal(zoo.get_model("model12").mean, morphable().mean)
     assert zoo.describe("model12").name == "model12"
-    (tmp_path / "mine").mkdir()  # the zoo's go first
+    (tmp_path / "mine").mkdir()
     assert zoo.find("mine") == home / "mine"
+    shutil.copytree(tmp_path / "model12", tmp_path / "mine", dirs_exist_ok=True)  # the zoo's go first
+    with pytest.warns(UserWarning, match=f"{home / 'mine'} goes before {tmp_path / 'mine'}"):
+        assert zoo.find("mine") == home / "mine"
     (tmp_path / "empty").mkdir()
     with pytest.raises(NameMismatchError, match=r"'empty' \(the folder of that name holds no model.toml\)"):
         zoo.find("empty")

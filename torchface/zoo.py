@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.models import DESCRIPTION, STATE, ModelRecord, read_model, read_record, write_model
+from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_names, model_roots
+from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
@@ -41,8 +43,18 @@ KINDS: dict[str, type[nn.Module]] = {
 """What a file may ask for: a kind is looked up here and nowhere else."""
 
 HOME = "TORCHFACE_HOME"
-__all__ = ["HOME", "KINDS", "STATE", "ModelDescription", "describe", "find", "get_model", "list_models", "save_model"]
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+__all__ = [
+    "HOME",
+    "KINDS",
+    "STATE",
+    "ModelDescription",
+    "damaged_models",
+    "describe",
+    "find",
+    "get_model",
+    "list_models",
+    "save_model",
+]
 
 
 @dataclass(frozen=True)
@@ -52,18 +64,26 @@ class ModelDescription(ModelRecord):
     Args:
         name: of the model.
         folder: that it lies in.
+        shadowed: folders of other models of the same name, which this one goes before.
     """
 
     name: str = ""
     folder: Path = Path()
+    shadowed: tuple[Path, ...] = ()
 
 
 def list_models() -> list[str]:
-    """Names of the models that there are, sorted."""
-    found: set[str] = set()
-    for root in _roots():
-        found |= {entry.name for entry in root.iterdir() if _is_model(root, entry.name)}
-    return sorted(found)
+    """Names of the models that can be loaded, sorted; damaged ones are left out with a warning that says why."""
+    damaged = damaged_models()
+    for name, fault in damaged.items():
+        _warn_once(f"model {name!r} is left out: {fault}")
+    return sorted(_all_names() - set(damaged))
+
+
+def damaged_models() -> dict[str, str]:
+    """Models that cannot be loaded, by name, and why: as far as description, kind and the state's size tell."""
+    faults = {name: model_fault(_named(name)[0], KINDS) for name in sorted(_all_names())}
+    return {name: fault for name, fault in faults.items() if fault is not None}
 
 
 def describe(name_or_path: str | Path) -> ModelDescription:
@@ -76,7 +96,8 @@ def describe(name_or_path: str | Path) -> ModelDescription:
     folder = find(name_or_path)
     found = dict(vars(read_record(folder)))
     found["url"] = found["url"] or folder.resolve().as_uri()
-    return ModelDescription(**found, name=folder.name, folder=folder)
+    shadowed = () if _is_path(name_or_path) else tuple(_named(str(name_or_path))[1:])
+    return ModelDescription(**found, name=folder.name, folder=folder, shadowed=shadowed)
 
 
 def get_model(name_or_path: str | Path) -> Any:
@@ -136,48 +157,70 @@ def save_model(
         known = ", ".join(one.__name__ for one in KINDS.values())
         raise NameMismatchError(f"save_model: found a {type(model).__name__}, expected one of {known}")
     folder = Path(folder)
-    if not _NAME.fullmatch(folder.name):
+    if not MODEL_NAME.fullmatch(folder.name):
         raise NameMismatchError(f"{folder}: found the name {folder.name!r}, expected letters, digits, - and _")
     record = ModelRecord(kinds[0], licence, data, dict(metrics), recipe, url, dict(settings or {}))
     return write_model(model, folder, record, card, half)
 
 
 def find(name_or_path: str | Path) -> Path:
-    """The folder of a model; see :func:`get_model`."""
+    """The folder of a model; see :func:`get_model`. A name that several folders have is told with a warning, once."""
     given = str(name_or_path)
-    if isinstance(name_or_path, Path) or "/" in given or os.sep in given:
+    if _is_path(name_or_path):
         folder = Path(given)
-        if "\0" in given or not folder.is_dir():
+        if not is_folder(folder):
             raise FileFormatError(f"{given!r}: found no such folder, expected one with {DESCRIPTION}")
         return folder
-    if _NAME.fullmatch(given):
-        for root in _roots():
-            if _is_model(root, given):
-                return root / given
-    local = Path(given or os.devnull)
-    if (local / DESCRIPTION).is_file():
-        return local
-    why = f" (the folder of that name holds no {DESCRIPTION})" if local.is_dir() else ""
+    named = _named(given)
+    if named:
+        if named[1:]:
+            others = ", ".join(str(folder.resolve()) for folder in named[1:])
+            _warn_once(
+                f"model {given!r}: {named[0]} goes before {others}; for another one name its folder by a path, "
+                f"such as {named[1].resolve()}"
+            )
+        return named[0]
+    why = f" (the folder of that name holds no {DESCRIPTION})" if is_folder(Path(given or os.devnull)) else ""
     known = ", ".join(list_models()) or "none at all"
+    home = os.environ.get(HOME)
+    missing = f"; ${HOME} is {home!r}, which is no folder" if home and not is_folder(Path(home)) else ""
     raise NameMismatchError(
-        f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder"
+        f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder{missing}"
     )
 
 
+def _is_path(name_or_path: str | Path) -> bool:
+    given = str(name_or_path)
+    return isinstance(name_or_path, Path) or "/" in given or os.sep in given
+
+
 def _roots() -> list[Path]:
-    """Folders of models, the first wins: the checkout's or the installed package's, then the user's own."""
-    package = Path(__file__).resolve().parent
-    checkout = package.parent
-    own = checkout / "models" if (checkout / "pyproject.toml").is_file() else package / "_models"
-    home = os.environ.get(HOME)
-    return [root for root in (own, *([Path(home)] if home else [])) if root.is_dir()]
+    return model_roots(Path(__file__).resolve().parent, os.environ.get(HOME))
 
 
-def _is_model(root: Path, name: str) -> bool:
-    """Whether a root holds this model; a link that leads out of the root is none."""
-    folder = root / name
+def _all_names() -> set[str]:
+    """Of the models of every root, damaged ones among them; a root that cannot be listed is named in a warning."""
+    names: set[str] = set()
+    for root in _roots():
+        try:
+            names.update(model_names(root))
+        except OSError as error:
+            _warn_once(f"models: {root} cannot be listed ({error.strerror})")
+    return names
+
+
+def _named(name: str) -> list[Path]:
+    """Folders of models of this name, the winner first: those of the roots, then that in the working directory."""
+    folders = [root / name for root in _roots() if is_model(root, name)]
+    local = Path(name or os.devnull)
     try:
-        inside = folder.resolve().is_relative_to(root.resolve())
-        return bool(_NAME.fullmatch(name)) and inside and (folder / DESCRIPTION).is_file()
-    except (OSError, RuntimeError):  # a loop of links
-        return False
+        if (local / DESCRIPTION).is_file() and local.resolve() not in [folder.resolve() for folder in folders]:
+            folders.append(local)
+    except (OSError, ValueError):  # a name that is too long for a file, a NUL
+        pass
+    return folders
+
+
+@cache
+def _warn_once(message: str) -> None:
+    warnings.warn(message, stacklevel=3)

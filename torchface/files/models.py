@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config
-from torchface.files.states import pack_state, read_state
+from torchface.files.states import check_size, pack_state, read_state
 from torchface.files.whole_files import make_folder, write_file
 
 FORMAT = 1
@@ -130,10 +130,8 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
         FileFormatError: a file is missing, cut off, damaged, of a newer format or another kind, or does not fit.
     """
     folder = Path(folder)
-    record = read_record(folder)
-    path, state_path = folder / DESCRIPTION, _inside(folder, STATE)
-    if record.kind not in kinds:
-        raise FileFormatError(f"{path}: found kind {record.kind!r}, expected {' or '.join(map(repr, sorted(kinds)))}")
+    record = _known_record(folder, kinds)
+    path, state_path = folder / DESCRIPTION, _state_path(folder)
     try:
         with torch.device("meta"):
             model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
@@ -142,8 +140,6 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
         raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
     except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
         raise FileFormatError(f"{path}: config cannot be used ({error})") from error
-    if not state_path.is_file():
-        raise FileFormatError(f"{state_path}: found no such file, expected the state of {path}")
     state, data = read_state(state_path, expected, record.size, record.kind)
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
@@ -160,6 +156,16 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     return model.eval()
 
 
+def model_fault(folder: str | Path, kinds: Collection[str]) -> str | None:
+    """Why a model of these kinds cannot be loaded, as far as its description and its state's size tell; else None."""
+    folder = Path(folder)
+    try:
+        check_size(_state_path(folder), _known_record(folder, kinds).size)
+    except (TorchfaceError, OSError) as error:
+        return str(error)
+    return None
+
+
 def card_text(name: str, record: ModelRecord, text: str) -> str:
     """The card: what the author says of the model, then data, licence, figures and the command that makes it."""
     parts = [f"# {name}", text.strip()] if text.strip() else [f"# {name}"]
@@ -170,6 +176,23 @@ def card_text(name: str, record: ModelRecord, text: str) -> str:
     if record.recipe:
         parts.append(f"Made again by\n\n```sh\n{record.recipe}\n```")
     return "\n\n".join(parts) + "\n"
+
+
+def _known_record(folder: Path, kinds: Collection[str]) -> ModelRecord:
+    """What ``model.toml`` says, which must be of one of these kinds."""
+    record = read_record(folder)
+    if record.kind not in kinds:
+        expected = " or ".join(map(repr, sorted(kinds)))
+        raise FileFormatError(f"{folder / DESCRIPTION}: found kind {record.kind!r}, expected {expected}")
+    return record
+
+
+def _state_path(folder: Path) -> Path:
+    """Where a model's state lies, which must be there."""
+    path = _inside(folder, STATE)
+    if not path.is_file():
+        raise FileFormatError(f"{path}: found no such file, expected the state of {folder / DESCRIPTION}")
+    return path
 
 
 def _inside(folder: Path, name: str) -> Path:

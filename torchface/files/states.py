@@ -65,9 +65,7 @@ def read_state(
         FileFormatError: the file is cut off, is no safetensors file, holds other tensors than the module has, or NaN.
     """
     try:
-        found = path.stat().st_size
-        if found != size:
-            raise FileFormatError(f"{path}: found {found} bytes, expected {size}: cut off, or of another model")
+        check_size(path, size)
         with path.open("rb") as file:
             if int.from_bytes(file.read(8), "little") > _MAX_HEADER_BYTES:
                 raise FileFormatError(f"{path}: no readable state (found a header above {_MAX_HEADER_BYTES} bytes)")
@@ -86,6 +84,18 @@ def read_state(
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise FileFormatError(f"{path}: found NaN or infinity in {name}, expected finite numbers")
     return state, data
+
+
+def check_size(path: Path, size: int) -> None:
+    """Refuses a state that has not as many bytes as its description says.
+
+    Raises:
+        FileFormatError: it has more or fewer.
+        OSError: the file cannot be looked at.
+    """
+    found = path.stat().st_size
+    if found != size:
+        raise FileFormatError(f"{path}: found {found} bytes, expected {size}: cut off, or of another model")
 
 
 def _smallest(values: Tensor) -> torch.dtype:

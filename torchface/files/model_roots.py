@@ -1,0 +1,66 @@
+"""Where models lie: in the checkout, in the installed package, in the user's own folder; the first of a name wins."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from torchface.errors import TorchfaceError
+from torchface.files.documents import read_toml
+from torchface.files.models import DESCRIPTION
+
+MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+def model_roots(package: Path, home: str | None) -> list[Path]:
+    """Folders of models that are there, each once: the checkout's, the installed package's, the user's own.
+
+    Args:
+        package: the folder that torchface is imported from.
+        home: the user's own folder of models, if any.
+    """
+    checkout = package.parent
+    wanted = [checkout / "models"] if is_checkout(checkout, package.name) else []
+    wanted += [package / "_models", *([Path(home)] if home else [])]
+    return list({root.resolve(): root for root in reversed(wanted) if is_folder(root)}.values())[::-1]
+
+
+def is_checkout(folder: Path, package: str) -> bool:
+    """Whether a folder is the package's own checkout, and not what some other project left where it is installed.
+
+    Its ``pyproject.toml`` must be the package's own, and no installer may have put the package there: what it installs
+    it records beside.
+    """
+    try:
+        project = read_toml(folder / "pyproject.toml")["project"]["name"].text()
+    except TorchfaceError:  # none, a stranger's without a name, no TOML
+        return False
+    return project == package and not any(folder.glob(f"{package}-*.dist-info"))
+
+
+def is_model(root: Path, name: str) -> bool:
+    """Whether a root holds a folder of this name with a description; a link that leads out of the root is none."""
+    if not MODEL_NAME.fullmatch(name):
+        return False
+    folder = root / name
+    try:
+        return folder.resolve().is_relative_to(root.resolve()) and (folder / DESCRIPTION).is_file()
+    except (OSError, RuntimeError):  # a loop of links
+        return False
+
+
+def model_names(root: Path) -> list[str]:
+    """Names of the models that a root holds, sorted, damaged ones among them.
+
+    Raises:
+        OSError: the root cannot be listed.
+    """
+    return sorted(entry.name for entry in root.iterdir() if is_model(root, entry.name))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path leads to a folder; one that cannot be followed does not."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):  # above it is what this user may not enter; a name too long; a NUL
+        return False
