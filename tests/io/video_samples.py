@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -45,7 +48,7 @@ def encode(
         options: of the container.
     """
     _require(codec)
-    with av.open(str(path), "w", container_options=options or {}) as container:
+    with _scheduling_kept(), av.open(str(path), "w", container_options=options or {}) as container:
         stream = container.add_stream(codec, rate=RATE, options=OPTIONS.get(codec, {}))
         stream.width, stream.height, stream.pix_fmt = *size, pixels
         stream.codec_context.time_base = Fraction(1, RATE if times is None else TICKS)
@@ -79,6 +82,19 @@ def _packets(
         frame.pts = i if times is None else round(times[i] * TICKS)
         found += encoder.encode(frame)
     return found + encoder.encode(None)
+
+
+@contextmanager
+def _scheduling_kept() -> Iterator[None]:
+    """Run by root, SVT-AV1 gives the thread that calls it real-time priority, before which all others starve."""
+    if sys.platform != "linux":
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
 
 
 def _require(codec: str) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 import trimesh
-from browser import forbid_real_time_scheduling
 
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -80,9 +79,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     for switch in (*_SWITCHES, f"--user-data-dir={profile}"):
         options.add_argument(switch)
     environment = {**os.environ, "SE_OFFLINE": "true"}
-    service = webdriver.ChromeService(
-        executable_path=driver, env=environment, popen_kw={"preexec_fn": forbid_real_time_scheduling}
-    )
+    service = webdriver.ChromeService(executable_path=driver, env=environment)
     running = webdriver.Chrome(options=options, service=service)
     yield running
     running.quit()

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import ctypes
 import json
 import shutil
 import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -92,12 +90,7 @@ def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, sid
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder / 'profile'}"]
     page = f"http://127.0.0.1:{server.server_port}/look.html"
-    process = subprocess.Popen(
-        [browser, *flags, page],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=forbid_real_time_scheduling,
-    )
+    process = subprocess.Popen([browser, *flags, page], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         assert done.wait(_SECONDS), "the page posted nothing"
     finally:
@@ -108,17 +101,6 @@ def pictures(browser: str, shots: Sequence[tuple[Path, Shot]], folder: Path, sid
     assert "error" not in results[0], results[0]["error"]
     rows = [base64.b64decode(url.partition(",")[2]) for url in results[0]["pictures"]]
     return [decode_image(row, "the browser's picture") for row in rows]
-
-
-def forbid_real_time_scheduling() -> None:
-    """Called in a browser's process before it starts.
-
-    Run as root, Chromium's renderers were seen in the class ``SCHED_FIFO``, spinning on both cores for minutes while
-    the process that they waited for got none.
-    """
-    if sys.platform == "linux":
-        drop_capability, sys_nice = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE; without the right it changes nothing
-        ctypes.CDLL(None).prctl(drop_capability, sys_nice, 0, 0, 0)
 
 
 def grid(rows: Sequence[Tensor], columns: int) -> Tensor:
