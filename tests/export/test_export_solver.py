@@ -76,7 +76,3 @@ def test_from_a_rig_on_disk_to_weights_without_torch(rig_folder: Path, tmp_path:
     solved = torch.from_numpy(np.load(tmp_path / "weights.npy"))
     torch.testing.assert_close(solved, MarkerSolver(rig, attachment)(markers), rtol=0, atol=1e-3)
     assert (solved - weights).abs().max() < 0.05
-
-
-def test_the_example_is_short() -> None:
-    assert len((REPOSITORY / "examples" / "solve_onnx.py").read_text().splitlines()) <= 21

@@ -364,7 +364,10 @@ def test_sizes_of_training_images_may_differ(film: PortraitVideo) -> None:
 
 @pytest.mark.real
 def test_a_dozen_photographs_help_with_faces_that_are_not_among_them(data: Path) -> None:
-    """Other people, poses and cameras than learned from: no job for such a model, and yet it must help, not harm."""
+    """Other people, poses and cameras than learned from: no job for such a model, and yet it must help, not harm.
+
+    What is learned, and what it is measured by, is what dlib's predictor says.
+    """
     pictures, points = [], []
     for face in load_dlib_faces(next((data / "images" / "dlib_faces").glob("*.xml"))):
         box = box_around(face.points.float())
@@ -373,16 +376,16 @@ def test_a_dozen_photographs_help_with_faces_that_are_not_among_them(data: Path)
         whole = load_image(data / "images" / "dlib_faces" / face.image)
         pictures.append(whole[:, int(low[1]) : int(high[1]), int(low[0]) : int(high[0])])
         points.append(face.points.float() - low)
-    truth = torch.stack(points)
-    assert len(truth) == 18
+    reference = torch.stack(points)
+    assert len(reference) == 18
     before, after = [], []
     generator = torch.Generator().manual_seed(0)
     for fold in range(3):
-        left_out = torch.arange(len(truth)) % 3 == fold
+        left_out = torch.arange(len(reference)) % 3 == fold
         learned = [picture for picture, out in zip(pictures, left_out.tolist(), strict=True) if not out]
-        model = AppearanceModel.fit(learned, truth[~left_out])
+        model = AppearanceModel.fit(learned, reference[~left_out])
         for row in torch.nonzero(left_out)[:, 0].tolist():
-            one = truth[row : row + 1]
+            one = reference[row : row + 1]
             start = planar_pose(model.mean_shape, one).apply(model.mean_shape)
             start = start + 0.04 * eyes_apart(one) * torch.randn(1, 1, 2, generator=generator)
             before.append(mean_error(start, one))

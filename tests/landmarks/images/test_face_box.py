@@ -189,11 +189,12 @@ def test_real_faces_are_found_and_nothing_else(data: Path) -> None:
     for frame in list(open_video(data / "video" / "no_face.mp4").frames())[::24]:
         assert len(find_faces(frame)) == 0
     folder = data / "images" / "dlib_faces"
-    truth: dict[str, list[Tensor]] = {}
+    # Boxes round the landmarks of dlib's predictor: a reference, no truth.
+    reference: dict[str, list[Tensor]] = {}
     for labelled in load_dlib_faces(folder / "training_with_face_landmarks.xml"):
-        truth.setdefault(labelled.image, []).append(box_around(labelled.points[None].float())[0])
+        reference.setdefault(labelled.image, []).append(box_around(labelled.points[None].float())[0])
     found = missed = 0
-    for name, boxes in truth.items():
+    for name, boxes in reference.items():
         picture = (load_image(folder / name) * 255).round().to(torch.uint8)
         faces: FaceBoxes = find_faces(picture)
         shared = overlaps(torch.stack(boxes), faces.boxes)

@@ -305,7 +305,10 @@ def test_the_shipped_model_finds_made_up_faces() -> None:
 
 @pytest.mark.real
 def test_the_shipped_model_finds_real_faces(data: Path) -> None:
-    """18 faces of four photographs, and one more; boxes of their landmarks, and of the Haar cascade if it has any."""
+    """18 faces that dlib's predictor has landmarks for, a reference and no truth, and one annotated by hand.
+
+    Boxes are those of the landmarks, and of the Haar cascade where it finds the face.
+    """
     model = zoo.get_model("face_landmarks")
     folder = data / "images" / "dlib_faces"
     faces = [
@@ -317,12 +320,12 @@ def test_the_shipped_model_finds_real_faces(data: Path) -> None:
     given, detected = [], []
     for path, points in faces:
         image = load_image(path).mean(0)[None, None]
-        truth, box = points.float()[None], box_around(points.float())
-        given.append(relative_errors(model(image, box[None]), truth))
+        reference, box = points.float()[None], box_around(points.float())
+        given.append(relative_errors(model(image, box[None]), reference))
         seen = torch.tensor(finder.detectMultiScale((255 * image[0, 0]).byte().numpy(), 1.1, 3)).reshape(-1, 4).float()
         away = (seen[:, :2] + seen[:, 2:] / 2 - box[:2] - box[2:] / 2).norm(dim=1) / box[2]
         if len(seen) and away.min() < 0.25:
-            detected.append(relative_errors(model(image, seen[away.argmin()][None]), truth))
+            detected.append(relative_errors(model(image, seen[away.argmin()][None]), reference))
     print(
         f"\nreal faces: {100 * torch.cat(given).mean():.1f} %, "
         f"from detected boxes {100 * torch.cat(detected).mean():.1f} %"
