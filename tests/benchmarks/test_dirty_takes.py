@@ -1,4 +1,4 @@
-"""Dirty takes cleaned, whole takes solved at once, helmets that slip: errors as shares of the plain solve's."""
+"""Dirty takes cleaned, takes solved whole or streamed, helmets that slip: errors as shares of the plain solve's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import HelmetSolver, MarkerSolver, WholeTakeSolver, clean_take
+from torchface.evaluation import weight_jitter
 from torchface.synthetic.stages.marker_stage import LabelSwap, StageFlaws, record
+from torchface.temporal import one_euro_filter
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 EVERY = 6
@@ -151,3 +153,31 @@ def test_slip(real_capture: Capture) -> None:
         )
         assert shares[1] <= 1.2
         assert max(shares[2:]) <= 1.06
+
+
+def frames_late(weights: Tensor, true: Tensor) -> float:
+    """By how many frames curves follow the true ones: where the summed correlation peaks, between frames too."""
+    a, b = ((w - w.mean(0)).double() for w in (weights, true))
+    sums = [float((a[10 + shift : len(a) - 10 + shift] * b[10 : len(b) - 10]).sum()) for shift in range(-3, 9)]
+    top = int(np.argmax(sums))
+    before, at, after = sums[max(top - 1, 0)], sums[top], sums[min(top + 1, len(sums) - 1)]
+    curve = before - 2 * at + after
+    return top - 3 + (0.5 * (before - after) / curve if curve else 0.0)
+
+
+@pytest.mark.real
+def test_streamed_takes(real_capture: Capture) -> None:
+    """Each frame smoothed by those before, as ``solve --stream`` sends it, beside the frames as they are solved."""
+    rig, attachment, takes = real_capture
+    solver = MarkerSolver(rig, attachment)
+    print("\ntake | jitter over the true: alone  streamed | error over the unsmoothed | frames late")
+    shares, jitters, late = [], [], []
+    for which, true in enumerate(takes):
+        recording = record(rig, attachment, true, torch.Generator().manual_seed(which), StageFlaws())
+        alone = solver(markers_of(recording.take))
+        streamed = one_euro_filter(alone, 60.0)
+        jitters.append([weight_jitter(each) / weight_jitter(true) for each in (alone, streamed)])
+        shares.append(error(streamed, true) / error(alone, true))
+        late.append(frames_late(streamed, true))
+        print(f"{which + 1:4} | {jitters[-1][0]:23.1f} {jitters[-1][1]:9.1f} | {shares[-1]:25.2f} | {late[-1]:11.2f}")
+    print(f"mean of the takes: error {float(np.mean(shares)):.2f}, {float(np.mean(late)):.2f} frames late")

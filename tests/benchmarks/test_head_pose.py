@@ -1,11 +1,12 @@
-"""Head pose beside OpenCV's RANSACs, and what filtering live costs and gains; one thread, processor time."""
+"""Head pose beside OpenCV's RANSACs, many frames at once and one at a time, with and without outliers on the temples;
+and what filtering live costs and gains. One thread, processor time."""
 
 from __future__ import annotations
 
-import functools
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,22 +18,15 @@ from torch import Tensor
 from torchface.capture.video.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.geometry.cameras.pnp import pixel_jacobian
+from torchface.geometry.cameras.pnp import Pose, pixel_jacobian, solve_pnp
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.synthetic import neutral_head
 
 K = assumed_calibration(640, 480).intrinsics
 UPRIGHT = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-FRAMES = 300
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+FRAMES, FEW = 300, 60
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def filmed(noise: float, size: float = 1.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -76,79 +70,218 @@ def turned_far(flatness: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return points, rotation, translation, pixels + torch.randn(pixels.shape, generator=generator).double()
 
 
-def opencv(points: Tensor, pixels: Tensor, method: int, draws: int, confidence: float) -> tuple[Tensor, Tensor]:
-    found = []
-    for frame in pixels.numpy():  # OpenCV takes one view at a time
-        good, vector, translation, inliers = cv2.solvePnPRansac(
-            points.numpy(),
-            frame,
-            K.numpy(),
-            None,
-            iterationsCount=draws,
-            reprojectionError=4.0,
-            confidence=confidence,
-            flags=method,
-        )
-        if good and inliers is not None and len(inliers) > 3:
-            agreed = inliers[:, 0]
-            vector, translation = cv2.solvePnPRefineLM(
-                points.numpy()[agreed], frame[agreed], K.numpy(), None, vector, translation
+@dataclass(frozen=True)
+class Ransac:
+    """Settings of ``cv2.solvePnPRansac``; what it finds is refined on its inliers by Levenberg's method."""
+
+    method: int
+    draws: int
+    confidence: float
+
+    def poses(self, points: Tensor, pixels: Tensor, threshold: float = 4.0) -> Found:
+        """Of each frame, and its inliers; OpenCV takes one view at a time, and weighs all points alike."""
+        model, camera = points.numpy(), K.numpy()
+        turns, moves, agreed = [], [], torch.zeros(pixels.shape[:2], dtype=torch.bool)
+        for row, frame in enumerate(pixels.numpy()):
+            good, vector, move, inliers = cv2.solvePnPRansac(
+                model,
+                frame,
+                camera,
+                None,
+                iterationsCount=self.draws,
+                reprojectionError=threshold,
+                confidence=self.confidence,
+                flags=self.method,
             )
-        elif not good:
-            vector, translation = np.full((2, 3, 1), np.nan)
-        found.append((rotation_matrix(torch.from_numpy(vector[:, 0])), torch.from_numpy(translation[:, 0])))
-    return torch.stack([pose[0] for pose in found]), torch.stack([pose[1] for pose in found])
+            if good and inliers is not None and len(inliers) > 3:
+                kept = inliers[:, 0]
+                vector, move = cv2.solvePnPRefineLM(model[kept], frame[kept], camera, None, vector, move)
+                agreed[row, kept] = True
+            elif not good:
+                vector, move = np.full((2, 3, 1), np.nan)
+            turns.append(vector[:, 0])
+            moves.append(move[:, 0])
+        rotation = rotation_matrix(torch.from_numpy(np.stack(turns)))
+        return Found(rotation, torch.from_numpy(np.stack(moves)), agreed)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Rotations (B,3,3), translations (B,3), inliers (B,N)."""
+
+    rotation: Tensor
+    translation: Tensor
+    inliers: Tensor
 
 
 PEERS = {
-    "solvePnPRansac": (cv2.SOLVEPNP_ITERATIVE, 256, 0.99),
-    "EPNP": (cv2.SOLVEPNP_EPNP, 300, 0.99),
-    "AP3P": (cv2.SOLVEPNP_AP3P, 300, 0.99),
-    "AP3P, most draws": (cv2.SOLVEPNP_AP3P, 4000, 1 - 1e-9),
-    "USAC_ACCURATE": (cv2.USAC_ACCURATE, 1000, 0.9999),
-    "USAC_MAGSAC": (cv2.USAC_MAGSAC, 1000, 0.9999),
+    "cv2 default (EPnP)": Ransac(cv2.SOLVEPNP_ITERATIVE, 256, 0.99),
+    "cv2 SQPnP": Ransac(cv2.SOLVEPNP_SQPNP, 300, 0.99),
+    "cv2 AP3P": Ransac(cv2.SOLVEPNP_AP3P, 300, 0.99),
+    "cv2 AP3P, 4,000 draws": Ransac(cv2.SOLVEPNP_AP3P, 4000, 1 - 1e-9),
+    "cv2 USAC_ACCURATE": Ransac(cv2.USAC_ACCURATE, 1000, 0.9999),
 }
 
 
-@pytest.mark.parametrize("scene", ["68 landmarks", "13 landmarks", "13, any pose", "13, any pose, flat face"])
-def test_robust_pnp_beside_opencv(scene: str) -> None:
-    cv2.setNumThreads(1)
+@dataclass(frozen=True)
+class Row:
+    """Processor milliseconds a frame, degrees off in the median and at 95 %, share over 10°, millimetres."""
+
+    milliseconds: float
+    median: float
+    tail: float
+    wrong: float
+    far: float
+
+    @staticmethod
+    def of(spent: float, found: Found, rotation: Tensor, translation: Tensor) -> Row:
+        angle = degrees(found.rotation, rotation)
+        far = (found.translation - translation).norm(dim=1).nan_to_num(1e9)
+        wrong = float((angle > 10).double().mean())
+        return Row(
+            1e3 * spent / len(angle), float(angle.median()), float(angle.quantile(0.95)), wrong, float(far.median())
+        )
+
+
+def timed(solve: Callable[[], Found], passes: int = 2) -> tuple[Found, float]:
+    """What is found, and the seconds of the quicker pass: others share the machine."""
+    best = math.inf
+    for _ in range(passes):
+        begin = time.process_time()
+        found = solve()
+        best = min(best, time.process_time() - begin)
+    return found, best
+
+
+def show(title: str, rows: dict[str, Row]) -> None:
+    print(f"{title}\n{'':36} {'ms/frame':>9} {'degrees: median':>16} {'95 %':>7} {'over 10':>8} {'mm: median':>11}")
+    for name, row in rows.items():
+        print(f"{name:36} {row.milliseconds:9.3f} {row.median:16.3f} {row.tail:7.2f} {row.wrong:8.1%} {row.far:11.2f}")
+
+
+def robust(points: Tensor, pixels: Tensor, initial: Pose | None = None, **settings: object) -> Found:
+    found = robust_pnp(points, pixels, K, initial=initial, **settings)  # type: ignore[arg-type]
+    return Found(found.pose.rotation, found.pose.translation, found.inliers)
+
+
+def spoiled(pixels: Tensor, share: float = 0.3) -> Tensor:
+    """Pixels of which a share is up to 150 pixels off."""
+    generator = torch.Generator().manual_seed(2)
+    wrong = torch.rand(pixels.shape[:2], generator=generator) < share
+    residual = 300 * (torch.rand(pixels.shape, generator=generator).double() - 0.5)
+    return torch.where(wrong[..., None], pixels + residual, pixels)
+
+
+@pytest.mark.parametrize(
+    ("scene", "slower"),
+    [("68 landmarks", 4.0), ("13 landmarks", 2.0), ("13, any pose", 2.0), ("13, any pose, flat face", 2.0)],
+)
+def test_many_frames_at_once_beside_opencv(scene: str, slower: float, print_machine: Callable[..., None]) -> None:
     if "any" in scene:
         points, rotation, translation, pixels = turned_far(0.15 if "flat" in scene else 1.0)
     else:
         points, rotation, translation, pixels = filmed(1.0)
     if scene == "13 landmarks":
         points, pixels = points[list(STABLE_LANDMARKS)], pixels[:, list(STABLE_LANDMARKS)]
-    generator = torch.Generator().manual_seed(2)
-    wrong = torch.rand(pixels.shape[:2], generator=generator) < 0.3
-    residual = 300 * (torch.rand(pixels.shape, generator=generator).double() - 0.5)
-    pixels = torch.where(wrong[..., None], pixels + residual, pixels)
+    pixels = spoiled(pixels)
+    robust(points, pixels[:10])
+    found, spent = timed(lambda: robust(points, pixels))
+    rows = {"torchface, all frames at once": Row.of(spent, found, rotation, translation)}
+    for name, peer in PEERS.items():
+        found, spent = timed(lambda peer=peer: peer.poses(points, pixels))  # type: ignore[misc]
+        rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
+    print_machine("opencv-contrib-python-headless")
+    show(f"{scene}, 1 px of noise, 30 % of them up to 150 px wrong, {FRAMES} frames", rows)
+    ours, quick = rows["torchface, all frames at once"], rows["cv2 AP3P, refined"]
+    for name, row in rows.items():
+        if "4,000" not in name and "USAC" not in name:
+            assert ours.median <= row.median
+            assert ours.wrong <= row.wrong
+    assert ours.milliseconds < slower * quick.milliseconds
 
-    def ours() -> tuple[Tensor, Tensor]:
-        pose = robust_pnp(points, pixels, K).pose
-        return pose.rotation, pose.translation
 
-    methods: dict[str, Callable[[], tuple[Tensor, Tensor]]] = {"torchface robust_pnp": ours}
-    for name, settings in PEERS.items():
-        methods[f"cv2 {name} + LM"] = functools.partial(opencv, points, pixels, *settings)
-    robust_pnp(points, pixels[:10], K)
-    print(f"\n{scene}, 1 px of noise, 30 % of them up to 150 px wrong, {FRAMES} frames")
-    print(f"{'':28} {'ms/frame':>9} {'degrees: median':>16} {'95 %':>7} {'over 10':>8} {'mm: median':>11}")
-    rows = []
-    for name, method in methods.items():
-        begin = time.process_time()
-        found, place = method()
-        spent = time.process_time() - begin
-        angle, far = degrees(found, rotation), (place - translation).norm(dim=1).nan_to_num(1e9)
-        rows.append((spent, float(angle.median()), float((angle > 10).double().mean())))
+def test_one_frame_at_a_time_beside_opencv(print_machine: Callable[..., None]) -> None:
+    """Thirteen landmarks, from nothing, and ours from the pose of the frame before: OpenCV's RANSACs take no start."""
+    stable = list(STABLE_LANDMARKS)
+    points, rotation, translation, clean = filmed(1.0)
+    points, clean = points[stable], clean[:, stable]
+    for scene, pixels in (("no outliers", clean), ("30 % up to 150 px wrong", spoiled(clean))):
+
+        def alone(pixels: Tensor = pixels) -> Found:
+            with torch.inference_mode():
+                return joined([robust(points, frame[None]) for frame in pixels[:FEW]])
+
+        def followed(pixels: Tensor = pixels) -> Found:
+            steps: list[Found] = []
+            with torch.inference_mode():
+                for frame in pixels[:FEW]:
+                    before = steps and Pose(steps[-1].rotation, steps[-1].translation, torch.zeros(1).double())
+                    steps.append(robust(points, frame[None], before or None, threshold=8.0))
+            return joined(steps)
+
+        rows = {}
+        for name, solve in (("torchface", alone), ("torchface, from the frame before", followed)):
+            found, spent = timed(solve)
+            rows[name] = Row.of(spent, found, rotation[:FEW], translation[:FEW])
+        for name, peer in PEERS.items():
+            found, spent = timed(lambda peer=peer, pixels=pixels: peer.poses(points, pixels))  # type: ignore[misc]
+            rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
+        print_machine("opencv-contrib-python-headless")
+        show(f"one frame at a time, 13 landmarks, 1 px of noise, {scene}", rows)
+        # OpenCV is the quicker one here, and by much; what a live frame may cost is held below.
+        assert rows["torchface"].wrong <= rows["cv2 AP3P, refined"].wrong
+
+
+def joined(frames: list[Found]) -> Found:
+    return Found(
+        *(torch.cat([getattr(each, name) for each in frames]) for name in ("rotation", "translation", "inliers"))
+    )
+
+
+def test_temples_that_are_off_beside_opencv(print_machine: Callable[..., None]) -> None:
+    """Why ours is there: temples 12 pixels off on one side, as detectors put them, must not make poses jump.
+
+    They are the least exact of the thirteen landmarks, and tell most of nodding: weighed, they are of use.
+    """
+    stable = list(STABLE_LANDMARKS)
+    points, rotation, _, pixels = filmed(0.7)
+    points, steady, shaky = points[stable], pixels[:, stable], pixels[:, stable].clone()
+    shaky[:, :2, 0] -= 12.0
+    trust = torch.where(torch.tensor(stable) < 17, 0.25, 1.0).double()
+    inner = [row for row, landmark in enumerate(stable) if landmark > 16]
+    threshold = 8.0 * float(K[0, 0]) / 600
+
+    def refined(found: Found, seen: Tensor) -> Found:
+        pose = solve_pnp(points, seen, K, trust * found.inliers)
+        return Found(pose.rotation, pose.translation, found.inliers)
+
+    many = PEERS["cv2 AP3P, 4,000 draws"]
+    ways: dict[str, Callable[[Tensor], Found]] = {
+        "torchface, temples weigh 1/4": lambda q: robust(points, q, threshold=threshold, weights=trust),
+        "torchface, no weights": lambda q: robust(points, q, threshold=threshold),
+        "torchface, without temples": lambda q: robust(points[inner], q[:, inner], threshold=threshold),
+        "AP3P, 4,000 draws, weighted refined": lambda q: refined(many.poses(points, q, threshold), q),
+        "AP3P, 4,000 draws, without temples": lambda q: many.poses(points[inner], q[:, inner], threshold),
+    }
+    for name, peer in PEERS.items():
+        ways[name] = lambda q, peer=peer: peer.poses(points, q, threshold)  # type: ignore[misc]
+    print_machine("opencv-contrib-python-headless")
+    print(f"13 landmarks, 0.7 px of noise, two temples 12 px off on one side, {FRAMES} frames; degrees")
+    print(f"{'':36} {'ms/frame':>9} {'jump: most':>11} {'if steady':>10} {'error: mean':>12} {'if steady':>10}")
+    jumps, errors = {}, {}
+    for name, way in ways.items():
+        found, spent = timed(lambda way=way: way(shaky), 1)  # type: ignore[misc]
+        turns = [rotation_vector(each.rotation @ rotation.transpose(1, 2)) for each in (found, way(steady))]
+        jumps[name] = [float(turn.diff(n=2, dim=0).norm(dim=1).max().rad2deg()) for turn in turns]
+        errors[name] = [float(turn.norm(dim=1).mean().rad2deg()) for turn in turns]
         print(
-            f"{name:28} {1e3 * spent / FRAMES:9.3f} {rows[-1][1]:16.3f} {float(angle.quantile(0.95)):7.2f} "
-            f"{rows[-1][2]:8.1%} {float(far.median()):11.2f}"
+            f"{name:36} {1e3 * spent / FRAMES:9.3f} {jumps[name][0]:11.2f} {jumps[name][1]:10.2f} "
+            f"{errors[name][0]:12.2f} {errors[name][1]:10.2f}",
+            flush=True,
         )
-    # As good as AP3P at its best, and unlike OpenCV's draws it takes weights, which temples need.
-    assert rows[0][1] <= 1.02 * min(row[1] for row in rows[1:4])
-    assert rows[0][2] <= min(row[2] for row in rows[1:4])
-    assert rows[0][0] < 3 * rows[1][0]
+    ours = "torchface, temples weigh 1/4"
+    assert all(jumps[ours][0] < jumps[name][0] for name in PEERS)
+    assert jumps[ours][0] < 1.5 * jumps[ours][1]
 
 
 def test_poses_along_time() -> None:

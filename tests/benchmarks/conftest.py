@@ -1,0 +1,54 @@
+"""What every table is printed with: the machine and the versions that its figures hold for."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from threadpoolctl import threadpool_limits
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """The peers compute on one thread, so ours does too."""
+    before, opencv = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    with threadpool_limits(1):
+        yield
+    torch.set_num_threads(before)
+    cv2.setNumThreads(opencv)
+
+
+@pytest.fixture
+def print_machine() -> Callable[..., None]:
+    """Prints processor, cores, threads, and the versions of the packages (names on PyPI) that are compared."""
+
+    def show(*packages: str) -> None:
+        print(f"\n{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads; processor time")
+        print(", ".join(f"{name} {_version(name)}" for name in ("torch", *packages)))
+
+    return show
+
+
+def _processor() -> str:
+    listed = Path("/proc/cpuinfo")
+    if listed.is_file():
+        told = dict(line.split(":", 1) for line in listed.read_text().splitlines() if ":" in line)
+        fields = {name.strip(): value.strip() for name, value in told.items()}
+        if "model name" in fields:
+            return f"{fields['model name']} (family {fields.get('cpu family')}, model {fields.get('model')})"
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
