@@ -44,6 +44,14 @@ LONGEST = (
 """Where the longest tests lie, which go first: then the processes of a run end together."""
 
 
+@pytest.fixture(scope="session", autouse=True)
+def disk_without_waiting() -> Iterator[None]:
+    """No test's files need survive a power cut: what waits for the disk does not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda handle: None)
+        yield
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Puts the longest tests first; those on real data are skipped where there is none."""
 

@@ -98,7 +98,7 @@ def test_what_a_planted_link_names_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("kept")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / ".lock").symlink_to(tmp_path / "precious")
-    with pytest.raises(FileFormatError, match="cannot be written to"), job_lock(tmp_path / "out"):
+    with pytest.raises(FileFormatError, match="cannot be written: found a link"), job_lock(tmp_path / "out"):
         pass
     assert (tmp_path / "precious").read_text() == "kept"
 

@@ -10,11 +10,12 @@ from contextvars import ContextVar
 from pathlib import Path
 from platform import node
 
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.errors import ValueRangeError
+from torchface.files.temporary_files import open_plain, remove_left_over, shortened
+from torchface.files.whole_files import check_writable, made_folder
+from torchface.files.write_errors import unwritten
 
 LOCK = ".lock"
-_LONGEST_NAME = 240  # bytes of a lock's name, which with its ending must stay below the 255 of most file systems
 _FAR = 2**30  # Windows locks bytes, and who holds the lock stands in the first ones
 _open_to_parts: ContextVar[frozenset[Path]] = ContextVar("open_to_parts", default=frozenset())
 
@@ -60,8 +61,14 @@ def job_lock(folder: str | Path) -> Iterator[Path]:
         FileFormatError: it cannot be made or written to.
     """
     folder = Path(folder)
-    with _made(folder), _locked(folder.resolve() / LOCK, folder):
-        yield folder
+    path = folder.resolve() / LOCK
+    with made_folder(folder), _locked(path, folder):
+        remove_left_over(folder)
+        token = _open_to_parts.set(_open_to_parts.get() | {path})
+        try:
+            yield folder
+        finally:
+            _open_to_parts.reset(token)
 
 
 @contextmanager
@@ -80,8 +87,7 @@ def file_lock(file: str | Path) -> Iterator[Path]:
     """
     file = Path(file)
     check_writable(file)
-    name = os.fsdecode(os.fsencode(file.name)[:_LONGEST_NAME])
-    with _made(file.parent) as folder, _locked(folder.resolve() / f".{name}{LOCK}", file):
+    with made_folder(file.parent) as folder, _locked(folder.resolve() / f".{shortened(file.name)}{LOCK}", file):
         yield file
 
 
@@ -102,57 +108,37 @@ def within_job(folder: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _made(folder: Path) -> Iterator[Path]:
-    """The folder, made where it is missing; what was made and stayed empty goes again."""
-    missing = [above for above in (folder, *folder.parents) if not os.path.lexists(above)]
-    make_folder(folder)
-    try:
-        yield folder
-    finally:
-        with suppress(OSError):
-            for one in missing:
-                one.rmdir()
-
-
-@contextmanager
 def _locked(path: Path, place: Path) -> Iterator[None]:
-    handle = _open(path, place)
-    token = _open_to_parts.set(_open_to_parts.get() | {path})
     try:
+        handle = _taken(path, place)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    try:
+        os.ftruncate(handle, 0)
+        os.lseek(handle, 0, os.SEEK_SET)
+        with suppress(OSError):  # a full disk is told by what is written first
+            os.write(handle, f"{os.getpid()} {node()}".encode())
         yield
     finally:
-        _open_to_parts.reset(token)
         _let_go(handle, path)
 
 
-def _open(path: Path, place: Path) -> int:
-    """The lock's file, open and locked, with this process named in it."""
+def _taken(path: Path, place: Path) -> int:
+    """The lock's file, open and locked."""
     while True:
-        try:
-            # A link of the lock's name is not followed: what it names would be overwritten.
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        except OSError as error:
-            raise FileFormatError(
-                f"{place}: cannot be written to ({path.name} beside or in it: {error.strerror}); expected a place "
-                "that can be written to"
-            ) from error
-        try:
-            taken = _take(handle)
-            if taken and _is_still(handle, path):
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, f"{os.getpid()} {node()}".encode(), 0)
-                return handle
-        except OSError as error:
+        handle = open_plain(path, os.O_RDWR | os.O_CREAT)
+        if not _take(handle):
+            os.lseek(handle, 0, os.SEEK_SET)
+            holder = os.read(handle, 300).decode(errors="replace").split()
             os.close(handle)
-            raise FileFormatError(f"{place}: cannot be locked ({path}: {error.strerror})") from error
-        holder = os.read(handle, 300).decode(errors="replace").split() if not taken else []
-        os.close(handle)
-        if not taken:
             who = f"process {holder[0]} on {holder[1]}" if len(holder) == 2 else "process unknown"
             raise ValueRangeError(
                 f"out: found another run writing into {place} ({who}), expected none; wait for its end or name "
                 "another place"
             )
+        if _is_still(handle, path):
+            return handle
+        os.close(handle)
 
 
 def _is_still(handle: int, path: Path) -> bool:

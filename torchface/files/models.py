@@ -16,7 +16,7 @@ from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config
 from torchface.files.states import check_size, pack_state, read_state
-from torchface.files.whole_files import make_folder, write_file
+from torchface.files.whole_files import all_or_none, made_folder, write_file
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
@@ -67,7 +67,7 @@ class ModelRecord:
 def write_model(
     model: nn.Module, folder: str | Path, record: ModelRecord, card: str = "", half: Collection[str] = ()
 ) -> ModelRecord:
-    """Writes a model into a folder; each file appears only when it is complete, ``model.toml`` last.
+    """Writes a model into a folder; its files take their places together, ``model.toml`` last.
 
     Args:
         model: a module with ``config`` and ``from_config``.
@@ -89,10 +89,10 @@ def write_model(
     folder = Path(folder)
     state = pack_state(model.state_dict(), half)
     record = replace(record, sha256=hashlib.sha256(state).hexdigest(), size=len(state), config=dict(model.config))  # type: ignore[arg-type]
-    make_folder(folder)
-    write_file(folder / STATE, state)
-    write_file(folder / CARD, card_text(folder.name, record, card).encode())
-    write_toml(folder / DESCRIPTION, {"format": FORMAT, **vars(record)})
+    with made_folder(folder), all_or_none():
+        write_file(folder / STATE, state)
+        write_file(folder / CARD, card_text(folder.name, record, card).encode())
+        write_toml(folder / DESCRIPTION, {"format": FORMAT, **vars(record)})
     return record
 
 

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 from torchface.errors import FileFormatError
+from torchface.files.temporary_files import new_temporary, remove_left_over, temporary_name
+from torchface.files.write_errors import unmade, unwritten
 
 LARGEST_FILE = 2**31
 """Bytes; what a head rig with hundreds of shapes stays well below."""
+
+_waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waiting", default=None)
 
 
 def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
@@ -34,19 +45,98 @@ def read_file(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def write_file(path: str | Path, data: bytes) -> None:
-    """Writes a file that appears only when it is complete.
+    """Writes a file that appears only when it is complete and on the disk; see :func:`replaced_file`.
 
     Raises:
         FileFormatError: the folder is missing or cannot be written to.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with _replaced(path, "") as (handle, _):
+        rest = memoryview(data)
+        while rest:  # a system takes 2 GB at a time at most
+            rest = rest[os.write(handle, rest) :]
+
+
+@contextmanager
+def replaced_file(path: str | Path, ending: str = "") -> Iterator[Path]:
+    """A temporary file for a writer that needs a path; it takes the place of ``path`` at the end of the block.
+
+    Before it does it is on the disk. An error in the block, or a process that is killed, leaves what was there before.
+    A file that is replaced hands on its permissions; a link in the place of ``path`` is replaced and not followed.
+
+    Args:
+        path: of the file.
+        ending: of the temporary name, for writers that go by it.
+
+    Returns:
+        The temporary path: an empty file beside ``path``.
+
+    Raises:
+        FileFormatError: it cannot be written; an ``OSError`` of the block is taken for one of its writing.
+    """
+    with _replaced(Path(path), ending) as (_, temporary):
+        yield temporary
+
+
+@contextmanager
+def all_or_none() -> Iterator[None]:
+    """Files written inside the block take their places together at its end.
+
+    An error before leaves all that was there before, an error while they do brings it back. Whatever reads one of them
+    inside the block finds the one before.
+
+    Raises:
+        FileFormatError: they cannot be put into their places.
+    """
+    if _waiting.get() is not None:  # a part of a larger whole
+        yield
+        return
+    waiting: list[tuple[Path | None, Path]] = []
+    token = _waiting.set(waiting)
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
+        try:
+            yield
+        finally:
+            _waiting.reset(token)
+        _put_in_place(waiting)
+    finally:
+        for temporary, _ in waiting:
+            if temporary is not None:
+                _delete(temporary)
+
+
+def delete_file(path: Path) -> None:
+    """Deletes a file where there is one; inside :func:`all_or_none` with the others.
+
+    Raises:
+        FileFormatError: it cannot be deleted.
+    """
+    waiting = _waiting.get()
+    if waiting is not None:
+        waiting.append((None, path))
+        return
+    try:
+        path.unlink(missing_ok=True)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise FileFormatError(f"{path}: cannot be written ({error.strerror})") from error
+        raise FileFormatError(f"{path}: cannot be deleted ({error.strerror})") from error
+
+
+@contextmanager
+def made_folder(folder: str | Path) -> Iterator[Path]:
+    """The folder, made with those above it where it is not there yet; what was made and stayed empty goes again.
+
+    Raises:
+        FileFormatError: it cannot be made.
+    """
+    folder = Path(folder)
+    missing = [above for above in (folder, *folder.parents) if not os.path.lexists(above)]
+    make_folder(folder)
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):
+            for one in missing:
+                one.rmdir()
 
 
 def make_folder(folder: str | Path) -> Path:
@@ -59,22 +149,143 @@ def make_folder(folder: str | Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        raise FileFormatError(
-            f"{folder}: found no folder, and it cannot be made ({getattr(error, 'strerror', error)}); expected a place "
-            "that can be written to"
-        ) from error
+        raise unmade(folder, error) from error
     return folder
 
 
-def check_writable(*paths: Path | None) -> None:
-    """Looks whether files or folders could be made, before long work; makes nothing.
+def check_writable(*files: Path | None, folder: Path | None = None) -> None:
+    """Looks whether files, or a folder for several, could be made, before long work; makes nothing.
 
     Raises:
-        FileFormatError: what is there above one of them is no folder, or may not be written to.
+        FileFormatError: what is there above one of them is no folder, or may not be written to; or in its place is
+            something else.
     """
-    for path in paths:
+    for path in files:
+        if path is not None:
+            try:
+                _permissions(path)
+            except (OSError, ValueError) as error:
+                raise unwritten(path, error) from error
+    if folder is not None and os.path.lexists(folder) and not folder.is_dir():
+        raise unwritten(folder, FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)))
+    for path in (*files, folder):
         if path is None:
             continue
-        above = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+        above = next(one for one in path.absolute().parents if os.path.lexists(one))
         if not above.is_dir() or not os.access(above, os.W_OK):
             raise FileFormatError(f"{path}: cannot be written ({above} is no folder that can be written to)")
+
+
+@contextmanager
+def _replaced(path: Path, ending: str) -> Iterator[tuple[int, Path]]:
+    try:
+        mode = _permissions(path)
+        remove_left_over(path.parent, path.name)
+        handle, temporary = new_temporary(path, 0o666 if mode is None else mode, ending)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise unwritten(path, error) from error
+    waiting = None
+    try:
+        try:
+            yield handle, temporary
+            if mode is not None:
+                os.chmod(handle if os.chmod in os.supports_fd else temporary, mode)
+            _sync(handle)
+        finally:
+            os.close(handle)
+        waiting = _waiting.get()
+        if waiting is None:
+            os.replace(temporary, path)
+            sync_folder(path.parent)
+        else:
+            waiting.append((temporary, path))
+    except OSError as error:
+        raise unwritten(path, error) from error
+    finally:
+        if waiting is None:  # where it has its place already, the temporary name is gone
+            _delete(temporary)
+
+
+def _permissions(path: Path) -> int | None:
+    """Those of the file that is there; None where there is none, or a link, which gives way."""
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return None
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if stat.S_ISLNK(found.st_mode):
+        return None
+    if not stat.S_ISREG(found.st_mode):
+        raise FileFormatError(f"{path}: cannot be written: found a device or a pipe in its place, expected a file")
+    return stat.S_IMODE(found.st_mode) & 0o777
+
+
+def _put_in_place(waiting: list[tuple[Path | None, Path]]) -> None:
+    """Renames all, or deletes where there is nothing to rename; where one cannot be, those before are as they were."""
+    before: list[tuple[Path, Path | None]] = []
+    path = Path()
+    try:
+        for temporary, path in waiting:
+            before.append((path, _second_name(path)))
+            if temporary is None:
+                path.unlink(missing_ok=True)
+            else:
+                os.replace(temporary, path)
+        for folder in dict.fromkeys(path.parent for _, path in waiting):
+            sync_folder(folder)
+    except OSError as error:
+        for one, old in reversed(before):
+            with suppress(OSError):
+                if old is None:
+                    one.unlink()
+                else:
+                    os.replace(old, one)
+        raise unwritten(path, error) from error
+    finally:
+        for _, old in before:
+            if old is not None:
+                _delete(old)
+
+
+def _second_name(path: Path) -> Path | None:
+    """A temporary name for the file that is there as well; None where there is none."""
+    if not os.path.lexists(path):
+        return None
+    name = temporary_name(path)
+    try:
+        os.link(path, name, follow_symlinks=False)
+    except (OSError, NotImplementedError):  # a file system without hard links
+        shutil.copy2(path, name, follow_symlinks=False)
+    return name
+
+
+def sync_folder(folder: Path) -> None:
+    """Has the names in a folder, such as one just renamed, on the disk.
+
+    Raises:
+        OSError: the disk fails.
+    """
+    if sys.platform == "win32":  # folders cannot be opened there
+        return
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except PermissionError:  # one may write into it and not list it
+        return
+    try:
+        _sync(handle)
+    finally:
+        os.close(handle)
+
+
+def _sync(handle: int) -> None:
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):  # file systems that cannot do so
+            raise
+
+
+def _delete(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()

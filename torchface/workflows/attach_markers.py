@@ -13,7 +13,7 @@ from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, clean_take, fit_attachment
 from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
 from torchface.mesh import Mesh
@@ -182,9 +182,9 @@ def attach(
     before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
     progress("writing")
     make_folder(out.parent)
-    fit.attachment.save(out)
-    if picture is not None:
-        save_rendered_image(
-            sheet([site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)], 1), picture
-        )
+    with all_or_none():
+        fit.attachment.save(out)
+        if picture is not None:
+            views = [site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)]
+            save_rendered_image(sheet(views, 1), picture)
     return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))

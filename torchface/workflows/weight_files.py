@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchface.errors import NameMismatchError
-from torchface.files.whole_files import make_folder
+from torchface.files.whole_files import all_or_none, make_folder
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
@@ -39,11 +39,12 @@ def write_weights(take: Take, out: Path, live_link: Path | None = None) -> list[
     assert take.weights is not None
     lost = not_in_live_link(take.weights.names)
     make_folder(out.parent)
-    (save_weights_csv if lost else save_live_link)(take, out)
-    if live_link is None:
-        return []
-    make_folder(live_link.parent)
-    save_live_link(take, live_link)
+    with all_or_none():
+        (save_weights_csv if lost else save_live_link)(take, out)
+        if live_link is None:
+            return []
+        make_folder(live_link.parent)
+        save_live_link(take, live_link)
     more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
     return (
         [f"{live_link} does not give back (halves are merged, others left out): {', '.join(lost[:_SHOWN])}{more}"]

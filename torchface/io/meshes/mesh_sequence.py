@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from pathlib import Path
 from types import TracebackType
 
@@ -13,9 +14,13 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, TopologyError
 from torchface.files.documents import read_json, write_json
+from torchface.files.temporary_files import open_plain
+from torchface.files.whole_files import sync_folder
+from torchface.files.write_errors import unwritten
 
 FORMAT = "torchface.mesh-sequence/1"
 _MAX_COUNT = 2**31
+_NOTE_SECONDS = 1.0
 
 
 class MeshSequence:
@@ -77,7 +82,8 @@ class MeshSequenceWriter:
     """Writes a mesh sequence mesh by mesh; the file appears when it is complete, and a killed run continues.
 
     What is unfinished lies beside as ``NAME.part`` with the count of its meshes in ``NAME.part.json``. A writer
-    with the same sizes and ``key`` goes on behind them: ``done`` says where.
+    with the same sizes and ``key`` goes on behind them: ``done`` says where. A process that is killed loses a second's
+    meshes at most.
 
     Args:
         path: of the file; its folder must be there.
@@ -117,11 +123,16 @@ class MeshSequenceWriter:
         self.done = self._finished()
         try:
             if self.done == 0:
-                self._part.write_bytes(self._begin)
-            self._file = self._part.open("r+b")
+                self._note.unlink(missing_ok=True)  # first: it would be one of other meshes
+                self._part.unlink(missing_ok=True)
+                self._file = os.fdopen(open_plain(self._part, os.O_RDWR | os.O_CREAT | os.O_EXCL), "r+b")
+                self._file.write(self._begin)
+            else:
+                self._file = os.fdopen(open_plain(self._part, os.O_RDWR), "r+b")
             self._file.seek(self._offset(self.done))
         except OSError as error:
-            raise FileFormatError(f"{self.path}: cannot be written ({error.strerror})") from error
+            raise unwritten(self.path, error) from error
+        self._noted = 0.0
 
     def append(self, vertices: Tensor) -> None:
         """Adds one mesh (V,C) or several (N,V,C).
@@ -140,18 +151,31 @@ class MeshSequenceWriter:
             self._file.write(several.detach().cpu().contiguous().numpy().astype("<f4", copy=False).tobytes())
             self._file.flush()
         except OSError as error:
-            raise FileFormatError(f"{self.path}: cannot be written ({error.strerror})") from error
+            raise unwritten(self.path, error) from error
         self.done += len(several)
-        write_json(self._note, {"done": self.done}, indent=None)
+        if time.monotonic() - self._noted > _NOTE_SECONDS:  # a disk takes longer to be sure than a mesh takes
+            self._note_done()
 
     def close(self) -> None:
         """Puts a complete file in its place; what is incomplete stays beside for another run."""
+        if self._file.closed:
+            return
+        try:
+            with self._file:
+                self._note_done()
+            if self.done == self.count:
+                os.replace(self._part, self.path)
+                sync_folder(self.path.parent)
+                self._note.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritten(self.path, error) from error
+
+    def _note_done(self) -> None:
+        """Notes what is there for another run, once it is on the disk."""
         self._file.flush()
         os.fsync(self._file.fileno())
-        self._file.close()
-        if self.done == self.count:
-            os.replace(self._part, self.path)
-            self._note.unlink(missing_ok=True)
+        write_json(self._note, {"done": self.done}, indent=None)
+        self._noted = time.monotonic()
 
     def __enter__(self) -> MeshSequenceWriter:
         return self

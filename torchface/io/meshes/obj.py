@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
@@ -90,12 +90,13 @@ def write_obj(mesh: Mesh, path: str | Path) -> None:
         FileFormatError: the folder cannot be written to.
     """
     path = Path(path)
-    if mesh.texture is not None:
-        write_file(path.with_suffix(".png"), encode_png(mesh.texture))
-        write_file(path.with_suffix(".mtl"), f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n".encode())
-    colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
-    rows = _vertex_lines(mesh.vertices, colors)
-    write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))
+    with all_or_none():
+        if mesh.texture is not None:
+            write_file(path.with_suffix(".png"), encode_png(mesh.texture))
+            write_file(path.with_suffix(".mtl"), f"newmtl skin\nKd 1 1 1\nmap_Kd {path.stem}.png\n".encode())
+        colors = None if mesh.colors is None else mesh.colors.detach().cpu().double().numpy()
+        rows = _vertex_lines(mesh.vertices, colors)
+        write_file(path, _material_line(mesh, path) + rows + _surface_lines(mesh))
 
 
 def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: str | Path) -> None:
@@ -110,8 +111,9 @@ def write_obj_shapes(mesh: Mesh, shapes: Iterable[tuple[str, Tensor]], neutral: 
         FileFormatError: the folder cannot be written to.
     """
     surface, material = _surface_lines(mesh), _material_line(mesh, Path(neutral))
-    for name, vertices in shapes:  # a file each
-        write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices) + surface)
+    with all_or_none():
+        for name, vertices in shapes:  # a file each
+            write_file(Path(neutral).with_name(f"{name}.obj"), material + _vertex_lines(vertices) + surface)
 
 
 def _material_line(mesh: Mesh, path: Path) -> bytes:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.documents import read_json, write_json
-from torchface.files.whole_files import read_file
+from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.container import Document
 from torchface.io.gltf.mesh_extras import read_annotations, write_extras
@@ -82,19 +80,9 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
     missing = [] if detail is None else [name for name in detail.names if name not in rig.names]
     if missing:
         raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
-    place = folder.resolve()  # "." has no name of its own
-    part = place.with_name(f".{place.name}.{os.getpid()}.part")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
-        _write(rig, part, detail)
-        folder.mkdir(exist_ok=True)
-        for path in sorted(part.iterdir()):  # one file each
-            os.replace(path, folder / path.name)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be written ({error.strerror})") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    check_writable(folder=folder)
+    with made_folder(folder), all_or_none():
+        _write(rig, folder, detail)
 
 
 def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
@@ -19,9 +18,11 @@ from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.files.whole_files import replaced_file
 from torchface.io.tables.frame_rates import check_rate
 from torchface.io.video.container import reason
-from torchface.io.video.video_file import VideoFile
+from torchface.io.video.packets import read_packets
+from torchface.io.video.video_file import VideoFile, open_video
 
 _SUFFIXES = (".avi", ".mkv", ".mp4")
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
@@ -30,7 +31,7 @@ _MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30
 
 
 def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> VideoFile:
-    """Writes frames; the file appears only when it is complete.
+    """Writes frames and reads the file back; it appears only when it is complete.
 
     Args:
         frames: grey chunks (t,H,W) or single grey frames (H,W), or chunks in colour (t,3,H,W), red first; uint8, or
@@ -48,20 +49,21 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     if path.suffix.lower() not in _SUFFIXES:
         raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_SUFFIXES)}")
     check_rate(fps, "fps", ValueRangeError)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix.lower()}")
     single = _single(frames)
     first = next(single, None)
     if first is None:
         raise ShapeError(f"{path}: found no frame, expected at least one")
-    try:
-        with av.open(str(temporary), "w") as container:
-            count = _encode(container, first, single, fps)
-        os.replace(temporary, path)
-    except (OSError, av.FFmpegError) as error:
-        raise FileFormatError(f"{path}: cannot be written ({reason(error)})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return VideoFile(path, fps, first.shape[-1], first.shape[-2], count)
+    with replaced_file(path, path.suffix.lower()) as temporary:
+        try:
+            with av.open(str(temporary), "w") as container:
+                count = _encode(container, first, single, fps)
+        except av.FFmpegError as error:
+            if isinstance(error, OSError):
+                raise
+            raise FileFormatError(f"{path}: cannot be written ({reason(error)})") from error
+        written = VideoFile(path, fps, first.shape[-1], first.shape[-2], count)
+        _check_written(written, temporary)
+    return written
 
 
 def to_bytes(frame: Tensor) -> Tensor:
@@ -69,6 +71,25 @@ def to_bytes(frame: Tensor) -> Tensor:
     if frame.dtype == torch.uint8:
         return frame.contiguous()
     return (frame.clamp(0, 1) * 255).round().to(torch.uint8).contiguous()
+
+
+def _check_written(expected: VideoFile, temporary: Path) -> None:
+    """Reads the file back, its packets and its first frame: an encoder may report success on a full disk.
+
+    Raises:
+        FileFormatError: it does not hold what was written.
+    """
+    try:
+        found = open_video(temporary)
+        frames = len(read_packets(temporary).seconds)
+    except FileFormatError as error:
+        message = str(error).replace(str(temporary), "read back")
+        raise FileFormatError(f"{expected.path}: cannot be written ({message}); is the disk full?") from error
+    if (frames, found.width, found.height) != (expected.count, expected.width, expected.height):
+        raise FileFormatError(
+            f"{expected.path}: cannot be written: read back, found {frames} frames of {found.width} x {found.height} "
+            f"pixels, expected {expected.count} of {expected.width} x {expected.height}; is the disk full?"
+        )
 
 
 def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor], fps: float) -> int:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.files.whole_files import all_or_none, made_folder
 from torchface.io.images.image_files import load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 
@@ -62,12 +63,9 @@ def save_annotated_frame(frame: AnnotatedFrame, folder: str | Path) -> Path:
         ValueRangeError: a landmark is NaN.
     """
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be made ({error.strerror})") from error
     image_path, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
-    if not image_path.exists():
-        save_image(frame.image, image_path)
-    save_pts(torch.as_tensor(frame.landmarks), points)
+    with made_folder(folder), all_or_none():
+        if not image_path.exists():
+            save_image(frame.image, image_path)
+        save_pts(torch.as_tensor(frame.landmarks), points)
     return points

@@ -129,8 +129,6 @@ def register_corpus(
     tasks = _tasks(job, files, marks)
     progress = progress or silent
     with within_job(folder):
-        for left_over in folder.glob(".*.part"):
-            left_over.unlink(missing_ok=True)
         kept = [entry for task in tasks if (entry := finished_entry(task, job.out)) is not None]
         entries = {entry.name: entry for entry in kept}
         progress("registering scans", len(entries), len(tasks))

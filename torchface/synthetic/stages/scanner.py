@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.documents import write_json
+from torchface.files.whole_files import all_or_none, made_folder
 from torchface.geometry.meshes.operators import components, corners
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.io.mesh_files import save_mesh
@@ -150,12 +151,12 @@ def write_scan(scan: RawScan, folder: str | Path, name: str) -> Path:
         The path of the OBJ file.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     groups = [{"label": label, "mask": list(rows)} for label, rows in _MENPO_GROUPS]
     landmarks = {"points": scan.ibug.tolist(), "connectivity": []}
     document = {"version": 2, "labels": groups, "landmarks": landmarks}
-    write_json(folder / f"{name}.ljson", document, indent=None)
-    save_mesh(scan.mesh, folder / f"{name}.obj")
+    with made_folder(folder), all_or_none():
+        write_json(folder / f"{name}.ljson", document, indent=None)
+        save_mesh(scan.mesh, folder / f"{name}.obj")
     return folder / f"{name}.obj"
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from torchface.errors import ValueRangeError
+from torchface.files.whole_files import all_or_none, made_folder
 from torchface.io import save_mesh, save_rig
 from torchface.io.landmarks.picks import save_correspondences, save_landmarks
 from torchface.mesh import Annotations, Mesh
@@ -41,8 +42,13 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
     picked = [vertex for vertex in picks.landmarks if vertex is not None]
     if not (picked or picks.markers or picks.pairs):
         raise ValueRangeError("picks: found none, expected a landmark, a marker or a correspondence to save")
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
+    with made_folder(folder), all_or_none():
+        return _write(session, folder, rig)
+
+
+def _write(session: PickSession, folder: Path, rig: BlendshapeRig | None) -> list[Path]:
+    picks, written = session.picks, list[Path]()
+    picked = [vertex for vertex in picks.landmarks if vertex is not None]
     if picked:
         save_landmarks(session.landmarks(), folder / "landmarks.json")
         written.append(folder / "landmarks.json")

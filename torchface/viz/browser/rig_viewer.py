@@ -12,6 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.mesh import Mesh
@@ -104,7 +105,7 @@ class RigViewer(BrowserPage):
     def save(self) -> Path:
         """Writes the weights as they stand now."""
         with self._lock:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.out.parent)
             save_take(self.editor.to_take(self.take), self.out)
         return self.out
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
-from torchface.files.whole_files import write_file
+from torchface.files.whole_files import all_or_none, write_file
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import vertex_openness
@@ -146,8 +146,9 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
         **_appearance(first.rig.neutral),
     }
     script = files("torchface.viz.reports").joinpath("player.js").read_bytes()
-    write_file(folder / "player.js", script)
-    write_file(folder / f"{name}.js", f'torchfacePlayer("{name}",{json.dumps(data, allow_nan=False)});\n'.encode())
+    with all_or_none():
+        write_file(folder / "player.js", script)
+        write_file(folder / f"{name}.js", f'torchfacePlayer("{name}",{json.dumps(data, allow_nan=False)});\n'.encode())
     return f'<div id="{name}"></div>\n<script src="player.js"></script>\n<script src="{name}.js"></script>\n'
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchface.files.whole_files import make_folder, write_file
+from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.rendering.compositing import save_rendered_image
 
 _STYLE = """
@@ -47,12 +47,17 @@ class Section:
 
 
 def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> Path:
-    """Writes ``index.html`` and its figures into a folder; the page appears last, complete.
+    """Writes ``index.html`` and its figures into a folder; they take their places together.
 
     Returns:
         The page's path.
     """
     folder = make_folder(folder)
+    with all_or_none():
+        return _write(folder, title, sections)
+
+
+def _write(folder: Path, title: str, sections: Sequence[Section]) -> Path:
     parts = [
         f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
         f"<style>{_STYLE}</style>\n<h1>{html.escape(title)}</h1>\n"

@@ -19,6 +19,7 @@ from torchface.evaluation import (
     vertex_errors,
 )
 from torchface.files.job_lock import within_job
+from torchface.files.whole_files import all_or_none
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.viz.figures.heat_maps import round_maximum
@@ -101,7 +102,8 @@ def _evaluate(
     progress("comparing")
     evaluation = compare(found, true, settings, scans)
     progress("writing")
-    write_tables(evaluation, out)
+    with all_or_none():
+        write_tables(evaluation, out)
     return evaluation
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from torchface.files.documents import write_json
+from torchface.files.whole_files import delete_file
 from torchface.io.tables.csv_table import write_table
 from torchface.workflows.evaluate.evaluation_record import Evaluation
 
@@ -43,7 +44,7 @@ def write_tables(evaluation: Evaluation, out: Path) -> None:
         rows = [[name, *(_number(float(x)) for x in numbers)] for name, *numbers in columns_of]
         write_table(out / "shapes.csv", ["shape", "mean", "largest", "correlation"], rows)
     else:
-        (out / "shapes.csv").unlink(missing_ok=True)  # one of an earlier run would be of other files
+        delete_file(out / "shapes.csv")  # one of an earlier run would be of other files
     write_json(out / "summary.json", summary(evaluation))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
@@ -154,13 +155,14 @@ def fit_photographs(
     worn = dressed_as(fit.mesh, rig.neutral, unseen)
     transferred = transfer_with_report(rig, worn, progress=progress)
     progress("writing the rig and the overlays")
-    save_rig(renamed(transferred.rig, names), out)
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
-    for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
-        save_rendered_image(overlay(fit, i, image, marks[i]), path)
-    for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
-        calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
-        save_calibration(calibration, path.with_suffix(".toml"))
-    for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
-        save_pts(one.face.landmarks, path.with_suffix(".pts"))
+    with all_or_none():
+        save_rig(renamed(transferred.rig, names), out)
+        for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
+            save_rendered_image(overlay(fit, i, image, marks[i]), path)
+        for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
+            calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
+            save_calibration(calibration, path.with_suffix(".toml"))
+        for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
+            save_pts(one.face.landmarks, path.with_suffix(".pts"))
     return FittedHead(transferred.rig, fit, overlays, transferred.report.summary(), tuple(found), tuple(remarks))

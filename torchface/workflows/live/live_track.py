@@ -13,6 +13,7 @@ from torchface.capture.video import VideoState
 from torchface.capture.video.head_pose import PoseTracker
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.errors import ValueRangeError
+from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io.weights.live_link_stream import LiveLinkSender, parse_address
@@ -168,11 +169,12 @@ def track_live(
     found = torch.stack([torch.isfinite(row.landmarks).all(1).any() for row in rows])
     path = None
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         rotations = torch.stack([row.rotation for row in rows])
         frontal = torch.eye(3).to(rotations) * rotations.new_tensor([1.0, -1, -1])
         rotations = torch.where(torch.isfinite(rotations), rotations, frontal)
         track, columns = Track(actor.names, weights[..., None]), rotation_columns(rotations)
         take = Take(source.video.fps, weights=track, extras={"columns": columns})
-        path = save_curves(take, out)["weights"]
+        with all_or_none():
+            path = save_curves(take, out)["weights"]
     return LiveReport(weights, found, torch.tensor(latency), source.dropped, len(rows) / took, path)

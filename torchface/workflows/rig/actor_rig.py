@@ -11,6 +11,7 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.job_lock import file_lock
+from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.landmarks.scans.detector_files import load_detector
@@ -205,11 +206,13 @@ def _rig_actor(
         learned, used = job.learned(actor, neutral, registration.matched, expressions)
         actor = clear_parts(learned.rig, parts)
     maps = job.baked(actor, fine)
-    progress("writing the rig")
-    save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
     progress("drawing the registration")
+    views = registration_sheet(load_mesh(scan, options.unit), registration)
+    progress("writing the rig")
     figure = out.with_name(f"{out.stem}{FIGURE_ENDING}")
-    save_rendered_image(registration_sheet(load_mesh(scan, options.unit), registration), figure)
+    with all_or_none():
+        save_rig(renamed(actor, options.names), out, renamed_detail(_detail(maps), actor, options.names))
+        save_rendered_image(views, figure)
     names = {label: baked for label, (_, baked) in maps.items()}
     return ActorReport(
         actor,
@@ -348,10 +351,8 @@ def check_out(out: Path) -> None:
         raise FileFormatError(
             f"{out}: found the ending {out.suffix!r}, expected .glb, or none for a folder of OBJ files"
         )
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        trial = out.resolve().parent / f".{out.resolve().name}.writable"
-        trial.touch()
-        trial.unlink()
-    except OSError as error:
-        raise FileFormatError(f"{out}: cannot be written ({error.strerror})") from error
+    if out.suffix:
+        check_writable(out)
+    else:
+        check_writable(folder=out)
+    make_folder(out.parent)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers import Cleanup, Defect
+from torchface.files.whole_files import make_folder
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rendering.compositing import caption, sheet
 from torchface.rig import BlendshapeRig
@@ -50,7 +51,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport, rig: Blendsh
     """
     take = report.take
     assert take.weights is not None
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     weights, names = take.weights.values[..., 0].float(), take.weights.names
     offsets = _offsets(rig, solution, weights)
     errors = offsets.norm(dim=-1)

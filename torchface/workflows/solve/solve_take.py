@@ -189,7 +189,7 @@ def solve_take(
         TorchfaceError: any file is broken or does not fit the others.
     """
     progress = progress or silent
-    check_writable(out, live_link, animation, report)
+    check_writable(out, live_link, animation, folder=report)
     if stream is not None:
         parse_address(stream)
     progress("reading the rig")

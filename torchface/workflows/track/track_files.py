@@ -9,7 +9,7 @@ from safetensors.torch import load, save
 
 from torchface.capture.video import VideoSolution
 from torchface.errors import FileFormatError, TorchfaceError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.whole_files import delete_file, read_file, write_file
 from torchface.io import save_animation
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.weights.live_link_csv import save_live_link
@@ -85,7 +85,7 @@ def save_curves(take: Take, out: Path) -> dict[str, Path]:
         products["live link"] = out / LIVE_LINK
         save_live_link(take, out / LIVE_LINK)
     else:
-        (out / LIVE_LINK).unlink(missing_ok=True)  # one of an earlier run would tell of another rig
+        delete_file(out / LIVE_LINK)  # one of an earlier run would tell of another rig
     return products
 
 

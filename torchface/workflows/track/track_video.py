@@ -17,6 +17,7 @@ from torchface.capture.video.video_smoothing import interpolated, solve_whole_ta
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
+from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io import load_rig
@@ -143,7 +144,8 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     tracked = Tracked(
         clip, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
     )
-    products |= write_curves(tracked, out)
+    with all_or_none():
+        products |= write_curves(tracked, out)
     if settings.overlay:
         texture_key = "" if settings.texture is None else file_digest(settings.texture)
         overlay_key = digest(solve_key, texture_key)
