@@ -7,10 +7,13 @@ from numbers import Real
 
 import torch
 
-from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 
 LARGEST_WEIGHT = 1e12
 """The largest weight that a term of an energy may have: beyond it rounding leaves nothing of the other terms."""
+
+MIN_FPS, MAX_FPS = 0.01, 10_000.0
+"""Frames a second: from a picture every hundred seconds to what no marker camera reaches."""
 
 
 def checked_number(
@@ -65,6 +68,18 @@ def checked_count(
     return int(_real(value))
 
 
+def check_rate(fps: object, where: str, error: type[TorchfaceError] = FileFormatError) -> float:
+    """The rate itself, where it can be one of a camera's; ``where`` begins the message.
+
+    Raises:
+        TorchfaceError: ``error``, for a rate that is no camera's.
+    """
+    number = _real(fps)
+    if not MIN_FPS <= number <= MAX_FPS:
+        raise error(f"{where}: found {fps!s:.40} frames a second, expected {MIN_FPS} to {MAX_FPS:.0f}")
+    return number
+
+
 def _real(value: object) -> float:
     """As a float; NaN for what is no number."""
     if isinstance(value, torch.Tensor) and value.numel() == 1 and value.dtype != torch.bool and not value.is_complex():
@@ -78,7 +93,7 @@ def _real(value: object) -> float:
 
 
 def _range_text(kind: str, least: float, most: float, above: bool = False) -> str:
-    if math.isinf(most) or most == 2**31 - 1:
+    if math.isinf(most) or most in (2**31 - 1, LARGEST_WEIGHT):
         return f"{kind} above {least:g}" if above else kind if math.isinf(least) else f"{kind} of at least {least:g}"
     low = f"above {least:g} and at most " if above else f"from {least:g} to "
     return f"{kind} {low}{most:.7g}"

@@ -10,6 +10,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import check_rate
+
+_WIDTHS = {"markers": 3, "landmarks": 2, "weights": 1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +81,8 @@ class Take:
         extras: what else the file holds (columns by name, device, subject), kept for writing it back.
 
     Raises:
-        ShapeError: the tracks differ in length.
-        ValueRangeError: ``fps`` is not a positive number.
+        ShapeError: the tracks differ in length, or a track's values are not of its kind's width.
+        ValueRangeError: ``fps`` is no rate of a camera, 0.01 to 10,000.
     """
 
     fps: float
@@ -90,8 +93,11 @@ class Take:
     extras: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (self.fps > 0 and self.fps < float("inf")):
-            raise ValueRangeError(f"take: found {self.fps} frames a second, expected a positive number")
+        check_rate(self.fps, "take", ValueRangeError)
+        for name, width in _WIDTHS.items():
+            track = getattr(self, name)
+            if track is not None and track.values.shape[2] != width:
+                raise ShapeError(f"take: found {name} {tuple(track.values.shape)}, expected (T,C,{width})")
         if self.timecode is not None:
             object.__setattr__(self, "timecode", tuple(self.timecode))
         lengths = {

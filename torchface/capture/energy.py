@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,5 +163,4 @@ def gaussian_term(mean: Tensor, variance: Tensor) -> Quadratic:
 def _check_weight(name: str, weight: float | Tensor) -> None:
     if isinstance(weight, Tensor) and weight.is_meta:  # a solver that waits for its state
         return
-    if not 0 <= weight < float("inf"):
-        raise ValueRangeError(f"{name}: found {float(weight)}, expected a number that is not negative")
+    checked_number(name, weight, 0.0, LARGEST_WEIGHT)

@@ -21,6 +21,7 @@ def attach(
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
+    flip: Literal["x", "y", "z"] | None = None,
     insist: bool = False,
     quiet: Quiet = False,
 ) -> None:
@@ -43,6 +44,7 @@ def attach(
             subjects' prefixes (Actor:M001) are left out without it.
         frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         insist: Write the sites although the rig does not explain the markers, or the take leaves most of them
             uncertain.
         quiet: Show no progress.
@@ -52,7 +54,7 @@ def attach(
     from torchface.workflows.marker_input import MarkerOptions
 
     with file_lock(out), progress_bars(quiet) as progress:
-        options = MarkerOptions(unit, labels, frames)
+        options = MarkerOptions(unit, labels, frames, flip)
         report = find_sites(rig, rom, out, initial, standoff, picture, part, progress, options, insist)
     print_lines(report.lines())
     print(out)

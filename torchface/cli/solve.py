@@ -35,6 +35,7 @@ def solve(
     labels: Path | None = None,
     frames: str | None = None,
     unit: Literal["mm", "cm", "m", "in"] | None = None,
+    flip: Literal["x", "y", "z"] | None = None,
     insist: bool = False,
     quiet: Quiet = False,
 ) -> None:
@@ -72,6 +73,7 @@ def solve(
             ATTACHMENT each; an empty second cell leaves the marker out, with Jane:* all of a subject's.
         frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
         unit: What the take's coordinates are in: mm, cm, m or in; else what the file says (CSV: millimetres).
+        flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         insist: Write weights although the rig does not explain the markers.
         quiet: Show no progress.
     """
@@ -89,7 +91,7 @@ def solve(
 
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
-    options = MarkerOptions(unit, labels, frames)
+    options = MarkerOptions(unit, labels, frames, flip)
     with file_lock(out), progress_bars(quiet) as progress:
         done = solve_take(
             rig, take, attachment, out, animation, settings, part, report, stream, camera, progress, options, live_link

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
+MIN_HEAD_SCALE, MAX_HEAD_SCALE = 0.8, 1.25
+"""Two heads in the same unit, a child's and a large man's included, do not differ by more in size."""
+
 
 @dataclass(frozen=True, eq=False)
 class Similarity:

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.operators import border_vertices, vertex_normals
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 
 _SEED = 0
 _ROTATIONS = 400
 _LANDMARK_WEIGHT = 20.0
-_MIN_SCALE, _MAX_SCALE = 0.8, 1.25
 _DAMPING = 1e-6
 _LEAST_FIT = 0.35
 _SCAN_POINTS = 20_000
@@ -98,7 +97,7 @@ def rigid_icp(
     Source: Chen, Medioni 1992 (across the surface); Rusinkiewicz, Levoy 2001; thesis 3.2.3, figure 16.
     """
     s, rotation, translation = start.scale.double(), start.rotation.double(), start.translation.double()
-    lowest, highest = s * _MIN_SCALE, s * _MAX_SCALE
+    lowest, highest = s * MIN_HEAD_SCALE, s * MAX_HEAD_SCALE
     for reach in reaches:
         pose = Similarity(s, rotation, translation)
         moved, targets, normals, weights = _planes(samples, scan, pose, reach)

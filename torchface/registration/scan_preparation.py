@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components, triangle_areas, triangle_cross
 from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 
@@ -123,6 +124,17 @@ def _inside_out(scan: PreparedScan) -> bool:
     return float((cross * (centres - mean)).sum()) < 0
 
 
+def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks") -> None:
+    """Raises ``AlignmentError`` where points on a scan (L,3) are a mirror image of a template's own (L,3)."""
+    found = check_mirrored(own, points)
+    if found.mirrored:
+        raise AlignmentError(
+            f"{name}: those on the scan are a mirror image of the template's: {found.figures()} are left; the scan "
+            "was exported in left-handed axes (export it in right-handed ones, or negate one coordinate of its "
+            "vertices and landmarks), or those of left and right are swapped"
+        )
+
+
 def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) -> tuple[Landmarks, Similarity, str]:
     """The landmarks that can be used, the similarity they give, and a note of what was left out ("" if nothing).
 
@@ -130,7 +142,7 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
         ShapeError: not (L,) and (L,3), or fewer than three are left.
         TopologyError: a vertex id outside the template.
         ValueRangeError: they lie on a line, or off the scan.
-        AlignmentError: no similarity brings the template's landmarks near the scan's.
+        AlignmentError: no similarity brings the template's landmarks near the scan's, or only a reflection does.
     """
     ids, points = landmarks[0].detach().cpu(), landmarks[1].detach().cpu().double()
     if ids.ndim != 1 or points.shape != (len(ids), 3) or ids.dtype != torch.int64:
@@ -161,6 +173,7 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
     pose = similarity_transform(own[None], points[None])
     error = float((pose.apply(own)[0] - points).square().sum(-1).mean().sqrt())
     size = float((points.amax(0) - points.amin(0)).norm())
+    check_same_hand(own, points)
     if error > _WORST_LANDMARK_FIT * size:
         raise AlignmentError(
             f"landmarks: the best similarity leaves {error:.1f} mm (root mean square) between the template's and the "

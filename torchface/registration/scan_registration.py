@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.meshes.operators import edges, vertex_normals
 from torchface.geometry.meshes.proximity import SurfaceIndex, SurfacePoints
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.registration.hair_and_cloth import Cover
@@ -163,7 +163,7 @@ def register(
         nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
         matched &= ~unseen
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
-    notes = [*start.notes, *start.pull.disagreement(deformer.current), *_model_notes(fit)]
+    notes = [*start.notes, *_scale_notes(start.pose), *start.pull.disagreement(deformer.current), *_model_notes(fit)]
     notes += _final_notes(template, scan, deformer, texture_size)
     colors = _scan_colors(scan, start.prepared)
     if colors is not None:
@@ -250,6 +250,16 @@ def _model_fit(model: ShapeModel, template: Mesh, laid: Tensor, start: _Start, s
     exposed = exposed_vertices(laid, faces, schedule.opening).nonzero()[:, 0]
     landmarks = (start.pull.vertices, start.pull.points)
     return fit_to_scan(model, faces, laid, exposed, start.surface, landmarks, schedule.largest_angle)
+
+
+def _scale_notes(pose: Similarity) -> list[str]:
+    scale = float(pose.scale[0])
+    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
+        return []
+    return [
+        f"the template was laid on the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
+        f"{MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
+    ]
 
 
 def _model_notes(fit: ModelFit | None) -> list[str]:

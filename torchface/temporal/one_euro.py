@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import check_rate, checked_number
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class OneEuroSettings:
     speed_cutoff: float = 1.0
 
     def __post_init__(self) -> None:
-        positive = (self.cutoff, self.speed_cutoff)
-        if not all(0 < value < math.inf for value in positive) or not 0 <= self.speed < math.inf:
-            raise ValueRangeError(f"one-euro filter: found {self}, expected positive cutoffs and a speed from 0")
+        for name in ("cutoff", "speed_cutoff"):
+            checked_number(f"one-euro filter: {name}", getattr(self, name), above=True)
+        checked_number("one-euro filter: speed", self.speed)
 
 
 class OneEuroFilter:
@@ -45,14 +46,13 @@ class OneEuroFilter:
         settings: cutoffs.
 
     Raises:
-        ValueRangeError: ``fps`` is not positive.
+        ValueRangeError: ``fps`` is no rate of a camera.
 
     Source: Casiez, Roussel, Vogel 2012.
     """
 
     def __init__(self, fps: float, settings: OneEuroSettings = OneEuroSettings()) -> None:
-        if not 0 < fps < math.inf:
-            raise ValueRangeError(f"one-euro filter: found {fps} frames a second, expected a positive number")
+        check_rate(fps, "one-euro filter", ValueRangeError)
         self.fps, self.settings = fps, settings
         self._value: Tensor | None = None
         self._speed: Tensor | None = None

@@ -12,6 +12,8 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, clean_take, fit_attachment
 from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
+from torchface.capture.markers.attachment.attachment_fit import marker_paths
+from torchface.capture.markers.rest_pose import check_not_mirrored
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.io import load_rig
@@ -22,7 +24,7 @@ from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.figures.site_views import errors_by_iteration, site_views
-from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, read_range_of_motion
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, pose_warnings, read_range_of_motion
 
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
@@ -157,7 +159,7 @@ def attach(
     """Reads, finds the sites, writes them; see ``torchface attach --help`` for the arguments.
 
     Raises:
-        AlignmentError: the rig does not explain the markers, unless ``insist``.
+        AlignmentError: the rig does not explain the markers, or they are mirrored, unless ``insist``.
         ValueRangeError: the take leaves most sites or shapes uncertain, unless ``insist``.
         TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
     """
@@ -171,7 +173,11 @@ def attach(
     if start is None:
         progress("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
+    elif not insist:
+        sites = start.on(loaded.neutral.faces, loaded.vertices)
+        check_not_mirrored(marker_paths(take, start), sites, str(rom))
     fit, cleanup = cleaned_fit(loaded, take, start, standoff, progress)
+    notes = [*notes, *pose_warnings(fit.alignment)]
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:

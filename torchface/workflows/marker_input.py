@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
+from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.io import load_take
 from torchface.io.markers.label_maps import load_label_map
 from torchface.take import Take, Track
 
 _SHOWN = 6
+_AXES = "xyz"
 _SPAN = re.compile(r"\s*(\d{0,9})\s*:\s*(\d{0,9})\s*")
 
 
@@ -28,11 +32,13 @@ class MarkerOptions:
         unit: of its coordinates; what the file says if absent.
         labels: a table that maps the take's labels to the attachment's.
         frames: ``A:B``, the frames from A up to, not including, B; all if absent.
+        flip: ``x``, ``y`` or ``z``, the axis whose coordinates are negated: a take in left-handed axes is mirrored.
     """
 
     unit: str | None = None
     labels: Path | None = None
     frames: str | None = None
+    flip: str | None = None
 
 
 DEFAULT_OPTIONS = MarkerOptions()
@@ -62,7 +68,28 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
     except NameMismatchError as error:
         raise NameMismatchError(f"{path}: {error}") from error
     chosen = take.markers.select(match.channels)
-    return replace(take, markers=Track(match.labels, chosen.values, chosen.confidence)), match.notes()
+    values = chosen.values if options.flip is None else _flipped(chosen.values, options.flip)
+    return replace(take, markers=Track(match.labels, values, chosen.confidence)), match.notes()
+
+
+def _flipped(values: Tensor, axis: str) -> Tensor:
+    """Markers (T,M,3) with one coordinate negated."""
+    if axis not in _AXES:
+        raise ValueRangeError(f"--flip: found {axis!r}, expected x, y or z")
+    return values * torch.tensor([-1.0 if name == axis else 1.0 for name in _AXES]).to(values)
+
+
+def pose_warnings(alignment: Similarity) -> list[str]:
+    """What the scale at which a take was laid on a rig says against them; nothing where it is a head's."""
+    scale = float(alignment.scale[0])
+    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
+        return []
+    unit = unit_of_scale(scale)
+    why = f"the take seems to be in {unit} (--unit {unit})" if unit else "the labels, the take or the rig are others"
+    return [
+        f"the take fits the rig at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to {MAX_HEAD_SCALE} "
+        f"times: {why}"
+    ]
 
 
 def read_range_of_motion(

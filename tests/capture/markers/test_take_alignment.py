@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
-from torchface.capture import MarkerSolver, align_take, rest_residual
+from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
+from torchface.errors import AlignmentError
+from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic.stages.marker_stage import StageFlaws, record
 
@@ -76,3 +79,45 @@ def test_what_is_left_at_rest_is_told_and_subtracted(performance: Performance) -
     clean = rest_residual(rig, attachment, take).residual
     assert clean is not None
     assert float(clean.norm(dim=1).mean()) < 0.15
+
+
+def flipped(take: Take, axis: int) -> Take:
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    values[..., axis] *= -1
+    return replace(take, markers=Track(take.markers.names, values))
+
+
+@pytest.mark.parametrize(("axis", "neutral_frame"), [(0, None), (1, 0), (2, 0)])
+def test_a_mirrored_take_is_refused_with_both_distances(
+    performance: Performance, stage_space: Similarity, axis: int, neutral_frame: int | None
+) -> None:
+    rig, attachment, takes = performance
+    take = record(rig, attachment, takes[0][::90], torch.Generator().manual_seed(0)).take
+    mirrored = flipped(moved(take, stage_space), axis)
+    with pytest.raises(AlignmentError, match=r"mirror image.* scaled 3\d\.\d mm .* mirrored as well \S+ mm .*--flip x"):
+        align_take(rig, attachment, mirrored, neutral_frame)
+    with pytest.raises(AlignmentError, match="mirror image"):
+        fit_attachment(rig, mirrored, attachment)
+    # Negated again, or insisted on, it is laid on the rig; its true scale is 1 / 1.07.
+    right = align_take(rig, attachment, flipped(mirrored, axis), 0)
+    assert abs(float(right.scale[0]) * 1.07 - 1) < 0.03
+    assert float(align_take(rig, attachment, mirrored, 0, insist=True).scale[0]) * 1.07 < 0.85
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("count", [12, 100])
+def test_no_real_take_is_called_mirrored_and_each_is_when_it_is(
+    real_capture: Performance, stage_space: Similarity, count: int
+) -> None:
+    rig, attachment, takes = real_capture
+    sites = attachment.select((attachment.labels or ())[:count])
+    rest = sites.on(rig.neutral.faces, rig.vertices)
+    for weights in takes:
+        take = record(rig, sites, weights[::40], torch.Generator().manual_seed(0)).take
+        take = moved(take, stage_space)
+        assert take.markers is not None
+        right = check_mirrored(take.markers.values.nanmean(0), rest)
+        assert not right.mirrored
+        assert right.mirrored_distance > 5 * right.distance
+        assert check_mirrored(flipped(take, 0).markers.values.nanmean(0), rest).mirrored  # type: ignore[union-attr]

@@ -20,6 +20,7 @@ from torchface.io import load_take, save_rig, save_take
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
+from torchface.workflows.marker_input import pose_warnings
 from torchface.workflows.solve.take_check import check_coverage
 
 FRAMES = 120
@@ -59,6 +60,10 @@ def elsewhere(markers: Tensor) -> Tensor:
     return Similarity(torch.ones(1), turn[None], torch.tensor([[100.0, -900, 40]])).apply(markers)
 
 
+def flipped(markers: Tensor) -> Tensor:
+    return markers * torch.tensor([-1.0, 1, 1])
+
+
 def mixed_up(stage: Path) -> str:
     sites = Attachment.load(stage / "attachment.json")
     order = torch.randperm(30, generator=torch.Generator().manual_seed(0))
@@ -70,6 +75,7 @@ def mixed_up(stage: Path) -> str:
     ("change", "attachment", "more", "cause"),
     [
         (elsewhere, False, (), "in another space: add --align"),
+        (lambda markers: flipped(elsewhere(markers)), False, (), "the coordinates are left-handed (add --flip x"),
         (lambda markers: markers / 1000, False, (), "seems to be in metres: add --unit m"),
         (lambda markers: markers / 10, False, (), "seems to be in centimetres: add --unit cm"),
         (lambda markers: markers, True, (), "labels are mixed up"),
@@ -105,6 +111,28 @@ def test_a_unit_said_by_hand_gives_the_same_weights(stage: Path) -> None:
     assert right is not None
     assert said is not None
     torch.testing.assert_close(said.values, right.values, atol=1e-3, rtol=0)
+
+
+def test_a_mirrored_take_is_refused_and_flipped_by_hand(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    take = changed(stage, "mirrored.c3d", lambda markers: flipped(elsewhere(markers)))
+    with pytest.raises(SystemExit):
+        solve(stage, take, "--align")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "mirrored.c3d: the markers are a mirror image of their sites: turned, moved and scaled" in told
+    each = ("--align", "--frame-by-frame")
+    right = load_take(solve(stage, stage / "take.c3d", *each)).weights
+    again = load_take(solve(stage, take, *each, "--flip", "y")).weights
+    assert right is not None
+    assert again is not None
+    torch.testing.assert_close(again.values, right.values, atol=5e-3, rtol=0)
+
+
+def test_a_scale_that_is_no_heads_is_told(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for factor, said in ((0.75, "at 1.33 times its size"), (0.1, "the take seems to be in cm (--unit cm)")):
+        take = changed(stage, "small.c3d", lambda markers, f=factor: f * markers)  # type: ignore[misc]
+        solve(stage, take, "--align", "--frame-by-frame")
+        assert said in " ".join(capsys.readouterr().err.split())
+    assert pose_warnings(Similarity(torch.tensor([1.07]), torch.eye(3)[None], torch.zeros(1, 3))) == []
 
 
 def test_a_take_that_fits_is_solved_without_a_warning(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchface.capture.energy import Quadratic, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
 from torchface.take import Take, Track
 from torchface.temporal import bridged, savitzky_golay
@@ -43,8 +44,7 @@ def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order
     """
     if active.ndim != 2:
         raise ShapeError(f"active: found {tuple(active.shape)}, expected (T,N)")
-    if not 0 <= maximum < float("inf"):
-        raise ValueRangeError(f"maximum: found {maximum}, expected a number that is not negative")
+    checked_number("maximum", maximum, 0.0, LARGEST_WEIGHT)
     smooth = savitzky_golay(maximum * active.double(), window, order)
     # Rounding must not leave a weight where there is none.
     return torch.where(smooth < 1e-9 * maximum, 0.0, smooth).clamp(0.0, maximum).float()
@@ -149,8 +149,10 @@ class HybridSolver(nn.Module):
         for name, found in (("predicted", predicted), ("gamma", gamma)):
             if tuple(found.shape) != wanted:
                 raise ShapeError(f"{name}: found {tuple(found.shape)}, expected {wanted}")
-        if not bool(torch.isfinite(gamma).all()) or bool((gamma < 0).any()):
-            raise ValueRangeError("gamma: found negative, NaN or infinite numbers, expected finite ones from 0 up")
+        if not bool(((gamma >= 0) & (gamma <= LARGEST_WEIGHT)).all()):
+            raise ValueRangeError(
+                f"gamma: found negative, NaN or infinite numbers, expected finite ones of 0 to {LARGEST_WEIGHT:.0e}"
+            )
         counts = predicted[gamma > 0]
         if not bool(((counts >= 0) & (counts <= 1)).all()):
             raise ValueRangeError("predicted: found weights outside [0,1] where gamma is positive")

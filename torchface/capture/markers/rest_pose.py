@@ -8,6 +8,7 @@ from torch import Tensor
 from torchface.capture.energy import marker_term
 from torchface.capture.markers.surface_motion import with_one
 from torchface.errors import AlignmentError
+from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.optim import BoxQP
@@ -122,6 +123,24 @@ def pose_of_take(affine: Tensor, paths: Tensor) -> Similarity:
         if converged and annealed == 1.0:
             break
     return pose
+
+
+def check_not_mirrored(paths: Tensor, rest: Tensor, name: str = "markers") -> None:
+    """Raises ``AlignmentError`` where the mirror image of a take's mean fits the sites clearly better.
+
+    Args:
+        paths: markers (T,M,3), NaN for not seen.
+        rest: their sites, (M,3).
+        name: of the take, for messages.
+    """
+    found = check_mirrored(paths.nanmean(0), rest)
+    if found.mirrored:
+        raise AlignmentError(
+            f"{name}: the markers are a mirror image of their sites: {found.figures()} are left; the coordinates are "
+            "left-handed, or the labels of left and right are swapped: export with right-handed axes or negate one "
+            "axis (--flip x of torchface solve and attach; with --align any axis will do), or rename the labels "
+            "(--labels)"
+        )
 
 
 def check_not_collinear(points: Tensor) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.rest_pose import pose_of_take, solve_weights
+from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
@@ -37,8 +38,9 @@ class FitCheck:
     Args:
         distance: median over all samples that were seen, millimetres of rig space.
         radius: of the sites at rest, mean distance from their centre, millimetres.
-        cause: what most likely is wrong: ``unit``, ``alignment``, ``slip`` (the helmet moves on the head) or
-            ``attachment`` (sites, labels or rig are other ones); empty where nothing is.
+        cause: what most likely is wrong: ``unit``, ``alignment``, ``mirror`` (left-handed coordinates, or sides
+            swapped), ``slip`` (the helmet moves on the head) or ``attachment`` (sites, labels or rig are other ones);
+            empty where nothing is.
         corrected: the distance without that cause, millimetres; NaN where no correction helps.
         similarity: that aligns the markers with the rig best, (1,).
     """
@@ -86,7 +88,8 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
 
     Weights are solved with hardly a penalty, so that the distance is what the rig cannot explain. Where its median
     is more than noise, the take is aligned by one similarity, then by a rigid motion a frame; a correction that leaves
-    less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Label swaps, spikes
+    less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Markers whose mirror
+    image fits clearly better are mirrored. Label swaps, spikes
     and markers that fell off move the median little: they are no cause.
 
     Args:
@@ -112,6 +115,10 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         return found
     if int((~torch.isnan(few).any(-1).all(0)).sum()) < 3:
         return _uncorrected(found)
+    if check_mirrored(few.nanmean(0), rest).mirrored:
+        flipped = few * few.new_tensor([-1.0, 1.0, 1.0])
+        pose = pose_of_take(affine, flipped)
+        return replace(found, cause="mirror", corrected=_distance(affine, pose.apply(flipped)))
     pose = pose_of_take(affine, few)
     laid = pose.apply(few)
     if slip and not _is_elsewhere(pose, few, radius):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
-from torchface.capture.markers.rest_pose import check_not_collinear, pose_of_take
+from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, pose_of_take
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
@@ -18,7 +18,9 @@ from torchface.take import Take
 _FRAMES = 240
 
 
-def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_frame: int | None = None) -> Similarity:
+def align_take(
+    rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_frame: int | None = None, insist: bool = False
+) -> Similarity:
     r"""The similarity that moves a take's markers into the rig's space; every take has its own.
 
     With a neutral frame, that frame is aligned with the rig at rest. Without one (a take may hold none) the similarity
@@ -31,6 +33,7 @@ def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_f
         attachment: where the markers sit; markers match by label, and a ``residual`` is added to the sites.
         take: markers (T,M,3), millimetres of any space.
         neutral_frame: a frame with the face at rest.
+        insist: also align markers that are a mirror image of their sites, as well as turning can.
 
     Returns:
         One similarity, marker space to rig space, scale included, float64.
@@ -39,7 +42,7 @@ def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_f
         NameMismatchError: the take has no markers, or one that the attachment does not know.
         ValueRangeError: no such frame, or a coordinate is infinite.
         ShapeError: fewer than three markers are seen in the neutral frame.
-        AlignmentError: the markers lie on a line.
+        AlignmentError: the markers lie on a line, or are mirrored, unless ``insist``.
         TopologyError: the attachment belongs to another mesh.
 
     Source: thesis 4.1.2.
@@ -47,6 +50,8 @@ def align_take(rig: BlendshapeRig, attachment: Attachment, take: Take, neutral_f
     attachment.check(rig.neutral)
     affine, paths = _seen_sites(rig, attachment, take)
     rest = affine[..., 0]
+    if not insist:
+        check_not_mirrored(paths, rest, str(take.extras.get("source", "take")))
     if neutral_frame is not None:
         if not 0 <= neutral_frame < len(paths):
             raise ValueRangeError(

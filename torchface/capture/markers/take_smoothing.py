@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
 from torchface.take import Take, Track
 
 SMOOTHNESS = 10.0
@@ -60,8 +61,8 @@ class WholeTakeSolver:
         object.__setattr__(self, "sparsity", float(sparsity))
         for name in ("smoothness", "huber_threshold", "sparsity"):
             value = getattr(self, name)
-            if not value >= 0 or (value == math.inf and name != "huber_threshold"):
-                raise ValueRangeError(f"{name}: found {value}, expected a number that is not negative")
+            if not (name == "huber_threshold" and value == math.inf):
+                checked_number(name, value, 0.0, LARGEST_WEIGHT)
 
     def solve_take(self, take: Take) -> Take:
         """The take with weights solved from its markers, matched by label.
@@ -111,8 +112,7 @@ class WholeTakeSolver:
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
-        if not 0 < fps < math.inf:
-            raise ValueRangeError(f"fps: found {fps}, expected a positive number")
+        check_rate(fps, "whole take", ValueRangeError)
         return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
 
     def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:

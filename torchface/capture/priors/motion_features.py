@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import check_rate
 
 _REGIONS = (r"eye_?look|pupil", r"eye", r"brow", r"cheek|nose", r"")
 _MAX_ORDERS = 3
@@ -114,10 +115,10 @@ def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
         (T',N), over the same time.
 
     Raises:
-        ValueRangeError: a rate is not positive.
+        ValueRangeError: a rate is no camera's.
     """
-    if not (0 < from_fps < float("inf") and 0 < to_fps < float("inf")):
-        raise ValueRangeError(f"frame rate: found {from_fps} and {to_fps} a second, expected positive numbers")
+    for fps in (from_fps, to_fps):
+        check_rate(fps, "take", ValueRangeError)
     if from_fps == to_fps or len(weights) < 2:
         return weights
     count = int((len(weights) - 1) * to_fps / from_fps + 1e-9) + 1

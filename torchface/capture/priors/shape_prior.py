@@ -15,6 +15,7 @@ from torchface.capture.priors.learned_names import name_matrices, require_same_n
 from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | GaussianMixture | StudentDensity
@@ -246,9 +247,7 @@ class ReciprocalPrior(ShapePrior):
         guard: float = 1e-2,
     ) -> None:
         super().__init__(names, groups, densities, strength)
-        if not 0 < guard < float("inf"):
-            raise ValueRangeError(f"guard: found {guard}, expected a positive density")
-        self.guard = guard
+        self.guard = checked_number("guard", guard, above=True)
 
     @classmethod
     def fit(
@@ -302,6 +301,4 @@ def _seen_frames(takes: Sequence[Tensor], names: Sequence[str]) -> list[Tensor]:
 
 
 def _checked_strength(strength: float) -> float:
-    if not isinstance(strength, int | float) or not 0 <= strength < float("inf"):
-        raise ValueRangeError(f"strength: found {strength!r}, expected a number that is not negative")
-    return float(strength)
+    return checked_number("strength", strength, 0.0, LARGEST_WEIGHT)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from torchface.errors import ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 
 # Of the eyes' distance: what models of landmarks are measured to be off, any face's and the actor's own.
 _FOUND, _REFINED = 0.025, 0.015
@@ -49,17 +48,12 @@ class VideoSettings:
     steps: int = 30
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value) or value < 0:
-                raise ValueRangeError(f"{field.name}: found {value!r}, expected a finite number of at least 0")
-        for name in ("pixel_noise", "dynamics_strength", "tolerance", "steps"):
-            if not getattr(self, name) > 0:
-                raise ValueRangeError(f"{name}: found {getattr(self, name)}, expected a positive number")
-        if self.contour_slide > 1:
-            raise ValueRangeError(f"contour_slide: found {self.contour_slide}, expected a share from 0 to 1")
-        if not isinstance(self.steps, int):
-            raise ValueRangeError(f"steps: found {self.steps}, expected a whole number")
+        for name in ("relative_noise", "sparsity", "ridge", "pose_trust"):
+            checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT)
+        for name in ("pixel_noise", "dynamics_strength", "tolerance"):
+            checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
+        checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
+        checked_count("steps", self.steps, 1)
 
     @classmethod
     def of_found_landmarks(cls, remembers: bool = False, refined: bool = False) -> VideoSettings:

@@ -11,8 +11,9 @@ import torch
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.container import Document, read_document, shown
 from torchface.io.gltf.primitive_reading import read_target_names
-from torchface.io.tables.frame_rates import MAX_FPS, MIN_FPS, simplest_rate
+from torchface.io.tables.frame_rates import simplest_rate
 from torchface.io.tables.numbered_csv import DEFAULT_RATE
+from torchface.number_checks import MAX_FPS, MIN_FPS
 from torchface.take import Take, Track
 
 _UNEVEN = 0.01

@@ -86,6 +86,8 @@ class _Reader:
         if tag == "dataset":
             self.is_dataset = True
         elif tag == "image":
+            if self._image is not None:
+                raise FileFormatError(f"{self.path}: found an <image> inside another, expected each to end before")
             self._image = self._text(attributes, "file", tag)
         elif tag == "box":
             if self._image is None or self._box is not None:

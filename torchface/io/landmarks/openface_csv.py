@@ -10,9 +10,10 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras
+from torchface.io.tables.frame_rates import frame_numbers, numbering_extras
 from torchface.io.tables.numbered_csv import rate_of
 from torchface.io.tables.track_checks import kept_columns, values_to_write
+from torchface.number_checks import check_rate
 from torchface.take import Take, Track
 
 _FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"

@@ -31,8 +31,9 @@ from torchface.io.markers.c3d_sections import (
 )
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, simplest_rate
+from torchface.io.tables.frame_rates import frame_numbers, simplest_rate
 from torchface.io.tables.track_checks import values_to_write
+from torchface.number_checks import check_rate
 from torchface.take import Take
 
 _MAX_COUNT = 65535
@@ -119,9 +120,10 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
     if not np.isfinite(scale) or scale == 0:
         raise FileFormatError(f"{path}: POINT:SCALE: found {scale}, expected a number other than 0")
     word = 4 if scale < 0 else 2
-    start = BLOCK * ((header.data_block or int(_number(sections, "POINT:DATA_START", 0))) - 1)
-    if start < BLOCK:
-        raise FileFormatError(f"{path}: found the data in block {start // BLOCK + 1}, expected block 3 or later")
+    block = header.data_block or _number(sections, "POINT:DATA_START", 0)
+    if not (2 <= block <= _MAX_COUNT and float(block).is_integer()):
+        raise FileFormatError(f"{path}: found the data in block {block:g}, expected block 3 or later")
+    start = BLOCK * (int(block) - 1)
     frame_size = word * (4 * header.points + header.analog)
     room = max(0, len(data) - start) // frame_size
     counts = [count for count in _frame_counts(sections) if count >= 1 and float(count).is_integer()]

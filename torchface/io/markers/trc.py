@@ -10,8 +10,9 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
 from torchface.io.tables.csv_table import MAX_TABLE_BYTES, number_texts, parse_number, parse_numbers, quoted
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras
+from torchface.io.tables.frame_rates import frame_numbers, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
+from torchface.number_checks import check_rate
 from torchface.take import Take
 
 _FIELDS = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame")

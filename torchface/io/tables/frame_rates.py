@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchface.errors import FileFormatError, TorchfaceError
+from torchface.errors import FileFormatError
 from torchface.take import Take
 
-MIN_FPS, MAX_FPS = 0.01, 10_000.0
 COMMON_RATES = (
     *(24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0),
     *(60000 / 1001, 60.0, 72.0, 90.0, 100.0),
@@ -21,13 +20,6 @@ COMMON_RATES = (
 """Rates that cameras run at."""
 
 _MAX_FRAME_NUMBER = 2**32 - 1
-
-
-def check_rate(fps: float, where: str, error: type[TorchfaceError] = FileFormatError) -> float:
-    """The rate itself, where it can be one of a camera's; ``where`` begins the message."""
-    if not MIN_FPS <= fps <= MAX_FPS:
-        raise error(f"{where}: found {fps} frames a second, expected {MIN_FPS} to {MAX_FPS:.0f}")
-    return float(fps)
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:

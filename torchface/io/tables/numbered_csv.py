@@ -10,7 +10,8 @@ import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import Table, TableReader, number_texts, write_table
-from torchface.io.tables.frame_rates import check_rate, frame_numbers, numbering_extras, simplest_rate
+from torchface.io.tables.frame_rates import frame_numbers, numbering_extras, simplest_rate
+from torchface.number_checks import check_rate
 from torchface.take import Take
 
 COLUMNS = ("frame", "time")

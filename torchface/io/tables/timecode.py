@@ -11,7 +11,8 @@ import numpy as np
 
 from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import COMMON_RATES, check_rate, frame_gaps
+from torchface.io.tables.frame_rates import COMMON_RATES, frame_gaps
+from torchface.number_checks import check_rate
 
 _PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
 _DAY = 24 * 3600

@@ -17,10 +17,10 @@ from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.tables.frame_rates import check_rate
 from torchface.io.video.container import open_container, reason
 from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
 from torchface.io.video.timing import check_even_rate
+from torchface.number_checks import check_rate
 
 _MAX_FRAMES = 2**31 - 1
 

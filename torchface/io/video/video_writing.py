@@ -19,10 +19,10 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.whole_files import replaced_file
-from torchface.io.tables.frame_rates import check_rate
 from torchface.io.video.container import reason
 from torchface.io.video.packets import read_packets
 from torchface.io.video.video_file import VideoFile, open_video
+from torchface.number_checks import check_rate
 
 _SUFFIXES = (".avi", ".mkv", ".mp4")
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range

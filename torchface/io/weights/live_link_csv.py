@@ -11,11 +11,12 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, parse_number, quoted, write_table
-from torchface.io.tables.frame_rates import check_rate, frame_numbers
+from torchface.io.tables.frame_rates import frame_numbers
 from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.tables.timecode import read_timecodes, write_timecodes
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.number_checks import check_rate
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 

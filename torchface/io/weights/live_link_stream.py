@@ -10,12 +10,14 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.number_checks import check_rate
 from torchface.shape_names import ARKIT, mapping
 
 VALUES = len(ARKIT) + len(ROTATIONS)
@@ -105,34 +107,49 @@ def parse_address(address: str) -> tuple[str, int]:
     """
     match = _ADDRESS.fullmatch(address)
     if match is None or not 0 < int(match["port"]) < 65536:
-        raise ValueRangeError(f"stream: found {address!r}, expected an address such as udp://127.0.0.1:11111")
+        raise ValueRangeError(
+            f"stream: found {address!r:.200}, expected an address such as udp://127.0.0.1:11111, the port 1 to 65535"
+        )
     return match["host"].strip("[]"), int(match["port"])
+
+
+def find_receiver(address: str) -> tuple[socket.AddressFamily, Any]:
+    """Family and socket address of ``udp://HOST:PORT``, its host looked up.
+
+    Raises:
+        ValueRangeError: the text is no such address, or its host is not known.
+    """
+    host, port = parse_address(address)
+    try:
+        family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    except (OSError, ValueError) as error:  # ValueError: a name that no host can have, such as a..b
+        raise ValueRangeError(f"stream: found {address!r:.200}, whose host is not known ({error})") from error
+    return family, target
 
 
 class LiveLinkSender:
     """Sends weights as Live Link Face's packets.
 
     Args:
-        address: ``udp://HOST:PORT``; Unreal listens on port 11111.
+        address: ``udp://HOST:PORT``; Unreal listens on port 11111. A broadcast address reaches a whole network.
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         fps: frames a second.
         subject: the name under which the receiver lists the face.
 
     Raises:
-        ValueRangeError: the address is none, or its host is not known.
+        ValueRangeError: the address is none, its host is not known, or ``fps`` is no camera's.
         NameMismatchError: not one name is one of ARKit's.
     """
 
     def __init__(self, address: str, names: Sequence[str], fps: float, subject: str = "torchface") -> None:
-        host, port = parse_address(address)
+        target = find_receiver(address)
+        check_rate(fps, "stream", ValueRangeError)
         self._matrix = mapping(names, ARKIT)
         if not self._matrix.any():
             raise NameMismatchError(f"stream: found the shapes {', '.join(names[:5])}, expected some of ARKit's")
-        try:
-            family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        except OSError as error:
-            raise ValueRangeError(f"stream: found {address!r}, whose host is not known ({error})") from error
-        self._socket, self._target = socket.socket(family, socket.SOCK_DGRAM), target
+        self._address, (family, self._target) = address, target
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._device = str(uuid.uuid4()).upper()
         self._subject, self._fps, self._sent = subject, fps, 0
 
@@ -141,6 +158,7 @@ class LiveLinkSender:
 
         Raises:
             ShapeError: another number of weights than names.
+            ValueRangeError: this machine cannot send there.
         """
         if weights.shape != self._matrix.shape[1:]:
             raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._matrix.shape[1]},)")
@@ -149,7 +167,13 @@ class LiveLinkSender:
         frame = LiveLinkFrame(
             self._device, self._subject, self._sent, 0.0, (round(self._fps * 1000), 1000), arkit, rotations
         )
-        self._socket.sendto(encode_frame(frame), self._target)
+        try:
+            self._socket.sendto(encode_frame(frame), self._target)
+        except OSError as error:
+            raise ValueRangeError(
+                f"stream: cannot send to {self._address} ({error.strerror or error}); expected an address that this "
+                "machine's network reaches"
+            ) from error
         self._sent += 1
 
     def close(self) -> None:

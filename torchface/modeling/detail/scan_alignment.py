@@ -13,6 +13,7 @@ from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices, triangle_areas, vertex_normals
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
+from torchface.registration.scan_preparation import check_same_hand
 
 Correspondences = tuple[Tensor, Tensor]
 """Vertex ids (L,) or points (L,3) of the mesh, and points (L,3) of the scan."""
@@ -59,12 +60,13 @@ def align_scan(
     Raises:
         ShapeError: fewer than three correspondences, or not of the shapes above.
         ValueRangeError: a correspondence is NaN, on a line, or the scan is in another unit.
-        AlignmentError: no initial pose ends close enough.
+        AlignmentError: no initial pose ends close enough, or the correspondences are mirrored.
     """
     _check_extent(mesh, scan)
     target = _Target.of(scan)
     if correspondences is not None:
         picked = _picked(mesh, correspondences)
+        check_same_hand(*picked, "correspondences")
         initial = similarity_transform(picked[0][None], picked[1][None], scale=scale)
         return _result(_iterate(_samples(mesh, _SAMPLES), target, _Pose.of(initial), 40, scale))
     return _automatic(mesh, target, scale)

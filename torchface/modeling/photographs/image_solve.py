@@ -17,6 +17,7 @@ from torchface.modeling.photographs.landmark_view import (
     linearised,
     residuals,
 )
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.optim import box_qp
 
 _DONE, _HALVINGS = 1e-5, 6
@@ -43,6 +44,9 @@ class FitSettings:
         focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
         max_iterations: of Gauss-Newton.
+
+    Raises:
+        ValueRangeError: a setting is NaN, infinite or out of its range.
     """
 
     inner_weight: float = 2.0
@@ -56,6 +60,15 @@ class FitSettings:
     focal_deviation: float = 0.0
     shared_focal: bool = True
     max_iterations: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):
+            checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)
+        if self.noise is not None:
+            checked_number("noise", self.noise, above=True)
+        checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
+        checked_number("focal_deviation", self.focal_deviation)
+        checked_count("max_iterations", self.max_iterations, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
 from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.raycast import RayCaster
@@ -82,8 +83,8 @@ def fit_colors(
         raise TopologyError(
             f"fit_colors: found a model of {tuple(model.mean.shape)} for a mesh of {len(mesh.vertices)} vertices"
         )
-    if not bound > 0 or not prior >= 0:
-        raise ValueRangeError(f"fit_colors: found bound {bound} and prior {prior}, expected positive numbers")
+    checked_number("fit_colors: bound", bound, above=True)
+    checked_number("fit_colors: prior", prior, 0.0, LARGEST_WEIGHT)
     views = _shown_vertices(mesh, images, cameras)
     mean, modes = model.mean.cpu().double(), model.modes.cpu().double()
     coefficients = torch.zeros(len(modes), dtype=torch.float64)

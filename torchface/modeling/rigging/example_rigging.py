@@ -15,6 +15,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.modeling.rigging.example_shapes import example_shares, personal_part, shape_stiffness
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.optim import box_qp
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -53,8 +54,7 @@ class RiggingSchedule:
     theta: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueRangeError(f"iterations: found {self.iterations}, expected at least 1")
+        checked_count("iterations", self.iterations, 1)
         for name in ("beta", "gamma"):
             if len(getattr(self, name)) != 2:
                 raise ShapeError(f"{name}: found {getattr(self, name)}, expected two numbers, first and last iteration")
@@ -62,10 +62,11 @@ class RiggingSchedule:
             ("beta", self.beta),
             ("gamma", self.gamma),
             ("unnamed", (self.unnamed,)),
-            ("kappa and theta", (self.kappa, self.theta)),
+            ("kappa", (self.kappa,)),
+            ("theta", (self.theta,)),
         ):
-            if not all(0 < number < float("inf") for number in numbers):
-                raise ValueRangeError(f"{name}: found {numbers}, expected finite numbers above 0")
+            for number in numbers:
+                checked_number(name, number, 0.0, LARGEST_WEIGHT, above=True)
 
     def at(self, number: int) -> tuple[float, float]:
         """Beta and gamma of an iteration, counted from 0."""

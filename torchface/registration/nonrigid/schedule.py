@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from torchface.errors import ValueRangeError
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 
 
 class Level(Enum):
@@ -44,9 +45,13 @@ class Stage:
     contact_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        weights = (self.landmark_weight, self.contact_weight)
-        if not (self.stiffness > 0 and min(weights) >= 0 and self.reach > 0 and self.iterations > 0):
-            raise ValueRangeError(f"stage: found {self}, expected positive stiffness, reach and iterations")
+        checked_number("stage: stiffness", self.stiffness, 0.0, LARGEST_WEIGHT, above=True)
+        checked_number("stage: reach", self.reach, above=True)
+        for name in ("landmark_weight", "contact_weight", "tolerance"):
+            checked_number(f"stage: {name}", getattr(self, name), 0.0, LARGEST_WEIGHT)
+        for name in ("iterations", "samples"):
+            if getattr(self, name) is not None:
+                checked_count(f"stage: {name}", getattr(self, name), 1)
 
 
 @dataclass(frozen=True)
@@ -72,8 +77,13 @@ class Schedule:
     opening: float = 10.0
 
     def __post_init__(self) -> None:
-        if not self.stages or self.nodes < 1 or self.gradient_length <= 0 or not 0 < self.sliding <= 1:
-            raise ValueRangeError(f"schedule: found {self}, expected stages, nodes, a length, sliding in (0,1]")
+        if not self.stages:
+            raise ValueRangeError("schedule: found no stages, expected at least one")
+        checked_count("schedule: nodes", self.nodes, 1)
+        checked_number("schedule: gradient_length", self.gradient_length, above=True)
+        checked_number("schedule: sliding", self.sliding, 0.0, 1.0, above=True)
+        checked_number("schedule: largest_angle", self.largest_angle, 0.0, 180.0, above=True)
+        checked_number("schedule: opening", self.opening)
 
 
 DEFAULT_SCHEDULE = Schedule(

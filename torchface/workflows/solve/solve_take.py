@@ -26,13 +26,13 @@ from torchface.evaluation import marker_rmse
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, save_animation
-from torchface.io.weights.live_link_stream import parse_address
+from torchface.io.weights.live_link_stream import find_receiver
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.temporal import OneEuroFilter
-from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, pose_warnings, read_markers
 from torchface.workflows.solve.head_camera import HeadCamera, Predicted, predicted_curves
 from torchface.workflows.solve.solution import Solution, SolveReport
 from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
@@ -98,11 +98,12 @@ def solve_markers(
     alignment = None
     if settings.align or settings.neutral is not None:
         progress("laying the take on the rig")
-        alignment = align_take(rig, attachment, take, settings.neutral)
+        alignment = align_take(rig, attachment, take, settings.neutral, settings.insist)
     terms = {"sparsity": settings.sparsity, "ridge": settings.ridge}
     solver = MarkerSolver(rig, attachment, alignment, **terms)
     fit = check_explained(solver, take, settings.slip, settings.insist)
     warnings = [*coverage.warnings(), *fit_warnings(fit, alignment is not None)]
+    warnings += [] if alignment is None else pose_warnings(alignment)
     if len(empty):
         numbers = take.extras.get("frame_numbers", torch.arange(len(take)))[empty]
         warnings.append(f"{_frames_text(numbers)} show no marker; their weights come from the frames before and after")
@@ -191,7 +192,7 @@ def solve_take(
     progress = progress or silent
     check_writable(out, live_link, animation, folder=report)
     if stream is not None:
-        parse_address(stream)
+        find_receiver(stream)
     progress("reading the rig")
     loaded = load_rig(rig, part=part)
     check_live_link(loaded.names, live_link)

@@ -130,6 +130,12 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
     if fit.cause == "alignment":
         advice = "the frame of --neutral is not at rest: --align does without one" if aligned else "add --align"
         return f"laid on the rig they lie {fit.corrected:.2g} mm from it, so the take is in another space: {advice}"
+    if fit.cause == "mirror":
+        return (
+            f"mirrored and laid on the rig they lie {fit.corrected:.2g} mm from it, so the coordinates are left-handed "
+            "(add --flip x, y or z, and --align if the take is not in the rig's space), or the labels of left and "
+            "right are swapped (--labels)"
+        )
     if fit.cause == "slip":
         return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
     tried = "the take is laid on the rig" if aligned else "turning, moving and scaling the take does not help"

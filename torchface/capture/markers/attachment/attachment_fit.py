@@ -15,7 +15,7 @@ from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.helmet_solver import HelmetMotion
 from torchface.capture.markers.marker_solver import check_labels
-from torchface.capture.markers.rest_pose import check_not_collinear
+from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
@@ -90,8 +90,8 @@ def fit_attachment(
         NameMismatchError: a marker is not in ``initial``.
         ValueRangeError: a marker is seen in no frame, markers do not move, or the take leaves most sites or shapes
             uncertain, unless ``insist``.
-        AlignmentError: the markers lie on a line, or the rig does not explain them, unless ``insist``; the message says
-            how far they stay and what is the likely cause.
+        AlignmentError: the markers lie on a line, or unless ``insist`` they are mirrored or the rig does not explain
+            them; the message says how far they stay and what is the likely cause.
         TopologyError: ``initial`` belongs to another mesh.
 
     Source: thesis 4.1.2, algorithm 4, run to convergence; bundle adjustment for the joint steps (Triggs et al. 2000).
@@ -102,6 +102,8 @@ def fit_attachment(
     motion = SurfaceMotion.of(rig, normals=standoff)
     initial_points = motion.at(motion.points, initial)[..., 0]
     solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff)
+    if not insist:
+        check_not_mirrored(paths, initial_points, str(rom.extras.get("source", "take")))
     pose = _first_pose(paths, initial_points)
     _check_motion(pose.apply(paths))
     shown = paths[~torch.isnan(paths).any(-1).all(1)]
