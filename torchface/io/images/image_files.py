@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import io
-import warnings
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
-from PIL.ImageFile import ImageFile
 from torch import Tensor
 
-from torchface.errors import FileFormatError, ShapeError
+from torchface.errors import ShapeError
 from torchface.files.whole_files import read_file, write_file
-
-_PIXELS_ALWAYS = 4096 * 4096
-_PIXELS_PER_BYTE = 100
-_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "PPM")
+from torchface.io.images.image_samples import decode_samples
 
 
 def load_image(path: str | Path) -> Tensor:
-    """An image file as (3,H,W) float32 in [0,1].
+    """An image file as (3,H,W) float32 in [0,1], upright: turned as its EXIF orientation says, as viewers show it.
+
+    Grey or RGB of 1 to 16 bits, palettes and CMYK; floating-point TIFF where its values lie in [0,1]. Transparency is
+    left out.
 
     Raises:
-        FileFormatError: the file is missing, no image, or unpacks to far more pixels than its size lets expect.
+        FileFormatError: the file is missing, no image, of a kind that is not read, or unpacks to far more pixels than
+            its size lets expect.
     """
     return decode_image(read_file(path), str(path))
 
@@ -42,31 +41,10 @@ def save_image16(image: Tensor, path: str | Path) -> None:
 def decode_image(data: bytes, source: str) -> Tensor:
     """The image (3,H,W) in ``data``; ``source`` names it in errors.
 
-    An image of more than 4096 x 4096 pixels needs a byte for every hundred of them, so that a file of some
-    kilobytes cannot unpack to gigabytes.
-
     Raises:
-        FileFormatError: no image, a broken one, or a decompression bomb.
+        FileFormatError: as :func:`~torchface.io.images.image_samples.decode_samples`.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's own warning of bombs and odd metadata; the limit here is lower
-            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
-                pixels = image.width * image.height
-                if pixels > max(_PIXELS_ALWAYS, _PIXELS_PER_BYTE * len(data)):
-                    raise FileFormatError(
-                        f"{source}: found an image of {image.width} x {image.height} pixels in {len(data)} bytes, "
-                        f"expected at most {max(_PIXELS_ALWAYS, _PIXELS_PER_BYTE * len(data))} pixels"
-                    )
-                if _has_16_bits(image):
-                    return _decode_png16(data, source)
-                array = np.array(image.convert("RGB"))
-    # Pillow's decoders let most kinds of errors escape on broken bytes; whatever they are, it is no image.
-    except (OSError, ValueError, SyntaxError, TypeError, IndexError, KeyError, EOFError, ArithmeticError) as error:
-        raise FileFormatError(f"{source}: no readable image ({error})") from error
-    except (Image.DecompressionBombError, AttributeError, AssertionError, RuntimeError) as error:
-        raise FileFormatError(f"{source}: no readable image ({error})") from error
-    return torch.from_numpy(array).permute(2, 0, 1).contiguous().float().div_(255)
+    return decode_samples(data, source).colors()
 
 
 def encode_png(image: Tensor) -> bytes:
@@ -95,22 +73,3 @@ def encode_png16(image: Tensor) -> bytes:
         raise ShapeError(f"image: found {tuple(image.shape)}, expected (3,H,W) with at least one pixel")
     steps = image.detach().cpu().clamp(0, 1).double().mul(65535).round().permute(1, 2, 0).numpy().astype(np.uint16)
     return cv2.imencode(".png", cv2.cvtColor(steps, cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
-def _has_16_bits(image: Image.Image) -> bool:
-    """Whether an image that Pillow has opened, not loaded, is a PNG of 16 bits a channel, of which Pillow keeps 8."""
-    return isinstance(image, ImageFile) and image.format == "PNG" and str(image.tile[0][3]).endswith("16B")
-
-
-def _decode_png16(data: bytes, source: str) -> Tensor:
-    import cv2
-
-    try:
-        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        steps = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise FileFormatError(f"{source}: no readable image ({error})") from error
-    if steps is None or steps.dtype != np.uint16:
-        raise FileFormatError(f"{source}: found a broken PNG of 16 bits a channel, expected a whole one")
-    array = cv2.cvtColor(steps, cv2.COLOR_BGR2RGB).astype(np.float32) / 65535
-    return torch.from_numpy(array).permute(2, 0, 1).contiguous()

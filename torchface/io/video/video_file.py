@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -23,6 +24,7 @@ from torchface.io.video.timing import check_even_rate
 from torchface.number_checks import check_rate
 
 _MAX_FRAMES = 2**31 - 1
+_CHUNK_BYTES = 32 * 2**20
 
 
 @dataclass(frozen=True)
@@ -59,22 +61,24 @@ class VideoFile:
                 raise self._resized(int((packets.seconds < seconds).sum()), width, height, *first)
 
     def chunks(self, frames: int = 64) -> Iterator[Tensor]:
-        """The frames as uint8 tensors (t,H,W), ``frames`` at a time, the last chunk shorter.
+        """The frames as uint8 tensors (t,H,W), up to ``frames`` at a time: fewer where they take more than 32 MiB.
 
         Raises:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
+            ValueRangeError: ``frames`` is not positive.
         """
-        for batch in _batches((cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in self._decoded()), frames):
-            yield torch.from_numpy(np.stack(batch))
+        grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in self._decoded())
+        yield from _chunks(grey, frames, (self.height, self.width))
 
     def color_chunks(self, frames: int = 16) -> Iterator[Tensor]:
-        """The frames in colour as uint8 tensors (t,3,H,W), red first, ``frames`` at a time, the last chunk shorter.
+        """The frames in colour as uint8 tensors (t,3,H,W), red first, up to ``frames`` at a time, as ``chunks``.
 
         Raises:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
+            ValueRangeError: ``frames`` is not positive.
         """
-        for batch in _batches((np.stack(cv2.split(frame)) for frame in self._decoded()), frames):
-            yield torch.from_numpy(np.stack(batch))
+        planes = (np.stack(cv2.split(frame)) for frame in self._decoded())
+        yield from _chunks(planes, frames, (3, self.height, self.width))
 
     def frames(self) -> Iterator[Tensor]:
         """The frames one by one, uint8 (H,W)."""
@@ -167,9 +171,18 @@ def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str
             errors.append(f" ({reason(error)})")
 
 
-def _batches(frames: Iterable[np.ndarray], size: int) -> Iterator[list[np.ndarray]]:
-    if size < 1:
-        raise ValueRangeError(f"frames: found {size}, expected at least 1")
+def _chunks(frames: Iterable[np.ndarray], most: int, shape: tuple[int, ...]) -> Iterator[Tensor]:
+    """Frames of a shape, up to ``most`` together and as many as 32 MiB hold, copied where they stay."""
+    if most < 1:
+        raise ValueRangeError(f"frames: found {most}, expected at least 1")
+    size = max(1, min(most, _CHUNK_BYTES // math.prod(shape)))
     iterator = iter(frames)
-    while batch := list(islice(iterator, size)):
-        yield batch
+    while True:
+        chunk = np.empty((size, *shape), np.uint8)
+        count = 0
+        for count, frame in enumerate(islice(iterator, size), 1):  # a decoder gives one frame at a time
+            chunk[count - 1] = frame
+        if count:
+            yield torch.from_numpy(chunk[:count])
+        if count < size:
+            return
