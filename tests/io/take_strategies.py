@@ -1,12 +1,18 @@
-"""Takes by chance for the tests of every take format."""
+"""Takes by chance, round trips and broken files for the tests of every take format."""
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
+import pytest
 import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from torchface.errors import FileFormatError
 from torchface.take import Take, Track
 
 FLOATS = st.floats(-1e6, 1e6, width=32)
@@ -44,3 +50,24 @@ def weight_takes(draw: st.DrawFn, names: tuple[str, ...] | None = None) -> Take:
 def same(first: torch.Tensor, second: torch.Tensor) -> bool:
     """Bit by bit the same numbers, NaN where the other has NaN."""
     return first.dtype == second.dtype and np.array_equal(first.numpy(), second.numpy(), equal_nan=True)
+
+
+def round_trip(save: Callable[[Take, Path], None], load: Callable[[Path], Take], take: Take) -> Take:
+    """The take as it comes back from a file; names and values are the same to the bit."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(take, Path(folder, "take"))
+        back = load(Path(folder, "take"))
+    for track, found in ((take.markers, back.markers), (take.weights, back.weights)):
+        assert (track is None) == (found is None)
+        if track is not None and found is not None:
+            assert found.names == track.names
+            assert same(found.values, track.values)
+    return back
+
+
+def check_refused(load: Callable[[Path], Take], path: Path, good: str, change: tuple[str, str], message: str) -> None:
+    """A good file with one change is refused, by its name and with this message."""
+    assert change[0] in good
+    path.write_text(good.replace(*change, 1))
+    with pytest.raises(FileFormatError, match=rf"{path.name}: " + message):
+        load(path)
