@@ -159,18 +159,3 @@ def empty_frames(take: Take) -> Tensor:
     if take.markers is None:
         raise ValueRangeError("take: found no markers, expected some")
     return take.markers.values.isnan().any(2).all(1).nonzero()[:, 0]
-
-
-def require_seen(take: Take) -> None:
-    """Checks that every frame shows at least one marker, for methods that need one.
-
-    Raises:
-        ValueRangeError: a frame shows none; the message names the file that the take was read from.
-    """
-    rows = empty_frames(take)
-    if len(rows):
-        shown = ", ".join(str(int(row)) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
-        raise ValueRangeError(
-            f"{take.extras.get('source', 'take')}: found {len(rows)} of {len(take)} frames without a single marker "
-            f"(rows {shown}), expected at least one marker in each"
-        )
