@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import reprlib
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +12,7 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 import torch
 from torch import Tensor
@@ -18,7 +21,22 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file, write_file
 
 _MAX_BYTES = 2**20
+_MAX_TOML_BYTES = 2**18  # its parser takes up to 500 bytes for one of the text
 _MAX_NUMBER = 1e9  # absolute; nothing that these files measure is larger
+_MAX_WHOLE = 2**63
+_MAX_DEPTH, _MAX_CONTAINERS = 64, 2**20
+_MAX_DOTS = 16  # in a key: TOML's parser takes time and memory by the square of them
+
+_JSON_TEXT = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
+_LONG_WHOLE_NUMBER = re.compile(rb"(?<![\d.eE+-])-?(\d{19,})(?![\d.eE])")
+_NOT_BRACKETS = bytes(byte for byte in range(256) if byte not in b"[]{}")
+_DOTTED_KEY = re.compile(
+    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_MAX_DOTS + 1}}}""", re.ASCII
+)
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 120
+_SHORT.maxlist = _SHORT.maxdict = 40
 
 
 @dataclass(frozen=True)
@@ -38,7 +56,7 @@ class Value:
     def error(self, expected: str) -> FileFormatError:
         """The error that names source, key, what was found and what was expected."""
         at = f"{self.key} = " if self.key else ""
-        return FileFormatError(f"{self.source}: found {at}{self.found!r:.120}, expected {expected}")
+        return FileFormatError(f"{self.source}: found {at}{_SHORT.repr(self.found):.120}, expected {expected}")
 
     def __bool__(self) -> bool:
         """Whether there is a value."""
@@ -131,12 +149,47 @@ def read_json(path: str | Path, marker: str | None = None, max_bytes: int = _MAX
     Raises:
         FileFormatError: the file is missing, too large, no JSON or of another format.
     """
-    return _read(path, json.loads, "JSON", marker, max_bytes)
+    return _read(path, parse_json, "JSON", marker, max_bytes)
 
 
-def read_toml(path: str | Path, marker: str | None = None, max_bytes: int = _MAX_BYTES) -> Value:
+def read_toml(path: str | Path, marker: str | None = None, max_bytes: int = _MAX_TOML_BYTES) -> Value:
     """The document of a TOML file; see :func:`read_json`."""
-    return _read(path, lambda data: tomllib.loads(data.decode()), "TOML", marker, max_bytes)
+    return _read(path, _parse_toml, "TOML", marker, max_bytes)
+
+
+def parse_json(data: bytes) -> Any:
+    """The value that JSON text in UTF-8 stands for, its nesting and its numbers checked before it is built.
+
+    Raises:
+        ValueError: not JSON, nested too deep, too many lists and tables, or a whole number of more than 64 bits.
+    """
+    bare = _JSON_TEXT.sub(b"", data)
+    brackets = np.frombuffer(bare.translate(None, _NOT_BRACKETS), np.uint8)
+    opening = (brackets == ord("[")) | (brackets == ord("{"))
+    if np.count_nonzero(opening) > _MAX_CONTAINERS:
+        raise ValueError(f"{np.count_nonzero(opening)} lists and tables, expected at most {_MAX_CONTAINERS}")
+    depth = int(np.where(opening, 1, -1).cumsum().max(initial=0))
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"nested {depth} deep, expected at most {_MAX_DEPTH}")
+    for match in _LONG_WHOLE_NUMBER.finditer(bare):
+        if len(match[1]) > 19 or int(match[1]) >= _MAX_WHOLE:
+            raise ValueError(f"a whole number of {len(match[1])} digits, expected at most 64 bits")
+    return json.loads(data.decode("utf-8-sig"))
+
+
+def _parse_toml(data: bytes) -> Any:
+    text = data.decode()
+    if _DOTTED_KEY.search(text):
+        raise ValueError(f"a key of more than {_MAX_DOTS + 1} parts")
+    document = tomllib.loads(text)
+    pending: list[Any] = [document]
+    while pending:  # not by recursion: it may be nested deep
+        value = pending.pop()
+        if type(value) is int and abs(value) >= _MAX_WHOLE:
+            raise ValueError("a whole number of more than 64 bits")
+        if isinstance(value, dict | list):
+            pending.extend(value.values() if isinstance(value, dict) else value)
+    return document
 
 
 def write_json(path: str | Path, document: Mapping[str, Any], indent: int | None = 1) -> None:
@@ -158,7 +211,7 @@ def _read(path: str | Path, parse: Callable[[bytes], Any], kind: str, marker: st
     if marker is not None:
         found = document.found.get("format") if isinstance(document.found, Mapping) else None
         if found != marker:
-            raise FileFormatError(f'{path}: found format {found!r:.60}, expected "{marker}"')
+            raise FileFormatError(f'{path}: found format {_SHORT.repr(found):.60}, expected "{marker}"')
     return document
 
 

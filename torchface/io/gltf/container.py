@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from torchface.errors import FileFormatError
+from torchface.files.documents import parse_json
 from torchface.files.whole_files import read_file
 from torchface.io.gltf.buffers import BufferWriter
 
@@ -174,7 +175,7 @@ def read_document(path: str | Path) -> Document:
     if len(text) > largest:
         raise FileFormatError(f"{path}: found {len(text)} bytes of JSON, expected at most {largest}")
     try:
-        root = json.loads(text)
+        root = parse_json(text)
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: found broken JSON ({str(error)[:100]}), expected a glTF 2.0 file") from error
     if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):
