@@ -46,7 +46,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
     reader = TableReader(path)
     names = tuple(name[2:] for name in reader.header if name.startswith("x_"))
     columns = [f"{axis}_{name}" for name in names for axis in "xy"]
-    stray = [name for name in reader.header if name.startswith("y_") and name[2:] not in set(names)]
+    stray = sorted({name for name in reader.header if name.startswith("y_")} - {f"y_{name}" for name in names})
     if not names or stray:
         raise FileFormatError(
             f"{path}: found the columns {quoted(stray or reader.header)}, expected x_ and y_ of every landmark"
@@ -55,7 +55,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
     table = reader.read()
     fps = rate_of(table.column(_FRAME), table.column(_TIME), path)
     extras = numbering_extras(table.column(_FRAME), first=1, where=str(path))
-    positions = table.columns(columns).reshape(-1, len(names), 2).astype(np.float32)
+    positions = table.columns(columns, np.float32).reshape(-1, len(names), 2)
     unseen = np.isnan(positions).any(2)
     if _SUCCESS in table.names:
         unseen |= (table.column(_SUCCESS) == 0)[:, None]

@@ -50,7 +50,10 @@ def load_markers_csv(path: str | Path, unit: str | None = None) -> Take:
     columns = [label + axis for label in labels for axis in _AXES]
     reader.require(columns)
     table, fps, extras = read_numbered(reader)
-    return marker_take(path, fps, labels, table.columns(columns).reshape(-1, len(labels), 3) * factor, extras)
+    positions = table.columns(columns).reshape(-1, len(labels), 3)
+    positions *= factor
+    del table  # a long take fits the memory once, not three times
+    return marker_take(path, fps, labels, positions, extras)
 
 
 def save_markers_csv(take: Take, path: str | Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,14 @@ import numpy as np
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.markers.marker_checks import marker_take, millimetres, unique_labels
-from torchface.io.tables.csv_table import MAX_TABLE_BYTES, number_texts, parse_number, parse_numbers, quoted
+from torchface.io.tables.csv_table import (
+    MAX_TABLE_BYTES,
+    TextLines,
+    number_texts,
+    parse_number,
+    parse_numbers,
+    quoted,
+)
 from torchface.io.tables.frame_rates import frame_numbers, numbering_extras
 from torchface.io.tables.track_checks import values_to_write
 from torchface.number_checks import check_rate
@@ -40,38 +50,48 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     Source: OpenSim documentation, "Marker (.trc) Files".
     """
     path = Path(path)
-    try:
-        lines = read_file(path, MAX_TABLE_BYTES).decode("utf-8-sig").split("\n")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: found bytes that are no UTF-8 ({error.reason}), expected a TRC file") from error
-    rows = [(number + 1, line.rstrip("\r").split("\t")) for number, line in enumerate(lines) if line.strip()]
-    if len(rows) < 4 or rows[0][1][0].strip() != "PathFileType":
+    data = read_file(path, MAX_TABLE_BYTES)
+    lines = _filled_lines(path, data)
+    head = [line.split("\t") for _, line in islice(lines, 4)]
+    if len(head) < 4 or head[0][0].strip() != "PathFileType":
         raise FileFormatError(f"{path}: found no 'PathFileType' header, expected a TRC file")
-    fields = dict(zip((cell.strip() for cell in rows[1][1]), (cell.strip() for cell in rows[2][1]), strict=False))
+    fields = dict(zip((cell.strip() for cell in head[1]), (cell.strip() for cell in head[2]), strict=False))
     missing = [name for name in ("DataRate", "NumFrames", "NumMarkers", "Units") if not fields.get(name)]
     if missing:
         raise FileFormatError(f"{path}: found no field {quoted(missing)}, expected it in rows 2 and 3")
     fps = check_rate(_field(fields, "DataRate", path), f"{path}: DataRate")
     factor = millimetres(fields["Units"], path, "Units", unit)
     markers = _field(fields, "NumMarkers", path)
-    labels = [cell.strip() for cell in rows[3][1][2::3]]
+    labels = [cell.strip() for cell in head[3][2::3]]
     while labels and not labels[-1] and len(labels) > markers:
         labels.pop()
     if len(labels) != markers or markers == 0:
         raise FileFormatError(
             f"{path}: found {len(labels)} labels and NumMarkers {markers:.0f}, expected the same, not 0"
         )
-    body = rows[4:]
-    if body and not body[0][1][0].strip():  # X1 Y1 Z1 ...
-        body = body[1:]
-    if len(body) != _field(fields, "NumFrames", path) or not body:
+    first = next(lines, None)
+    named = first is not None and not first[1].split("\t", 1)[0].strip()  # X1 Y1 Z1 ...
+    count = sum(1 for _ in lines) + (first is not None) - named
+    if count == 0 or count != _field(fields, "NumFrames", path):
         raise FileFormatError(
-            f"{path}: found {len(body)} rows and NumFrames {fields['NumFrames'][:40]}, expected the same, not 0"
+            f"{path}: found {count} rows and NumFrames {fields['NumFrames'][:40]}, expected the same, not 0"
         )
     columns = ["Frame#", "Time", *(f"{axis}{i + 1}" for i in range(len(labels)) for axis in "XYZ")]
-    table = np.array([_row(cells, columns, f"{path}: row {number}") for number, cells in body])
+    numbers = array("d")
+    for number, line in islice(_filled_lines(path, data), 4 + named, None):  # text comes by the line
+        numbers.extend(_row(line.split("\t"), columns, f"{path}: row {number}"))
+    table = np.frombuffer(numbers).reshape(count, len(columns))
     extras = numbering_extras(table[:, 0], first=1, where=str(path))
     return marker_take(path, fps, unique_labels(labels), _scaled(table[:, 2:], factor), extras)
+
+
+def _filled_lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:
+    """The lines that hold more than blanks, with their numbers from 1."""
+    lines = TextLines(path, data, newline="\n")
+    for number, line in enumerate(lines, 1):
+        lines.row_begins()
+        if line.strip():
+            yield number, line.rstrip("\r\n")
 
 
 def _field(fields: dict[str, str], name: str, path: Path) -> float:
@@ -90,9 +110,9 @@ def _row(cells: list[str], columns: list[str], where: str) -> list[float]:
 
 
 def _scaled(values: np.ndarray, factor: float) -> np.ndarray:
-    scaled = values.reshape(len(values), -1, 3) * factor
-    scaled[np.abs(scaled) > np.finfo(np.float32).max] = np.nan
-    return scaled
+    values *= factor
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is no position
+        return values.astype(np.float32).reshape(len(values), -1, 3)
 
 
 def save_trc(take: Take, path: str | Path) -> None:

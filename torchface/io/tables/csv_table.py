@@ -6,8 +6,9 @@ import csv
 import io
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,10 @@ from torchface.files.whole_files import read_file, write_file
 MAX_TABLE_BYTES = 2**29
 """Bytes of text; two hours of 60 fps Live Link Face stay below."""
 
+_MAX_ROW = 2**22
 _MAX_NUMBER = float(np.finfo(np.float32).max)
+_SHARED_TEXT = 3  # letters; there are few texts so short, and a table may hold each a million times
+_BLOCK = 2**16
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,20 @@ class Table:
     numbers: np.ndarray
     texts: dict[str, tuple[str, ...]]
 
-    def column(self, name: str) -> np.ndarray:
-        return self.numbers[:, self.names.index(name)]
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
 
-    def columns(self, names: Sequence[str]) -> np.ndarray:
-        row = {name: i for i, name in enumerate(self.names)}
-        return self.numbers[:, [row[name] for name in names]]
+    def column(self, name: str) -> np.ndarray:
+        return self.numbers[:, self._index[name]]
+
+    def columns(self, names: Sequence[str], dtype: type[np.floating] = np.float64) -> np.ndarray:
+        """Some columns (T,C) in this order."""
+        wanted = [self._index[name] for name in names]
+        found = np.empty((len(self.numbers), len(wanted)), dtype)
+        for first in range(0, len(found), _BLOCK):  # so that no second copy of a long take is made
+            found[first : first + _BLOCK] = self.numbers[first : first + _BLOCK, wanted]
+        return found
 
 
 class TableReader:
@@ -49,13 +61,8 @@ class TableReader:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        try:
-            text = read_file(path, MAX_TABLE_BYTES).decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise FileFormatError(
-                f"{path}: found bytes that are no UTF-8 ({error.reason}), expected a table"
-            ) from error
-        self._rows = csv.reader(io.StringIO(text, newline=""))
+        self._lines = TextLines(self.path, read_file(path, MAX_TABLE_BYTES))
+        self._rows = csv.reader(self._lines)
         self.header = tuple(cell.strip() for cell in self._next() or ())
         if not any(self.header):
             raise FileFormatError(f"{path}: found no header, expected the names of the columns in the first row")
@@ -64,6 +71,7 @@ class TableReader:
             raise FileFormatError(f"{path}: found more than one column {quoted(twice)}, expected each once")
 
     def _next(self) -> list[str] | None:
+        self._lines.row_begins()
         try:
             return next(self._rows, None)
         except csv.Error as error:
@@ -88,6 +96,7 @@ class TableReader:
         """
         width = len(self.header)
         kept: dict[str, list[str]] = {name: [] for name in texts}
+        shared: dict[str, str] = {}
         text_columns = [i for i, name in enumerate(self.header) if name in kept]
         number_columns = [i for i, name in enumerate(self.header) if name not in kept]
         names = tuple(self.header[i] for i in number_columns)
@@ -102,7 +111,8 @@ class TableReader:
                     f"{self.path}: row {self._rows.line_num}: found {len(cells)} cells, expected {width}"
                 )
             for i in text_columns:
-                kept[self.header[i]].append(cells[i].strip())
+                text = cells[i].strip()
+                kept[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
             wanted = [cells[i] for i in number_columns]
             numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
             rows += 1
@@ -111,8 +121,44 @@ class TableReader:
         return Table(
             names,
             np.frombuffer(numbers, np.float64).reshape(rows, len(number_columns)),
-            {name: tuple(column) for name, column in kept.items()},
+            {name: tuple(kept.pop(name)) for name in list(kept)},
         )
+
+
+class TextLines:
+    """The lines of a UTF-8 file with their ends, decoded as they are asked for.
+
+    Args:
+        path: names the file in errors.
+        data: its bytes.
+        newline: as ``open`` takes it.
+    """
+
+    def __init__(self, path: Path, data: bytes, newline: str = "") -> None:
+        self.path = path
+        self._file = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline=newline)
+        self._row_size = 0
+
+    def row_begins(self) -> None:
+        """Of one row, which may be of several lines, only so much is read."""
+        self._row_size = 0
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        try:
+            line = self._file.readline(_MAX_ROW + 1)
+        except UnicodeDecodeError as error:
+            raise FileFormatError(
+                f"{self.path}: found bytes that are no UTF-8 ({error.reason}), expected a table"
+            ) from error
+        self._row_size += len(line)
+        if self._row_size > _MAX_ROW:
+            raise FileFormatError(f"{self.path}: found a row of more than {_MAX_ROW} letters, expected a table")
+        if not line:
+            raise StopIteration
+        return line
 
 
 def parse_numbers(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:

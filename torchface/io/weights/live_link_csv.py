@@ -98,7 +98,7 @@ def load_live_link(path: str | Path) -> Take:
         "measured_fps": timing.measured,
         **({"gaps": timing.gaps} if timing.gaps else {}),
     }
-    weights = torch.from_numpy(table.columns(names).astype(np.float32))[..., None]
+    weights = torch.from_numpy(table.columns(names, np.float32))[..., None]
     return Take(timing.fps, weights=Track(names, weights), timecode=table.texts[spelling[_TIMECODE]], extras=extras)
 
 

@@ -48,7 +48,7 @@ def load_weights_csv(path: str | Path) -> Take:
     if not names:
         raise FileFormatError(f"{path}: found no shape among the columns, expected frame,time,<shape>,...")
     columns = {name: torch.from_numpy(table.column(name).copy()) for name in table.names if name in ROTATIONS}
-    values = torch.from_numpy(table.columns(names).astype(np.float32))[..., None]
+    values = torch.from_numpy(table.columns(names, np.float32))[..., None]
     return Take(
         fps,
         weights=Track(names, values),
