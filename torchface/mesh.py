@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimes
 
 if TYPE_CHECKING:
     import trimesh
+
+_FAN_CELLS = 2**20
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ class Mesh:
             _check_shape("colors", self.colors, (len(self.vertices), 3))
         if self.texture is not None:
             _check_shape("texture", self.texture, (3, None, None))
-        if self.polygons is not None and not torch.equal(fan_triangulation(self.polygons), self.faces):
+        if self.polygons is not None and not _are_fans(self.polygons, self.faces):
             raise TopologyError("mesh: faces are not the fan triangulation of polygons")
         if self.annotations is not None:
             _check_annotations(self.annotations, len(self.vertices))
@@ -170,9 +173,26 @@ def fan_triangulation(polygons: Tensor) -> Tensor:
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
         raise ShapeError(f"polygons: found {tuple(polygons.shape)}, expected (P,K) with K at least 3")
-    apex = polygons[:, :1].expand(-1, polygons.shape[1] - 2)
-    fan = torch.stack([apex, polygons[:, 1:-1], polygons[:, 2:]], dim=-1).reshape(-1, 3)
-    return fan[(fan >= 0).all(-1)].contiguous()
+    blocks = list(_fans(polygons))
+    return blocks[0] if len(blocks) == 1 else torch.cat(blocks)
+
+
+def _fans(polygons: Tensor) -> Iterator[Tensor]:
+    """The triangles of some polygons after the other: a table of all fans may be far larger than what it holds."""
+    for some in polygons.split(max(1, _FAN_CELLS // polygons.shape[1])):
+        apex = some[:, :1].expand(-1, some.shape[1] - 2)
+        fan = torch.stack([apex, some[:, 1:-1], some[:, 2:]], dim=-1).reshape(-1, 3)
+        yield fan[(fan >= 0).all(-1)].contiguous()
+
+
+def _are_fans(polygons: Tensor, faces: Tensor) -> bool:
+    """Whether the triangles (F,3) are those of the polygons, in their order."""
+    done = 0
+    for fan in _fans(polygons):
+        if not torch.equal(fan, faces[done : done + len(fan)]):
+            return False
+        done += len(fan)
+    return done == len(faces)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ MEGABYTES = 500
 
 _SIZES = 20
 _ALLOWED_AT_ALL = 3  # times the budget: then the child is ended, so that the machine outlives a reader without bounds
+_WAITED = 100  # times the processor time, for the machine may be busy with other work
 _STDERR, _REPORT = "stderr.txt", "report.json"
 _STATUS = Path("/proc/self/status")
 _START: dict[str, float] = {}
@@ -101,7 +102,7 @@ def measure(reader: Callable[[Path], Any], path: Path, good: Path | None = None)
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     size = sum(file.stat().st_size for file in files) / 2**20
     job = {**place_of(reader), "path": str(path), "good": None if good is None else str(good), "megabytes": size}
-    report = run_child(_measure, job, _ALLOWED_AT_ALL * time_budget(size) + 60)
+    report = run_child(_measure, job, _ALLOWED_AT_ALL * time_budget(size))
     return Cost(**report)
 
 
@@ -111,15 +112,15 @@ def run_child(work: Callable[[dict[str, Any], Path], Any], job: dict[str, Any], 
     Args:
         work: of the job and an empty folder; returns what JSON can hold.
         job: of what JSON can hold.
-        seconds: after which a child is ended.
+        seconds: of processor time after which a child is ended.
 
     Raises:
         AssertionError: the child crashed, was ended, or raised; the message holds what it wrote.
     """
     with tempfile.TemporaryDirectory(prefix="reader-") as folder:
-        child = _children().Process(target=_report, args=(work, job, Path(folder)))
+        child = _children().Process(target=_report, args=(work, job, Path(folder), seconds))
         child.start()
-        child.join(seconds)
+        child.join(60 + _WAITED * seconds)
         if child.is_alive():
             child.kill()
             child.join()
@@ -181,8 +182,12 @@ def _children() -> Any:
     return context
 
 
-def _report(work: Callable[[dict[str, Any], Path], Any], job: dict[str, Any], folder: Path) -> None:
+def _report(work: Callable[[dict[str, Any], Path], Any], job: dict[str, Any], folder: Path, seconds: float) -> None:
     os.dup2(os.open(folder / _STDERR, os.O_WRONLY | os.O_CREAT), sys.stderr.fileno())
+    if _STATUS.exists():
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + seconds) + 2, resource.RLIM_INFINITY))
     (folder / _REPORT).write_text(json.dumps(work(job, folder)))
 
 

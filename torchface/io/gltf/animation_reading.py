@@ -39,12 +39,18 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     channels = document.array(animations[0], "channels", place) if animations else []
     weights: dict[str, np.ndarray] = {}
     times: np.ndarray | None = None
+    meshes: set[int] = set()
     for number, row in enumerate(channels):
         channel = document.record(row, f"{place}.channels[{number}]")
         target = document.record(channel.get("target"), f"{place}.channels[{number}].target")
         if target.get("path") != "weights":
             continue
-        here, names, values = _channel(document, animations[0], channel, target, f"{place}.channels[{number}]")
+        node = document.item("nodes", target.get("node"), f"{place}.channels[{number}].target.node")
+        mesh = document.integer(node, "mesh", f"{place}.channels[{number}].target.node")
+        if mesh in meshes:
+            continue  # another node shows it again, and the first's weights count
+        meshes.add(mesh)
+        here, names, values = _channel(document, animations[0], channel, mesh, f"{place}.channels[{number}]")
         if times is not None and (len(here) != len(times) or not np.allclose(here, times)):
             raise document.error(f"{place}.channels[{number}]", "keys at other times", "those of the first channel")
         times = here
@@ -57,7 +63,7 @@ def read_gltf_weights(path: str | Path) -> Take | None:
 
 
 def _channel(
-    document: Document, animation: dict[str, Any], channel: dict[str, Any], target: dict[str, Any], place: str
+    document: Document, animation: dict[str, Any], channel: dict[str, Any], mesh: int, place: str
 ) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
     """Times (T,), names and values (T,N) of one channel."""
     samplers = document.array(animation, "samplers", "animations[0]")
@@ -65,8 +71,7 @@ def _channel(
     if index >= len(samplers):
         raise document.error(f"{place}.sampler", index, f"less than {len(samplers)}")
     sampler = document.record(samplers[index], f"{place}.sampler")
-    node = document.item("nodes", target.get("node"), f"{place}.target.node")
-    names = read_target_names(document, document.integer(node, "mesh", f"{place}.target.node"))
+    names = read_target_names(document, mesh)
     if not names:
         raise document.error(f"{place}.target.node", "a mesh without morph targets", "one with them")
     times = read_floats(document, sampler.get("input"), f"{place}.input", ("SCALAR",))[:, 0]

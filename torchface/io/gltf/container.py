@@ -14,14 +14,14 @@ from urllib.parse import unquote
 
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
-from torchface.files.whole_files import read_file
+from torchface.files.whole_files import LARGEST_FILE, read_file
 from torchface.io.gltf.buffers import BufferWriter
 
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _MAX_JSON = 2**26
 _MAX_JSON_WITH_BUFFERS = 2**28
-_UNPACKED_ALWAYS = 2**26
-_UNPACKED_PER_BYTE = 64
+_UNPACKED_ALWAYS = 2**28
+_UNPACKED_PER_BYTE = 32
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 60
 _EXTENSIONS = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_punctual")
@@ -46,7 +46,7 @@ class Document:
     path: Path
     root: dict[str, Any]
     binary: memoryview | None = None
-    _buffers: dict[int, memoryview] = field(default_factory=dict)
+    _sources: dict[str, memoryview] = field(default_factory=dict)
     _unpacked: int = 0
 
     def error(self, where: str, found: object, expected: str) -> FileFormatError:
@@ -112,17 +112,13 @@ class Document:
         return buffer[start : start + length], stride
 
     def bytes_at(self, uri: object, where: str) -> memoryview:
-        """The bytes that a URI names: data in it, or a file in the document's folder or below."""
+        """The bytes that a URI names: data in it, or a file in the document's folder or below; read once."""
         if not isinstance(uri, str):
             raise self.error(where, shown(uri), "a URI")
         if uri.startswith("data:"):
-            head, _, body = uri.partition(",")
-            if not head.endswith(";base64"):
-                raise self.error(where, f"'{head[:60]}'", "base64 data")
-            try:
-                return memoryview(base64.b64decode(body, validate=True))
-            except (binascii.Error, ValueError) as error:
-                raise self.error(where, f"broken base64 ({error})", "base64 data") from error
+            if uri not in self._sources:
+                self._sources[uri] = self._decoded(uri, where)
+            return self._sources[uri]
         folder = self.path.resolve().parent
         try:
             file = (folder / unquote(uri)).resolve()
@@ -130,31 +126,43 @@ class Document:
             raise self.error(where, f"'{uri[:60]}'", f"a file name ({error})") from error
         if "://" in uri or not file.is_relative_to(folder):
             raise self.error(where, f"'{uri[:60]}'", "a file in the folder of the document")
-        return memoryview(read_file(file))
+        if str(file) not in self._sources:
+            self._sources[str(file)] = memoryview(read_file(file, LARGEST_FILE - self._packed()))
+        return self._sources[str(file)]
 
     def reserve(self, size: int, where: str) -> None:
-        """Counts memory about to be taken; refuses more than a file of this size can reasonably unpack to."""
+        """Counts memory about to be taken; refuses more than files of this size can reasonably unpack to."""
         self._unpacked += size
-        packed = sum(map(len, self._buffers.values()))
-        limit = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * packed)
+        limit = max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * self._packed())
         if self._unpacked > limit:
             raise self.error(where, f"data that unpacks to {self._unpacked} bytes", f"at most {limit}")
 
+    def _packed(self) -> int:
+        """Bytes of the binary chunk and of all sources so far."""
+        return len(self.binary or b"") + sum(map(len, self._sources.values()))
+
+    def _decoded(self, uri: str, where: str) -> memoryview:
+        head, _, body = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise self.error(where, f"'{head[:60]}'", "base64 data")
+        try:
+            return memoryview(base64.b64decode(body, validate=True))
+        except (binascii.Error, ValueError) as error:
+            raise self.error(where, f"broken base64 ({error})", "base64 data") from error
+
     def _buffer(self, index: int) -> memoryview:
-        if index not in self._buffers:
-            buffer = self.item("buffers", index, f"buffers[{index}]")
-            place = f"buffers[{index}]"
-            length = self.integer(buffer, "byteLength", place)
-            if buffer.get("uri") is None:
-                if index != 0 or self.binary is None:
-                    raise self.error(place, "no uri", "one, or the binary chunk of a .glb")
-                data = self.binary
-            else:
-                data = self.bytes_at(buffer["uri"], f"{place}.uri")
-            if len(data) < length:
-                raise self.error(place, f"{len(data)} bytes (truncated)", f"byteLength {length}")
-            self._buffers[index] = data[:length]
-        return self._buffers[index]
+        buffer = self.item("buffers", index, f"buffers[{index}]")
+        place = f"buffers[{index}]"
+        length = self.integer(buffer, "byteLength", place)
+        if buffer.get("uri") is None:
+            if index != 0 or self.binary is None:
+                raise self.error(place, "no uri", "one, or the binary chunk of a .glb")
+            data = self.binary
+        else:
+            data = self.bytes_at(buffer["uri"], f"{place}.uri")
+        if len(data) < length:
+            raise self.error(place, f"{len(data)} bytes (truncated)", f"byteLength {length}")
+        return data[:length]
 
 
 def read_document(path: str | Path) -> Document:

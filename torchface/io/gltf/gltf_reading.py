@@ -16,7 +16,7 @@ from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
 from torchface.io.gltf.part_joining import rejoined
-from torchface.io.gltf.primitive_reading import Part, read_part
+from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, Part, read_part
 from torchface.io.gltf.scene import Instance, instances
 from torchface.io.gltf.seam_welding import weld
 from torchface.io.images.image_files import decode_image
@@ -80,15 +80,20 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
             parts[instance.mesh] = read_part(document, instance.mesh)
         part = parts[instance.mesh]
         if part is not None and len(part.triangles):
-            document.reserve(part.deltas.nbytes + part.positions.nbytes, f"nodes: {instance.name[:40]}")
+            size = part.deltas.nbytes + BYTES_A_VERTEX * len(part.positions) + BYTES_A_CORNER * part.triangles.size
+            document.reserve(size, f"nodes: {instance.name[:40]}")
             found.append((instance, part))
     if not found:
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
     whole = rejoined(document, found)
     pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
     texture = next((part.texture for _, part in found if part.texture is not None), None)
+    del parts, found, part, whole  # their shapes fit the memory once, not twice
     names = tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
     total = sum(len(piece.vertices) for piece in pieces)
+    image = None if texture is None else read_texture(document, texture)
+    if len(pieces) == 1:
+        return _join(pieces, image), pieces[0].deltas, names
     document.reserve((12 * len(names) + len(pieces)) * total, "the scene's morph targets")
     deltas = torch.zeros(len(names), total, 3)
     row = {name: i for i, name in enumerate(names)}
@@ -96,7 +101,7 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     for piece in pieces:
         deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
         first += len(piece.vertices)
-    return _join(pieces, None if texture is None else read_texture(document, texture)), deltas, names
+    return _join(pieces, image), deltas, names
 
 
 def _piece(document: Document, instance: Instance, part: Part, scale: float) -> _Piece:
@@ -104,8 +109,10 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     joined = weld(part)
     linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
     vertices = _moved(part.positions[joined.row_of], linear, translation)
-    deltas = np.stack([_moved(delta[joined.row_of], linear) for delta in part.deltas]) if len(part.deltas) else None
-    if not np.isfinite(vertices).all() or (deltas is not None and not np.isfinite(deltas).all()):
+    deltas = np.zeros((len(part.deltas), len(vertices), 3), np.float32)
+    for row, delta in zip(deltas, part.deltas, strict=True):
+        row[:] = _moved(delta[joined.row_of], linear)
+    if not np.isfinite(vertices).all() or not np.isfinite(deltas).all():
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
     extras, triangles = part.extras.get("torchface"), part.triangles
     rows = read_order(document, extras, place, len(triangles)) if joined.authored else None
@@ -125,7 +132,7 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
         None if part.colors is None else torch.from_numpy(part.colors[joined.row_of]),
         read_polygons(document, extras, place, faces),
         read_annotations(document, extras, place, len(vertices)) if joined.authored else None,
-        torch.zeros(0, len(vertices), 3) if deltas is None else torch.from_numpy(deltas),
+        torch.from_numpy(deltas),
         part.names,
     )
 

@@ -18,6 +18,9 @@ from torchface.io.gltf.container import Document, shown
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MAX_EXACT_ID = 2**24
 
+BYTES_A_VERTEX, BYTES_A_CORNER = 200, 40
+"""What a vertex without its morph targets, and a triangle's corner, take while they are read."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -79,7 +82,7 @@ def read_part(document: Document, index: int) -> Part | None:
     has = [count for count, texture in textures if texture is not None]
     return Part(
         np.concatenate([block.positions for block in rows]),
-        np.concatenate([block.deltas for block in rows], axis=1),
+        rows[0].deltas if len(rows) == 1 else np.concatenate([block.deltas for block in rows], axis=1),
         _target_names(document, mesh, place, len(rows[0].deltas)),
         np.concatenate(triangles),
         filled([block.uvs for block in rows], [len(block.positions) for block in rows], 0.0),
@@ -110,6 +113,7 @@ def _read_block(document: Document, primitive: dict[str, Any], place: str, first
         raise document.error(f"{place}.attributes", "no POSITION", "one")
     positions = read_floats(document, attributes["POSITION"], f"{place}.POSITION", ("VEC3",))
     count = len(positions)
+    document.reserve(count * BYTES_A_VERTEX, f"{place}.POSITION")
     targets = document.array(primitive, "targets", place)
     document.reserve(len(targets) * count * 12, f"{place}.targets")
     deltas = np.zeros((len(targets), count, 3), np.float32)
@@ -138,6 +142,7 @@ def _read_triangles(document: Document, primitive: dict[str, Any], place: str, c
         corners = np.arange(count)
     else:
         corners = read_indices(document, primitive["indices"], f"{place}.indices")
+    document.reserve(len(corners) * BYTES_A_CORNER, f"{place}.indices")
     if len(corners) and int(corners.max()) >= count:
         raise document.error(f"{place}.indices", int(corners.max()), f"less than the {count} vertices")
     mode = primitive.get("mode", _TRIANGLES)

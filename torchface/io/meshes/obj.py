@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import chain
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,11 @@ from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.length_units import finite_vertices, millimetres_per
+from torchface.io.meshes.obj_statements import Statements, read_statements, read_vertices, texture_coordinates
 from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh
 
-_MAX_MATERIAL_FILE = 2**20
+_MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh
 
 
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
@@ -33,17 +33,12 @@ def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
         TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
-    lines = _lines_by_keyword(path, read_file(path))
-    table = _number_rows(path, "v", lines["v"], (3, 4, 6, 7))
-    if not len(table):
-        raise FileFormatError(f"{path}: found no vertex (line 'v x y z'), expected an OBJ mesh")
-    vertices = finite_vertices(path, table[:, :3] * scale)
-    sizes, corners, uv_corners = _face_corners(path, lines, len(vertices))
-    polygons = pad_polygons(str(path), sizes, corners)
-    uvs, uv_polygons = _texture_coordinates(path, lines, sizes, uv_corners)
-    colors = _colors(path, table)
-    texture = _texture(path, lines)
-    rest = {"colors": colors, "texture": texture}
+    found = read_statements(path, read_file(path))
+    vertices = finite_vertices(path, found.vertices[:, :3] * scale)
+    polygons = pad_polygons(str(path), found.sizes, found.corners)
+    uvs, uv_polygons = _texture_coordinates(path, found)
+    rest = {"colors": _colors(path, found.vertices), "texture": _texture(path, found)}
+    del found  # a large mesh fits the memory once, not twice
     if polygons.shape[1] == 3:
         return Mesh(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
     return Mesh.from_polygons(vertices, polygons, uvs, uv_polygons, **rest)  # type: ignore[arg-type]
@@ -63,9 +58,7 @@ def read_obj_vertices(path: str | Path, neutral: Mesh, topology: bytes | None, u
         TopologyError: another number of vertices, or other faces.
     """
     path, data = Path(path), read_file(path)
-    table = _plain_vertices(path, data)
-    if table is None:
-        table = _number_rows(path, "v", _lines_by_keyword(path, data)["v"], (3, 4, 6, 7))
+    table = read_vertices(path, data)
     if len(table) != len(neutral.vertices):
         raise TopologyError(
             f"{path}: found {len(table)} vertices, expected the {len(neutral.vertices)} of the neutral mesh"
@@ -143,126 +136,15 @@ def _surface_lines(mesh: Mesh) -> bytes:
     return ("\n".join(text) + "\n").encode()
 
 
-def _plain_vertices(path: Path, data: bytes) -> NDArray[np.float64] | None:
-    """The vertices of a file whose first to last vertex line hold nothing but ``v x y z``; none of another file.
-
-    All is split at once; every fourth word being the keyword, and a line a vertex, says that no line is odd.
-    """
-    start = 0 if data.startswith(b"v ") else data.find(b"\nv ") + 1
-    last = data.rfind(b"\nv ") + 1
-    end = data.find(b"\n", last)
-    block = data[start : end if end >= 0 else None].rstrip()
-    words = block.split()
-    count = len(words) // 4
-    if not count or len(words) % 4 or words[::4].count(b"v") != count or block.count(b"\n") != count - 1:
-        return None
-    del words[::4]
-    return _floats(path, "v", words).reshape(count, 3)
-
-
-def _floats(path: Path, keyword: str, words: Iterable[bytes]) -> NDArray[np.float64]:
-    try:
-        return np.array(list(map(float, words)), dtype=np.float64)
-    except ValueError as error:
-        raise FileFormatError(f"{path}: found text in a '{keyword}' line, expected numbers ({error})") from error
-
-
-def _lines_by_keyword(path: Path, data: bytes) -> dict[str, list[bytes]]:
-    """What follows the keyword, for the keywords that are read; text comes by the line, hence the loop."""
-    if b"\0" in data[:4096]:
-        raise FileFormatError(f"{path}: found binary data, expected the text of an OBJ")
-    known: dict[bytes, list[bytes]] = {b"v": [], b"vt": [], b"f": [], b"mtllib": [], b"usemtl": []}
-    vertices, coordinates, faces = known[b"v"], known[b"vt"], known[b"f"]
-    for line in data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
-        words = line.split(None, 1)
-        if len(words) == 2 and (rows := known.get(words[0])) is not None:
-            rows.append(words[1])
-            if rows is faces and b"-" in words[1]:  # a relative index counts back from the last vertex above it
-                faces[-1] = _absolute(path, words[1], len(vertices), len(coordinates))
-    return {keyword.decode(): rows for keyword, rows in known.items()}
-
-
-def _absolute(path: Path, face: bytes, vertices: int, coordinates: int) -> bytes:
-    """A face with its negative indices counted from the start."""
-    corners = []
-    for corner in face.split():
-        parts = corner.split(b"/")
-        for place, count in ((0, vertices), (1, coordinates)):
-            if len(parts) > place and parts[place].startswith(b"-"):
-                parts[place] = b"%d" % (count + 1 + _integers(path, [parts[place]])[0])
-        corners.append(b"/".join(parts))
-    return b" ".join(corners)
-
-
-def _number_rows(path: Path, keyword: str, lines: Sequence[bytes], widths: Sequence[int]) -> NDArray[np.float64]:
-    rows = [line.split() for line in lines]
-    found = set(map(len, rows))
-    if len(found) > 1 or not found <= set(widths):
-        odd = next(i for i, row in enumerate(rows) if len(row) not in widths or len(row) != len(rows[0]))
-        raise FileFormatError(
-            f"{path}: found {len(rows[odd])} numbers in '{keyword}' line {odd + 1}, "
-            f"expected {' or '.join(map(str, widths))}, in every line the same"
-        )
-    numbers = _floats(path, keyword, chain.from_iterable(rows))
-    return numbers.reshape(len(rows), -1) if rows else numbers.reshape(0, widths[0])
-
-
-def _integers(path: Path, words: Sequence[bytes]) -> list[int]:
-    try:
-        return list(map(int, words))
-    except ValueError as error:
-        raise FileFormatError(f"{path}: found text in an 'f' line, expected integers ({error})") from error
-
-
-def _index_array(path: Path, words: Sequence[bytes]) -> NDArray[np.int64]:
-    try:
-        return np.array(_integers(path, words), dtype=np.int64) - 1
-    except OverflowError as error:
-        raise TopologyError(f"{path}: found an index of more than 63 bits in an 'f' line") from error
-
-
-def _face_corners(
-    path: Path, lines: dict[str, list[bytes]], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64] | None]:
-    """Corners a face (P,), vertex ids (C,), rows of the texture coordinates (C,) with -1 for none."""
-    rows = [line.split() for line in lines["f"]]
-    if not rows:
-        raise FileFormatError(f"{path}: found {count} vertices and no face (line 'f'), expected at least one face")
-    sizes = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
-    if sizes.min() < 3:
-        raise FileFormatError(
-            f"{path}: found {int(sizes.min())} corners in face {int(sizes.argmin())}, expected at least 3"
-        )
-    parts = [corner.split(b"/") for corner in chain.from_iterable(rows)]
-    corners = _index_array(path, [part[0] for part in parts])
-    _check_range(path, "vertex", corners, count)
-    if not lines["vt"] or all(len(part) < 2 or not part[1] for part in parts):
-        return sizes, corners, None
-    uv_corners = _index_array(path, [part[1] if len(part) > 1 and part[1] else b"0" for part in parts])
-    _check_range(path, "texture coordinate", uv_corners[uv_corners >= 0], len(lines["vt"]))
-    return sizes, corners, uv_corners
-
-
-def _check_range(path: Path, what: str, indices: NDArray[np.int64], count: int) -> None:
-    if len(indices) and (indices.min() < 0 or indices.max() >= count):
-        raise TopologyError(
-            f"{path}: found faces with {what} {int(indices.min()) + 1} to {int(indices.max()) + 1}, "
-            f"expected 1 to {count}"
-        )
-
-
-def _texture_coordinates(
-    path: Path, lines: dict[str, list[bytes]], sizes: NDArray[np.int64], corners: NDArray[np.int64] | None
-) -> tuple[Tensor | None, Tensor | None]:
+def _texture_coordinates(path: Path, found: Statements) -> tuple[Tensor | None, Tensor | None]:
+    corners = found.uv_corners
     if corners is None:
         return None, None
-    uvs = _number_rows(path, "vt", [b" ".join(line.split()[:2]) for line in lines["vt"]], (2,)).astype(np.float32)
-    if not np.isfinite(uvs).all():
-        raise FileFormatError(f"{path}: found NaN or infinity among the texture coordinates, expected finite numbers")
+    uvs = texture_coordinates(path, found.coordinates)
     if (corners < 0).any():  # faces without coordinates beside faces with them share one row at the origin
         corners = np.where(corners < 0, len(uvs), corners)
         uvs = np.vstack([uvs, np.zeros((1, 2), np.float32)])
-    return torch.from_numpy(uvs), pad_polygons(str(path), sizes, corners)
+    return torch.from_numpy(uvs), pad_polygons(str(path), found.sizes, corners)
 
 
 def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
@@ -275,21 +157,26 @@ def _colors(path: Path, table: NDArray[np.float64]) -> Tensor | None:
     return torch.from_numpy((colors / scale).clip(0, 1).astype(np.float32))
 
 
-def _texture(path: Path, lines: dict[str, list[bytes]]) -> Tensor | None:
+def _texture(path: Path, found: Statements) -> Tensor | None:
     """The image of the first material in use that has one."""
     images: dict[str, str] = {}
-    for library in lines["mtllib"]:
+    seen: set[Path] = set()
+    left = _MAX_MATERIALS
+    for library in found.libraries:
         file = _beside(path, library)
-        if file is None or not file.is_file():
+        if file is None or file in seen or not file.is_file():
             continue  # exporters name libraries that nobody passes on; the mesh is whole without
+        text = read_file(file, left)
+        seen.add(file)
+        left -= len(text)
         material = ""
-        for line in read_file(file, _MAX_MATERIAL_FILE).decode("utf-8", "replace").splitlines():
+        for line in text.decode("utf-8", "replace").splitlines():
             words = line.split()
             if len(words) >= 2 and words[0] == "newmtl":
                 material = " ".join(words[1:])
             elif len(words) >= 2 and words[0] == "map_Kd":
                 images.setdefault(material, words[-1])
-    used = [name.decode("utf-8", "replace").strip() for name in dict.fromkeys(lines["usemtl"])]
+    used = [name.decode("utf-8", "replace").strip() for name in found.materials]
     for name in used or list(images):
         image = _beside(path, images[name].encode()) if name in images else None
         if image is not None and image.is_file():

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.mesh import Mesh
 
-_MAX_TABLE = 10_000_000
+_MAX_TABLE = 20_000_000
 
 
 def pad_polygons(source: str, sizes: NDArray[np.int64], corners: NDArray[np.int64]) -> Tensor:
@@ -19,12 +19,14 @@ def pad_polygons(source: str, sizes: NDArray[np.int64], corners: NDArray[np.int6
     Raises:
         FileFormatError: one polygon has so many corners that the padded table would fill the memory.
     """
-    widest = int(sizes.max())
-    if len(sizes) * widest > max(_MAX_TABLE, 16 * len(corners)):
+    widest, largest = int(sizes.max()), max(_MAX_TABLE, 3 * len(corners) // 2)
+    if len(sizes) * widest > largest:
         raise FileFormatError(
             f"{source}: found a polygon of {widest} corners among {len(sizes)} faces, "
-            f"expected at most {max(_MAX_TABLE, 16 * len(corners)) // len(sizes)} corners; triangulate it"
+            f"expected at most {largest // len(sizes)} corners; triangulate it"
         )
+    if len(sizes) * widest == len(corners):
+        return torch.from_numpy(corners.reshape(-1, widest))
     padded = np.full((len(sizes), widest), -1, dtype=np.int64)
     padded[np.arange(widest) < sizes[:, None]] = corners
     return torch.from_numpy(padded)
