@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.primitive_reading import Part
 
-
 _STIR = np.uint64(0x9E3779B97F4A7C15)
 
 

@@ -1,0 +1,147 @@
+"""Files made to take memory or time are read or refused within the budget of every reader."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from reader_budget import check_budget, measure
+
+from torchface.capture.action_units.shape_table import load_shape_table
+from torchface.capture.retargeting import load_shape_rules
+from torchface.errors import FileFormatError
+from torchface.files.documents import read_json, read_toml
+from torchface.files.models import read_record
+from torchface.io import load_calibration, load_landmark_points, load_mesh, load_take
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("key", ["{} = 1", "[{}]", "[[{}]]", "a = {{{} = 1}}"])
+def test_keys_of_thousands_of_parts_are_refused_before_they_are_parsed(key: str, tmp_path: Path) -> None:
+    dotted = written(tmp_path / "deep.toml", key.format(" . ".join(["a", '"b"', "'c'", "d-1"] * 4000)))
+    cost = check_budget(read_toml, dotted)
+    assert "a key of more than 17 parts" in cost.refused
+    assert cost.megabytes < 20
+    assert cost.seconds < 0.5
+
+
+def test_a_key_of_some_parts_and_dots_elsewhere_are_read(tmp_path: Path) -> None:
+    text = "a.b.'c'.\"d\" = 1\nnumbers = [" + "1.5, " * 50 + ']\ntext = "www.' + "x" * 40 + '.org"\n'
+    assert read_toml(written(tmp_path / "good.toml", text)).found["a"]["b"]["c"]["d"] == 1
+
+
+@pytest.mark.parametrize("number", ["0x" + "f" * 5000, "0b" + "1" * 20000, "9" * 5000, str(2**63), str(-(2**70))])
+@pytest.mark.parametrize("reader", [load_calibration, load_shape_table, load_shape_rules, read_record])
+def test_whole_numbers_of_more_than_64_bits_are_refused(
+    reader: Callable[[Path], object], number: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "model.toml", f"format = {number}\njawOpen = {number}\n")
+    with pytest.raises(FileFormatError, match=r"model\.toml: not TOML"):
+        reader(tmp_path if reader is read_record else path)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("[" * 65 + "]" * 65, "nested 65 deep"),
+        ('["]]]]", ' + '{"a":' * 64 + "1" + "}" * 64 + "]", "nested 65 deep"),
+        ("[1, " + "7" * 25 + "]", "a whole number of 25 digits"),
+        ("[" + "[]," * 2**20 + "[]]", "1048578 lists and tables"),
+        ("[9223372036854775808]", "a whole number of 19 digits"),
+    ],
+)
+def test_json_is_measured_before_it_is_built(text: str, found: str, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=found):
+        read_json(written(tmp_path / "odd.json", text), max_bytes=2**24)
+
+
+def test_json_that_only_looks_deep_or_large_is_read(tmp_path: Path) -> None:
+    rows = ["[[" * 100, 'a \\" {{{ \\\\', 1.2345678901234567890123, -9223372036854775807, 1e300]
+    text = json.dumps(rows).replace("1.2345678901234567", "1.2345678901234567890123")
+    assert read_json(written(tmp_path / "good.json", text)).found == rows
+
+
+def test_a_wide_table_is_read_in_time_that_grows_with_its_cells(tmp_path: Path) -> None:
+    others = ",".join(f"a{i}" for i in range(30_000))
+    landmarks = ",".join(f"x_{i},y_{i}" for i in range(10_000))
+    text = f"frame,timestamp,{landmarks},{others}\n1,0.0" + ",1" * 50_000 + "\n"
+    cost = check_budget(load_take, written(tmp_path / "wide.csv", text))
+    assert cost.refused == ""
+
+
+@pytest.mark.parametrize("cell", ["", "1", "ab"])
+def test_a_row_without_end_is_refused(cell: str, tmp_path: Path) -> None:
+    path = written(tmp_path / "long.csv", f"{cell}," * (2**22 // (len(cell) + 1) + 1))
+    assert "found a row of more than" in check_budget(load_take, path).refused
+
+
+def test_a_material_file_named_two_hundred_times_is_read_once(tmp_path: Path) -> None:
+    written(tmp_path / "skin.mtl", "newmtl skin\n" * 80_000)
+    names = ["skin.mtl", "./skin.mtl", ".//skin.mtl"]
+    text = "".join(f"mtllib {names[i % 3]}\n" for i in range(200)) + TRIANGLE + "f 1 2 3\n"
+    cost = check_budget(load_mesh, written(tmp_path / "mesh.obj", text))
+    assert cost.seconds < 1
+
+
+def test_hundreds_of_material_files_are_refused(tmp_path: Path) -> None:
+    text = "".join(f"mtllib {i}.mtl\n" for i in range(200)) + TRIANGLE + "f 1 2 3\n"
+    with pytest.raises(FileFormatError, match="more than 64 material files"):
+        load_mesh(written(tmp_path / "mesh.obj", text))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "f 1 2 3\n" * 300_000,
+        "f 1/1 2/1 3/1\n" * 150_000,
+        "v 0 0 0\n" * 300_000 + "f 1 2 3\n",
+        "f" + " 1 2 3" * 150_000 + "\nf 1 2 3\n" * 3,
+    ],
+)
+def test_words_of_a_large_obj_do_not_fill_the_memory(lines: str, tmp_path: Path) -> None:
+    path = written(tmp_path / "mesh.obj", TRIANGLE + "vt 0 0\n" + lines)
+    cost = measure(load_mesh, path)
+    assert cost.refused == ""
+    assert cost.megabytes < 20 * cost.file_megabytes + 110  # of one piece of the text
+
+
+def test_a_line_of_megabytes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="a line of more than 1048576 bytes"):
+        load_mesh(written(tmp_path / "mesh.obj", TRIANGLE + "f" + " 1 2 3" * 400_000 + "\n"))
+
+
+def test_a_file_that_many_gltf_buffers_name_is_read_once(tmp_path: Path) -> None:
+    size, count = 60 * 2**20, 12
+    with (tmp_path / "zeros.bin").open("wb") as file:
+        file.truncate(size)
+    root = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": name, "byteLength": size} for name in ["zeros.bin", "./zeros.bin"] * (count // 2)],
+        "bufferViews": [{"buffer": i, "byteLength": 36} for i in range(count)],
+        "accessors": [{"bufferView": i, "componentType": 5126, "type": "VEC3", "count": 3} for i in range(count)],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": i}} for i in range(count)]}],
+    }
+    cost = check_budget(load_mesh, written(tmp_path / "mesh.gltf", json.dumps(root)))
+    assert cost.refused == ""
+    assert cost.megabytes < 1.5 * 60
+
+
+def test_shapes_that_a_gltf_makes_of_nothing_stay_within_the_memory(tmp_path: Path) -> None:
+    root = {
+        "asset": {"version": "2.0"},
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 60_000}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 0}] * 80}]}],
+    }
+    check_budget(load_mesh, written(tmp_path / "rig.gltf", json.dumps(root)))
+
+
+def test_lists_without_end_in_landmarks_are_refused(tmp_path: Path) -> None:
+    check_budget(load_landmark_points, written(tmp_path / "odd.ljson", '{"a":[' + "[]," * 4_000_000 + "1]}"))
