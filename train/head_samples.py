@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +12,12 @@ from torch import Tensor
 
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
+from torchface.files.content_keys import content_key
 from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
 from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io.meshes.named_files import named_files
 from torchface.modeling import color_casts, texture_areas, without_cast
 from torchface.progress import Progress
 from torchface.registration import find_scans
@@ -23,6 +25,7 @@ from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 
+_METHOD = "gathered heads/2"
 _CAST_VERTICES = 4000
 _CAST_SAMPLES = 6_000_000
 
@@ -61,7 +64,7 @@ def performers(count: int, seed: int) -> Source:
         mesh = neutral_head(identities[number], texture=False)
         return replace(mesh, colors=complexion_colors(complexions[number : number + 1])[0])
 
-    return Source([f"performer {i}" for i in range(count)], read, f"performers {count} {seed}")
+    return Source([f"performer {i}" for i in range(count)], read, content_key(_METHOD, performers=count, seed=seed))
 
 
 def registered(folder: Path) -> Source:
@@ -69,8 +72,8 @@ def registered(folder: Path) -> Source:
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one of registered meshes")
     paths = find_scans([folder])
-    stamps = [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
-    key = hashlib.sha256("\n".join(stamps).encode()).hexdigest()
+    files = {file.name: file for path in paths for file in (path, *named_files(path))}
+    key = content_key(_METHOD, names=[path.name for path in paths], files=files)
     return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number])), key)
 
 
@@ -92,8 +95,7 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
     colored, size = first.colors is not None, len(template.vertices)
     files = (work / "shapes.safetensors", work / "colors.safetensors")
     count = len(source.names)
-    known = [MeshSequence(path) if path.is_file() else None for path in files]
-    shape, color = (one if one is not None and one.key == source.key and len(one) == count else None for one in known)
+    shape, color = (_kept(path, source.key, count) for path in files)
     if shape is not None and (color is not None or not colored):
         return Gathered(template, shape, color, held_out)
     shapes, colors = (MeshSequenceWriter(path, count, size, template.faces, key=source.key) for path in files)
@@ -114,6 +116,23 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
                 colors.append(mesh.colors)
             progress("reading heads", number + 1, count)
     return Gathered(template, MeshSequence(files[0]), MeshSequence(files[1]) if colored else None, held_out)
+
+
+def _kept(path: Path, key: str, count: int) -> MeshSequence | None:
+    """What an earlier run has gathered of the same meshes; None where it has not, or it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        found = MeshSequence(path)
+        if found.key != key or len(found) != count:
+            return None
+        fault = "" if found.is_whole() else f"{path}: found other meshes than were written"
+    except FileFormatError as error:
+        fault = str(error)
+    if fault:
+        warnings.warn(f"{fault}; they are gathered anew", stacklevel=3)
+        return None
+    return found
 
 
 def upright(mesh: Mesh) -> Mesh:

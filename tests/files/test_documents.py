@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from torchface.errors import FileFormatError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
 from torchface.files.documents import Value, read_json, read_toml, write_json, write_toml
 
 TEXT = """
@@ -109,14 +110,17 @@ def test_what_is_written_is_whole_and_read_by_any_program(tmp_path: Path) -> Non
 
 
 def test_a_checkpoint_belongs_to_one_thing(tmp_path: Path) -> None:
-    path, key = tmp_path / "c.safetensors", {"format": "test/1", "key": "a"}
+    path, key = tmp_path / "c.safetensors", content_key("test/1", of="a")
     assert read_checkpoint(path, key) is None
     write_checkpoint(path, {"x": torch.arange(6.0).view(2, 3).T}, key)
     found = read_checkpoint(path, key)
     assert found is not None
     assert found["x"].equal(torch.arange(6.0).view(2, 3).T)
-    assert read_checkpoint(path, {**key, "key": "b"}) is None
-    path.write_bytes(path.read_bytes()[:-1])
-    assert read_checkpoint(path, key) is None
+    assert read_checkpoint(path, content_key("test/1", of="b")) is None
+    whole = path.read_bytes()
+    for damaged in (b"", whole[:-1], whole[:-8] + bytes(8), whole[:40] + b"\xff" + whole[41:]):
+        path.write_bytes(damaged)
+        with pytest.warns(UserWarning, match=r"c\.safetensors: found a damaged checkpoint"):
+            assert read_checkpoint(path, key) is None
     save_file({"x": torch.zeros(1)}, path)
     assert read_checkpoint(path, key) is None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from forked_runs import held, killed
 from scipy.spatial.transform import Rotation
 
 from torchface import Mesh, load_mesh, save_mesh, zoo
@@ -23,6 +24,7 @@ from torchface.workflows.fit.fit_model import load_head_model, matching
 from train import morphable as recipe
 from train.head_samples import registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train
+from train.runner import run
 
 
 def people(count: int) -> list[Mesh]:
@@ -110,6 +112,10 @@ def test_the_folder_holds_model_card_and_pictures(trained: tuple[Trained, Path])
 def test_performers_in_half_precision_are_learned_the_same_each_time(tmp_path: Path, without_pictures: None) -> None:
     settings = Settings(performers=6, held_out=2, components=4, half=True, out=tmp_path / "one")
     train(settings)
+    other = replace(settings, seed=8, out=tmp_path / "two")
+    for step, done in (("reading heads", 4), ("fitting principal components", 2)):  # of another seed, into the folder
+        killed(lambda progress: train(other, progress), step, done)
+    assert list((tmp_path / ".two.training").rglob("*.safetensors*"))
     again = train(replace(settings, out=tmp_path / "two"))
     assert zoo.describe(tmp_path / "one").sha256 == zoo.describe(tmp_path / "two").sha256
     loaded, a = zoo.get_model(tmp_path / "two"), torch.full((1, 4), 2.0)
@@ -147,6 +153,14 @@ def test_a_killed_run_goes_on_where_it_was(
     again = train(settings)
     assert read[11:] == [0]
     assert torch.equal(again.model.shape.components, trained[0].model.shape.components)
+
+
+def test_another_run_into_the_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "people"
+    monkeypatch.setattr("sys.argv", ["train.morphable", "--performers", "6", "--out", str(out)])
+    with held(out) as process, pytest.raises(SystemExit, match=rf"another run writing into .* \(process {process} on "):
+        run(Settings, train, None, lambda settings, trained: ())
+    assert not (tmp_path / ".people.training").exists()
 
 
 def test_meshes_that_teach_nothing_are_named(heads: list[Mesh], tmp_path: Path, without_pictures: None) -> None:

@@ -106,6 +106,13 @@ def test_folders_and_counts_that_do_not_fit_are_refused(
     other = write_video(film.frames[:5], tmp_path / "other.avi", 30.0).path
     with pytest.raises(FileFormatError, match=r"proposals for 'actor\.avi'"):
         prepare_annotation(other, tmp_path, tracker, 3)
+    (tmp_path / "alike").mkdir()
+    alike = write_video(film.frames.flip(0), tmp_path / "alike" / "actor.avi", 30.0).path
+    with pytest.raises(FileFormatError, match=r"frames of \d+ x \d+ of other content\)"):
+        prepare_annotation(alike, tmp_path, tracker, 3)
+    assert tracker.asked == 1
+    prepare_annotation(video, tmp_path, tracker, 3, key="another model")
+    assert tracker.asked == 2
     with pytest.raises(ValueRangeError, match="count: found 0"):
         prepare_annotation(video, tmp_path / "new", tracker, 0)
     with pytest.raises(ValueRangeError, match="a face in none"):

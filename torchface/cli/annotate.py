@@ -42,6 +42,8 @@ def annotate(
         port: The first port to try.
         quiet: Show no progress.
     """
+    from torchface import zoo
+    from torchface.files.content_keys import content_key
     from torchface.files.job_lock import job_lock
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
 
@@ -53,7 +55,6 @@ def annotate(
         with progress_bars(quiet) as progress:
 
             def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
-                from torchface import zoo
                 from torchface.errors import NameMismatchError
                 from torchface.landmarks import LandmarkTrees
                 from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
@@ -67,7 +68,8 @@ def annotate(
                 return found.values, found.confidence
 
             progress("reading")
-            annotation = prepare_annotation(video, out, track, count)
+            key = content_key("annotate", landmarks=zoo.find(landmarks), face=face)
+            annotation = prepare_annotation(video, out, track, count, key)
         if not browser:
             for path in write_proposals(annotation):
                 print(path)

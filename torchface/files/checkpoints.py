@@ -1,7 +1,8 @@
-"""What unfinished work has done so far, on disk: tensors in one safetensors file that names what they belong to."""
+"""What unfinished work has done so far, on disk: tensors in one safetensors file that names what they were made of."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,30 +11,58 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.files.content_keys import content_key
 from torchface.files.whole_files import read_file, write_file
 
+_FORMAT = "torchface.checkpoint/1"
 
-def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], belongs_to: Mapping[str, str]) -> None:
-    """Writes tensors and what they belong to; the file appears only when it is complete.
+
+def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], key: str) -> None:
+    """Writes tensors, what they were made of, and a hash of their numbers; the file appears only when it is complete.
 
     Args:
         path: of the file; its folder must be there.
         tensors: by name.
-        belongs_to: whatever the tensors depend on, as texts.
+        key: of what the tensors were made of, see :func:`~torchface.files.content_keys.content_key`.
 
     Raises:
         FileFormatError: the file cannot be written.
     """
     packed = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_file(path, save(packed, dict(belongs_to)))
+    write_file(path, save(packed, {"format": _FORMAT, "key": key, "content": _content(packed)}))
 
 
-def read_checkpoint(path: Path, belongs_to: Mapping[str, str]) -> dict[str, Tensor] | None:
-    """The tensors of a checkpoint; None where there is none, it is damaged or belongs to something else."""
+def read_checkpoint(path: Path, key: str) -> dict[str, Tensor] | None:
+    """The tensors of a checkpoint; None where there is none, or it was made of something else.
+
+    One that is damaged, be it a single number, is named in a warning and taken for none: its part is computed again.
+    """
+    if not path.is_file():
+        return None
     try:
         with safe_open(path, framework="pt") as file:
-            if file.metadata() != dict(belongs_to):
-                return None
-        return load(read_file(path))
-    except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, FileFormatError):
-        return None  # what is damaged is computed again
+            told = file.metadata() or {}
+        if (told.get("format"), told.get("key")) != (_FORMAT, key):
+            return None
+        found = load(read_file(path))
+        if _content(found) == told.get("content"):
+            return found
+        fault = "its numbers are not those that were written"
+    except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, FileFormatError) as error:
+        fault = str(error)
+    warnings.warn(f"{path}: found a damaged checkpoint ({fault}); what it held is computed again", stacklevel=2)
+    return None
+
+
+def checkpoint_key(path: Path) -> str | None:
+    """The key that a checkpoint was written with; None where there is none, or it cannot be read."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            told = file.metadata() or {}
+        return told.get("key")
+    except (SafetensorError, OSError, ValueError):
+        return None
+
+
+def _content(tensors: Mapping[str, Tensor]) -> str:
+    return content_key(_FORMAT, tensors={name: tensors[name] for name in sorted(tensors)})

@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.content_keys import content_key, file_digest
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import make_folder
 from torchface.io.landmarks.landmark_points import load_landmark_points
@@ -18,7 +19,8 @@ from torchface.landmarks.images.annotated_frames import AnnotatedFrame, save_ann
 from torchface.landmarks.images.frame_choice import choose_frames
 
 PROPOSALS = "proposals.json"
-_FORMAT = "torchface proposals"
+_FORMAT = "torchface proposals 2"
+_METHOD = "annotation proposals/2"
 _MAX_BYTES = 16 * 2**20
 _MAX_FRAMES = 1000
 Tracker = Callable[[VideoFile], tuple[Tensor, Tensor | None]]
@@ -40,10 +42,10 @@ class Annotation:
     folder: Path
 
 
-def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 15) -> Annotation:
+def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 15, key: str = "") -> Annotation:
     """Tracks a video, unless that is done already, and gives the frames to annotate.
 
-    Proposals are kept in the folder's ``proposals.json``; with the same video and count nothing is tracked anew.
+    Proposals are kept in the folder's ``proposals.json``; with the same video, count and key nothing is tracked anew.
     More frames asked for later hold the earlier ones.
 
     Args:
@@ -51,6 +53,7 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
         folder: made if missing.
         track: finds the landmarks; called only where it must be.
         count: how many frames.
+        key: of what the tracker's landmarks depend on beside the video.
 
     Raises:
         FileFormatError: the video cannot be decoded, or the folder holds proposals for another one.
@@ -59,11 +62,12 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
     if not 1 <= count <= _MAX_FRAMES:
         raise ValueRangeError(f"count: found {count}, expected 1 to {_MAX_FRAMES}")
     opened = open_video(video)
+    made_from = content_key(_METHOD, video=opened.path, tracker=key)
     proposed = _read(folder / PROPOSALS, opened)
-    if proposed is None or proposed.asked < count:
+    if proposed is None or proposed.asked < count or proposed.key != made_from:
         landmarks, confidence = track(opened)
         chosen = choose_frames(landmarks, count, confidence)
-        proposed = _Proposals(count, {int(i): landmarks[i].double() for i in chosen})
+        proposed = _Proposals(count, {int(i): landmarks[i].double() for i in chosen}, made_from)
         _write(folder, opened, proposed)
     wanted = list(proposed.landmarks)[:count]
     wanted += [i for i in proposed.landmarks if i not in wanted and _points(folder, opened, i).is_file()]
@@ -96,10 +100,12 @@ def write_proposals(annotation: Annotation) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class _Proposals:
-    """How many frames were asked for, and landmarks (68,2) by frame number in the order of choice."""
+    """How many frames were asked for, landmarks (68,2) by frame number in the order of choice, and what they were made
+    from."""
 
     asked: int
     landmarks: dict[int, Tensor]
+    key: str
 
 
 def _name(video: VideoFile, number: int) -> str:
@@ -125,7 +131,13 @@ def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
 
 
 def _identity(video: VideoFile) -> dict[str, Any]:
-    return {"video": video.path.name, "frames": video.count, "width": video.width, "height": video.height}
+    return {
+        "video": video.path.name,
+        "frames": video.count,
+        "width": video.width,
+        "height": video.height,
+        "sha256": file_digest(video.path),
+    }
 
 
 def _write(folder: Path, video: VideoFile, proposals: _Proposals) -> None:
@@ -133,6 +145,7 @@ def _write(folder: Path, video: VideoFile, proposals: _Proposals) -> None:
         "format": _FORMAT,
         **_identity(video),
         "asked": proposals.asked,
+        "key": proposals.key,
         "proposals": [
             {"frame": number, "landmarks": [[round(x, 3) for x in row] for row in points.tolist()]}
             for number, points in proposals.landmarks.items()
@@ -145,15 +158,17 @@ def _read(path: Path, video: VideoFile) -> _Proposals | None:
     if not path.exists():
         return None
     document = read_json(path, _FORMAT, _MAX_BYTES)
-    found = {key: document[key].found for key in _identity(video)}
-    if found != _identity(video):
+    expected = _identity(video)
+    found = {key: document[key].found for key in expected}
+    if found != expected:
+        content = " of other content" if found["sha256"] != expected["sha256"] else ""
         raise FileFormatError(
             f"{path}: found proposals for {found['video']!r} ({found['frames']} frames of {found['width']} x "
-            f"{found['height']}), expected {video.path.name!r} ({video.count} of {video.width} x {video.height}): name "
-            "another folder, or remove this file"
+            f"{found['height']}{content}), expected {video.path.name!r} ({video.count} of {video.width} x "
+            f"{video.height}): name another folder, or remove this file"
         )
     landmarks = {
         row["frame"].whole(0, video.count - 1): row["landmarks"].tensor(68, 2, expected="68 finite points")
         for row in document["proposals"].rows(1, _MAX_FRAMES)
     }
-    return _Proposals(document["asked"].whole(), landmarks)
+    return _Proposals(document["asked"].whole(), landmarks, document["key"].text())

@@ -53,6 +53,21 @@ def test_a_killed_writer_continues_where_it_was(tmp_path: Path) -> None:
     assert MeshSequenceWriter(path, 7, 4, FACES, key="b").done == 0  # made of something else
 
 
+def test_meshes_that_are_not_as_they_were_written_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "heads.safetensors"
+    part = tmp_path / "heads.safetensors.part"
+    MeshSequenceWriter(path, 7, 4, FACES, key="a").append(MESHES[:3])
+    data = part.read_bytes()
+    part.write_bytes(data[:-16] + bytes(16))
+    with pytest.warns(UserWarning, match=r"heads\.safetensors\.part: found other meshes"):
+        MeshSequenceWriter(path, 7, 4, FACES, key="a")
+    assert MeshSequence(written(path)).is_whole()
+    path.write_bytes(path.read_bytes()[:-16] + bytes(16))
+    assert not MeshSequence(path).is_whole()
+    save_file({"vertices": MESHES, "faces": FACES}, path)
+    assert MeshSequence(path).is_whole()  # another program's
+
+
 def test_other_meshes_are_refused(tmp_path: Path) -> None:
     with MeshSequenceWriter(tmp_path / "heads.safetensors", 2, 4, FACES) as writer:
         with pytest.raises(TopologyError, match=r"found \(5, 3\), expected \(4, 3\)"):

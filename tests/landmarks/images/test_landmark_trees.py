@@ -187,9 +187,14 @@ def test_a_killed_training_goes_on_to_the_same_result(learned: LandmarkTrees, tm
         assert torch.equal(value, again.state_dict()[name]), name
     with pytest.raises(FileFormatError, match="other images or settings"):
         LandmarkTrees.fit(*blobs(60, 5), FEW, checkpoint=path)
-    path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(FileFormatError, match=r"trees\.safetensors"):
-        LandmarkTrees.fit(*data, FEW, checkpoint=path)
+    path.write_bytes(path.read_bytes()[:-64] + bytes(64))
+
+    def kill_at_once(step: str, done: int = 0, total: int = 0) -> None:
+        assert done == 1  # it begins anew
+        raise KilledError
+
+    with pytest.warns(UserWarning, match=r"trees\.safetensors: found a damaged"), pytest.raises(KilledError):
+        LandmarkTrees.fit(*data, FEW, kill_at_once, checkpoint=path)
 
 
 def test_mirrored_pictures_teach_the_other_side() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from forked_runs import killed
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.modeling import MorphableModel
@@ -70,6 +71,27 @@ def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypat
     other = fit_sequence(InMemory(2 * values), 10, tmp_path / "check")
     assert torch.allclose(other.mean, 2 * ours.mean)
     assert torch.allclose(other.standard_deviations, 2 * ours.standard_deviations, rtol=1e-5)
+
+
+def test_a_killed_fit_gives_the_same_and_never_takes_the_rows_of_others(
+    values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
+    killed(lambda progress: fit_sequence(InMemory(values), 10, tmp_path, progress), "fitting principal components", 20)
+    left = sorted(tmp_path.glob("gram_*.safetensors"))
+    assert len(left) == 4
+    data = left[2].read_bytes()
+    left[2].write_bytes(data[:-100] + bytes(100))  # finite numbers, of the right size
+    again, whole = InMemory(values), InMemory(values)
+    with pytest.warns(UserWarning, match=r"gram_00002\.safetensors: found a damaged checkpoint"):
+        ours = fit_sequence(again, 10, tmp_path)
+    theirs = fit_sequence(whole, 10)
+    assert again.read_count < whole.read_count
+    assert all(torch.equal(a, b) for a, b in zip(ours.state_dict().values(), theirs.state_dict().values(), strict=True))
+    killed(lambda progress: fit_sequence(InMemory(values), 10, tmp_path, progress), "fitting principal components", 20)
+    turned = values.flip(0)  # the same mean, another order
+    ours, theirs = fit_sequence(InMemory(turned), 10, tmp_path), fit_sequence(InMemory(turned), 10)
+    assert torch.equal(ours.components, theirs.components)
 
 
 @pytest.mark.parametrize("lanczos", [False, True])

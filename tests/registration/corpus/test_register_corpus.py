@@ -11,19 +11,23 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from torchface.errors import FileFormatError, MissingExtraError, ShapeError, TopologyError, ValueRangeError
+from torchface.files import content_keys
 from torchface.io import load_mesh, save_mesh
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
 from torchface.registration import Level, Schedule, Stage, register
-from torchface.registration.corpus.register_corpus import CorpusReport, find_scans, register_corpus
+from torchface.registration.corpus.register_corpus import CorpusReport, corpus_tasks, find_scans, register_corpus
+from torchface.registration.corpus.scan_job import CorpusJob
 from torchface.registration.corpus.scan_record import CorpusEntry
 from torchface.registration.landmark_files import load_scan_landmarks
+from torchface.registration.model_fit import LinearShape
 
 SHORT = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
 COUNT = 5
@@ -103,9 +107,15 @@ def test_only_what_has_changed_is_registered_again(
     assert all(entry.reused for entry in again.entries)
     assert told == [(3, 3)]
     assert [e.median_distance for e in again.registered] == [e.median_distance for e in first.registered]
-    (out / "s0.glb").write_bytes((out / "s0.glb").read_bytes()[:-5])  # somebody has damaged a result
-    os.utime(own / "s1.ljson", (1, 1))
-    after = run(template, own, out)
+    size = (out / "s0.glb").stat().st_size
+    (out / "s0.glb").write_bytes(bytes(size))  # what a disk may leave of a result when the power fails
+    state = (own / "s1.ljson").stat()
+    text = (own / "s1.ljson").read_text()
+    digit = text.rindex(".") + 5
+    (own / "s1.ljson").write_text(text[:digit] + ("1" if text[digit] == "0" else "0") + text[digit + 1 :])
+    os.utime(own / "s1.ljson", ns=(state.st_atime_ns, state.st_mtime_ns))  # neither size nor date tell
+    with pytest.warns(UserWarning, match=r"s0\.glb: found other content than was written"):
+        after = run(template, own, out)
     assert {entry.name: entry.reused for entry in after.entries} == {"bad": True, "s0": False, "s1": False}
     (out / "s0.json").write_text("{")
     shutil.copy(own / "s1.ply", own / "bad.ply")
@@ -245,6 +255,57 @@ def test_mistakes_are_told_before_anything_is_done(
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"-m pip install 'ray>=2.40'"):
         register_corpus(template, [scans], tmp_path / "out", cluster="auto")
+
+
+def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes, count = template.annotations, len(template.vertices)
+    assert notes is not None
+    scan, marks = tmp_path / "scans" / "a.obj", tmp_path / "marks"
+    for folder in (scan.parent, marks, tmp_path / "detector"):
+        folder.mkdir()
+    files = {
+        scan: "mtllib other.mtl\nv 0 0 0\n",
+        scan.parent / "other.mtl": "newmtl skin\nmap_Kd -clamp on skin.png\n",
+        scan.parent / "skin.png": "pixels",
+        scan.parent / "a.png": "beside",
+        marks / "a.ljson": "{}",
+        tmp_path / "detector" / "model.toml": "kind",
+    }
+    for path, text in files.items():
+        path.write_text(text)
+    job = CorpusJob(template, tmp_path, SHORT, 0, detector=tmp_path / "detector")
+
+    def key(job: CorpusJob, given: Path | None = marks) -> str:
+        return corpus_tasks(job, [scan], given)[0].key
+
+    shape = LinearShape(template.vertices, torch.zeros(1, count, 3))
+    jobs = [
+        job,
+        replace(job, template=template.with_vertices(template.vertices + 1e-4)),
+        replace(job, template=replace(template, annotations=replace(notes, contacts=torch.tensor([[0, 5]])))),
+        replace(job, template=replace(template, annotations=replace(notes, mirror=torch.arange(count)))),
+        replace(job, template=replace(template, annotations=replace(notes, regions={"a": torch.ones(count) > 0}))),
+        replace(job, template=replace(template, annotations=replace(notes, landmarks=template.landmarks.flip(0)))),
+        replace(job, schedule=replace(SHORT, nodes=31)),
+        replace(job, texture_size=64),
+        replace(job, unit="cm"),
+        replace(job, detector=None),
+        replace(job, model=shape),
+        replace(job, model=replace(shape, modes=shape.modes + 1)),
+    ]
+    keys = [key(job) for job in jobs]
+    keys.append(key(job, None))
+    for path, text in files.items():  # none of another size or date
+        state = path.stat()
+        path.write_text(text[:-2] + "?\n" if text.endswith("\n") else text[:-1] + "?")
+        os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+        keys.append(key(job))
+        path.write_text(text)
+        os.utime(path, (5, 5))
+        assert key(job) == keys[0]
+    monkeypatch.setattr(content_keys, "__version__", "0.0.0")
+    keys.append(key(job))
+    assert len(set(keys)) == len(keys)
 
 
 def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: CorpusReport) -> None:

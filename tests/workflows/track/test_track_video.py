@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from forked_runs import held
+from safetensors.torch import load_file
 
 from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
 from torchface.capture.priors import ShapePrior
@@ -206,6 +208,42 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
+def test_damaged_files_are_told_and_made_anew(
+    done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workflow, "PIECE", PIECE)
+    out = tmp_path / "out"
+    shutil.copytree(done.out, out)
+    names = {path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file()}
+    pieces = sorted((out / FOLDER).glob("landmarks_*"))
+    pieces[1].write_bytes(b"")
+    (out / "overlay.mp4").write_bytes((out / "overlay.mp4").read_bytes()[:1000])
+    for name in ("weights.csv", "animation.glb", "summary.json"):
+        (out / name).write_bytes(b"")
+    left = out / FOLDER / f".{pieces[1].name}.999999.part"
+    left.write_bytes(b"of a run that was killed")
+    with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written") as told:
+        again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
+    assert f"{pieces[1].name}: found a damaged checkpoint" in " ".join(str(one.message) for one in told)
+    assert again.reused == PIECE
+    assert {"landmarks", "overlay"} <= set(again.seconds)
+    assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == names
+    for name in names - {Path("summary.json"), Path(FOLDER) / "track.json"}:  # these hold times and hashes of files
+        if name.suffix == ".safetensors":  # whose header names things in any order
+            ours, theirs = load_file(out / name), load_file(done.out / name)
+            assert all(torch.equal(values, theirs[part]) for part, values in ours.items())
+        else:
+            assert (out / name).read_bytes() == (done.out / name).read_bytes(), name
+
+
+def test_another_run_into_the_folder_is_refused(done: Done, filmed: Filmed, tmp_path: Path) -> None:
+    with (
+        held(tmp_path / "out") as process,
+        pytest.raises(ValueRangeError, match=rf"another run writing into .*out \(process {process} on "),
+    ):
+        track_video(filmed.video, filmed.rig, tmp_path / "out", QUICK)
+
+
 def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:
     piece = TrackedFrames(torch.rand(4, 68, 2), torch.rand(4, 68), torch.rand(4, 4))
     state = TrackState(tmp_path, "a")
@@ -213,8 +251,9 @@ def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -
         state.append(piece)
     assert TrackState(tmp_path, "a").done == 12
     files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
-    files[1].write_bytes(files[1].read_bytes()[:-7])
-    assert TrackState(tmp_path, "a").done == 4
+    files[1].write_bytes(files[1].read_bytes()[:-1000] + bytes(1000))
+    with pytest.warns(UserWarning, match=r"landmarks_000001\.safetensors: found a damaged checkpoint"):
+        assert TrackState(tmp_path, "a").done == 4
     assert [path.exists() for path in files] == [True, False, False]
     assert TrackState(tmp_path, "b").done == 0
     product = tmp_path / "x.csv"
@@ -222,6 +261,10 @@ def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -
     state.made(product, "k")
     assert state.is_current(product, "k")
     assert not state.is_current(product, "l")
+    product.write_text("y")
+    with pytest.warns(UserWarning, match=r"x\.csv: found other content than was written"):
+        assert not state.is_current(product, "k")
+    product.write_text("x")
     (tmp_path / FOLDER / "track.json").write_text("[[[")
     assert not state.is_current(product, "k")
 

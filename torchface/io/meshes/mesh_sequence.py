@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
+import warnings
 from pathlib import Path
 from types import TracebackType
+from typing import BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -21,6 +24,8 @@ from torchface.files.write_errors import unwritten
 FORMAT = "torchface.mesh-sequence/1"
 _MAX_COUNT = 2**31
 _NOTE_SECONDS = 1.0
+_BLOCK = 2**22
+_UNKNOWN = "0" * 64  # in place of the numbers' hash, until all are written
 
 
 class MeshSequence:
@@ -40,7 +45,9 @@ class MeshSequence:
         try:
             with safe_open(self.path, framework="pt") as file:
                 names = set(file.keys())
-                self.key: str = (file.metadata() or {}).get("key", "")
+                told = file.metadata() or {}
+                self.key: str = told.get("key", "")
+                self._content: str | None = told.get("content")
                 if not {"vertices", "faces"} <= names:
                     raise FileFormatError(f"{self.path}: found {sorted(names)[:5]}, expected vertices and faces")
                 vertices, faces = file.get_slice("vertices"), file.get_slice("faces")
@@ -77,13 +84,29 @@ class MeshSequence:
             raise FileFormatError(f"{self.path}: found meshes of {tuple(part.shape[1:])}, expected {self.shape[1:]}")
         return part
 
+    def is_whole(self) -> bool:
+        """Whether the vertices are those that were written; a file that holds no hash of them is believed.
+
+        Raises:
+            FileFormatError: the file cannot be read.
+        """
+        if self._content is None:
+            return True
+        try:
+            with self.path.open("rb") as file:
+                size = 4 * int(np.prod(self.shape, dtype=np.int64))
+                file.seek(-size, os.SEEK_END)
+                return _hashed(file, size).hexdigest() == self._content
+        except OSError as error:
+            raise FileFormatError(f"{self.path}: cannot be read ({error})") from error
+
 
 class MeshSequenceWriter:
     """Writes a mesh sequence mesh by mesh; the file appears when it is complete, and a killed run continues.
 
-    What is unfinished lies beside as ``NAME.part`` with the count of its meshes in ``NAME.part.json``. A writer
-    with the same sizes and ``key`` goes on behind them: ``done`` says where. A process that is killed loses a second's
-    meshes at most.
+    What is unfinished lies beside as ``NAME.part``, with the count and the hash of its meshes in ``NAME.part.json``. A
+    writer with the same sizes and ``key`` goes on behind them if they are as they were written: ``done`` says where. A
+    process that is killed loses a second's meshes at most.
 
     Args:
         path: of the file; its folder must be there.
@@ -109,7 +132,7 @@ class MeshSequenceWriter:
         size = 4 * count * vertices * channels
         header = json.dumps(
             {
-                "__metadata__": {"format": FORMAT, "key": key},
+                "__metadata__": {"format": FORMAT, "key": key, "content": _UNKNOWN},
                 "faces": {"dtype": "I64", "shape": list(faces.shape), "data_offsets": [0, len(numbers)]},
                 "vertices": {
                     "dtype": "F32",
@@ -119,7 +142,9 @@ class MeshSequenceWriter:
             }
         ).encode()
         header += b" " * (-len(header) % 8)
+        self._content_at = 8 + header.rindex(_UNKNOWN.encode())
         self._begin = len(header).to_bytes(8, "little") + header + numbers
+        self._hash = hashlib.sha256()
         self.done = self._finished()
         try:
             if self.done == 0:
@@ -148,10 +173,12 @@ class MeshSequenceWriter:
         if self.done + len(several) > self.count:
             raise ShapeError(f"mesh sequence: found more than the {self.count} meshes announced")
         try:
-            self._file.write(several.detach().cpu().contiguous().numpy().astype("<f4", copy=False).tobytes())
+            data = several.detach().cpu().contiguous().numpy().astype("<f4", copy=False).tobytes()
+            self._file.write(data)
             self._file.flush()
         except OSError as error:
             raise unwritten(self.path, error) from error
+        self._hash.update(data)
         self.done += len(several)
         if time.monotonic() - self._noted > _NOTE_SECONDS:  # a disk takes longer to be sure than a mesh takes
             self._note_done()
@@ -163,6 +190,11 @@ class MeshSequenceWriter:
         try:
             with self._file:
                 self._note_done()
+                if self.done == self.count:
+                    self._file.seek(self._content_at)
+                    self._file.write(self._hash.hexdigest().encode())
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
             if self.done == self.count:
                 os.replace(self._part, self.path)
                 sync_folder(self.path.parent)
@@ -174,7 +206,7 @@ class MeshSequenceWriter:
         """Notes what is there for another run, once it is on the disk."""
         self._file.flush()
         os.fsync(self._file.fileno())
-        write_json(self._note, {"done": self.done}, indent=None)
+        write_json(self._note, {"done": self.done, "sha256": self._hash.hexdigest()}, indent=None)
         self._noted = time.monotonic()
 
     def __enter__(self) -> MeshSequenceWriter:
@@ -189,14 +221,30 @@ class MeshSequenceWriter:
         return len(self._begin) + 4 * meshes * int(np.prod(self.mesh_shape))
 
     def _finished(self) -> int:
-        """How many meshes an earlier run of the same kind has written."""
+        """How many meshes an earlier run of the same kind has written; those whose bytes have changed since are
+        named in a warning and begun anew."""
         if not (self._part.is_file() and self._note.is_file()):
             return 0
         try:
-            done = read_json(self._note)["done"].whole(0, self.count)
+            note = read_json(self._note)
+            done = note["done"].whole(0, self.count)
             with self._part.open("rb") as file:
-                same = file.read(len(self._begin)) == self._begin
-            whole = self._part.stat().st_size >= self._offset(done)
-        except (OSError, FileFormatError):
-            return 0  # a damaged note is as good as none
-        return done if same and whole else 0
+                if file.read(len(self._begin)) != self._begin:
+                    return 0
+                found = _hashed(file, self._offset(done) - len(self._begin))
+            if found.hexdigest() != note["sha256"].found:
+                raise FileFormatError(f"{self._part}: found other meshes than were written")
+        except (OSError, FileFormatError) as error:
+            warnings.warn(f"{error}; the meshes of {self.path.name} are written anew", stacklevel=4)
+            return 0
+        self._hash = found
+        return done
+
+
+def _hashed(file: BinaryIO, size: int) -> hashlib._Hash:
+    """The hash of the next bytes of a file, of fewer where it ends."""
+    digest = hashlib.sha256()
+    while size > 0 and (block := file.read(min(size, _BLOCK))):
+        digest.update(block)
+        size -= len(block)
+    return digest

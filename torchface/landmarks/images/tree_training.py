@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,12 +10,13 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.files.states import pack_state, read_state
-from torchface.files.whole_files import write_file
+from torchface.files.checkpoints import checkpoint_key, read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees, initial_shapes, similarity_to
 from torchface.progress import Progress, silent
 
+_METHOD = "landmark trees/2"
 _ROWS = 4096  # samples whose pixels are read at once
 _MAX_PIXELS = 2**33
 
@@ -110,12 +110,13 @@ def fit_trees(
         progress: called with each step and how far it is.
         mirror: which landmark each becomes in a mirrored image; iBUG's where there are 68, else nothing is mirrored.
         checkpoint: a file that is written after every cascade; where it is there, from the same images and settings,
-            learning goes on from it, to the same result. It may be deleted afterwards.
+            learning goes on from it, to the same result; a damaged one is named in a warning, and learning begins anew.
+            It may be deleted afterwards.
 
     Raises:
         ShapeError: numbers of images, boxes and landmarks differ, or an image is no uint8 (H,W).
         ValueRangeError: a box is NaN or empty, a landmark is never seen, or a setting is out of range.
-        FileFormatError: the checkpoint is of other images or settings, or damaged.
+        FileFormatError: the checkpoint is of other images or settings.
     """
     settings = settings or TreeSettings()
     boxes, landmarks = boxes.float(), landmarks.float()
@@ -128,14 +129,17 @@ def fit_trees(
     generator = torch.Generator().manual_seed(settings.seed)
     samples, initial, mean = _draw_initial_shapes(images, boxes, landmarks, settings, mirror, generator)
     model.mean.copy_(mean)
-    signature = _signature(images, boxes, landmarks, settings, mirror)
-    done, shapes = _resume(checkpoint, signature, model, initial) if checkpoint is not None else (0, initial)
+    key, done, shapes = "", 0, initial
+    if checkpoint is not None:
+        key = content_key(_METHOD, images=images, boxes=boxes, landmarks=landmarks, settings=settings, mirror=mirror)
+        done, shapes = _resume(checkpoint, key, model, initial)
     for cascade in range(done, settings.cascades):
         # A generator a cascade, so that what goes on from a checkpoint draws what it would have drawn.
         drawn = torch.Generator().manual_seed(1_000_003 * settings.seed + cascade + 1)
         shapes = _grow_cascade(model, cascade, samples, shapes, settings, drawn, progress or silent)
         if checkpoint is not None:
-            _save(checkpoint, signature, model, shapes, cascade + 1)
+            state = {**model.state_dict(), "shapes": shapes, "done": torch.tensor([cascade + 1])}
+            write_checkpoint(checkpoint, state, key)
     return model.eval()
 
 
@@ -334,31 +338,16 @@ def best_test(right: Tensor, wanted: Tensor) -> Tensor:
     return gain.argmax()
 
 
-def _signature(
-    images: Sequence[Tensor], boxes: Tensor, landmarks: Tensor, settings: TreeSettings, mirror: Sequence[int] | None
-) -> Tensor:
-    """What a checkpoint has to have been made from, (32,) uint8."""
-    digest = hashlib.sha256(repr((settings, mirror, tuple(landmarks.shape))).encode())
-    for tensor in (boxes, landmarks, *images):
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return torch.tensor(list(digest.digest()), dtype=torch.uint8)
-
-
-def _save(path: Path, signature: Tensor, model: LandmarkTrees, shapes: Tensor, done: int) -> None:
-    state = {**model.state_dict(), "shapes": shapes, "signature": signature, "done": torch.tensor([done])}
-    write_file(path, pack_state(state))
-
-
-def _resume(path: Path, signature: Tensor, model: LandmarkTrees, shapes: Tensor) -> tuple[int, Tensor]:
+def _resume(path: Path, key: str, model: LandmarkTrees, shapes: Tensor) -> tuple[int, Tensor]:
     """How many cascades a checkpoint holds, and the shapes after them; it is read into the model."""
-    if not path.is_file():
-        return 0, shapes
-    expected = {**model.state_dict(), "shapes": shapes, "signature": signature, "done": torch.zeros(1).long()}
-    state, _ = read_state(path, expected, path.stat().st_size)
-    if not torch.equal(state.pop("signature"), signature) or not 0 < int(state["done"]) <= model.sizes["cascades"]:
+    if checkpoint_key(path) not in (None, key):
         raise FileFormatError(
-            f"{path}: found a checkpoint of other images or settings, expected one of these; delete it"
+            f"{path}: found a checkpoint of other images or settings, or of another version; expected one of these; "
+            "delete it"
         )
+    state = read_checkpoint(path, key)
+    if state is None:
+        return 0, shapes
     done, shapes = int(state.pop("done")), state.pop("shapes")
     model.load_state_dict(state)
     model.check_state()

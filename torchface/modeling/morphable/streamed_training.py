@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling.morphable.morphable_model import MorphableModel
@@ -22,7 +22,7 @@ from torchface.progress import Progress, silent
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
 _MAX_COMPONENTS = 200
-_FORMAT = "torchface.gram-rows/1"
+_METHOD = "gram rows/2"
 
 
 def fit_sequence(
@@ -41,7 +41,8 @@ def fit_sequence(
         samples: in correspondence, aligned.
         components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
         checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
-            samples and folder, the fit continues; in the end the files are removed.
+            samples in the same order and the same folder, the fit continues; rows of other samples and damaged ones
+            are computed again. In the end the files are removed.
         progress: called with each step and how far it is.
 
     Raises:
@@ -63,9 +64,9 @@ def fit_sequence(
     def step() -> None:
         report("fitting principal components", next(steps), work)
 
-    mean, floor = _mean(samples, parts, step)
+    mean, floor, contents = _mean(samples, parts, step, keyed=checkpoint is not None)
     gram = torch.zeros(count, count, dtype=torch.float64)
-    rows = _Rows(None if checkpoint is None else Path(checkpoint), mean, count)
+    rows = _Rows(None if checkpoint is None else Path(checkpoint), content_key(_METHOD, samples=contents, parts=parts))
     for number, (begin, end) in enumerate(parts):
         if (stored := rows.read(number, end - begin, end)) is not None:
             gram[begin:end, :end] = stored
@@ -96,10 +97,13 @@ def fit_sequence(
     )
 
 
-def _mean(samples: Samples, parts: list[tuple[int, int]], step: Callable[[], None]) -> tuple[Tensor, float]:
-    """The mean (D,) float64, and the eigenvalue that rounding alone makes."""
+def _mean(
+    samples: Samples, parts: list[tuple[int, int]], step: Callable[[], None], keyed: bool
+) -> tuple[Tensor, float, list[str]]:
+    """The mean (D,) float64, the eigenvalue that rounding alone makes, and if asked for the key of each block."""
     total: Tensor | None = None
     largest = eps = 0.0
+    contents = []
     for begin, end in parts:
         part = samples.read(begin, end).flatten(1)
         summed = part.sum(0, dtype=torch.float64)
@@ -108,9 +112,11 @@ def _mean(samples: Samples, parts: list[tuple[int, int]], step: Callable[[], Non
             raise ValueRangeError(f"samples: number {int(bad[0])} holds NaN or infinity; expected none")
         total = summed if total is None else total + summed
         largest, eps = max(largest, float(part.abs().max())), torch.finfo(part.dtype).eps
+        if keyed:
+            contents.append(content_key(_METHOD, block=part))
         step()
     assert total is not None
-    return total / samples.shape[0], (eps * largest) ** 2 * len(total)
+    return total / samples.shape[0], (eps * largest) ** 2 * len(total), contents
 
 
 def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
@@ -140,19 +146,16 @@ def _leading(gram: Tensor, floor: float, count: int | None) -> tuple[Tensor, Ten
 
 
 class _Rows:
-    """Finished rows of the Gram matrix on disk; another mean means other samples, and they begin anew."""
+    """Finished rows of the Gram matrix on disk; with another key they begin anew."""
 
-    def __init__(self, folder: Path | None, mean: Tensor, count: int) -> None:
-        self._folder = folder
-        if folder is None:
-            return
-        make_folder(folder)
-        numbers = hashlib.sha256(f"{count} ".encode() + mean.numpy().tobytes()).hexdigest()
-        self._belongs_to = {"format": _FORMAT, "key": numbers}
+    def __init__(self, folder: Path | None, key: str) -> None:
+        self._folder, self._key = folder, key
+        if folder is not None:
+            make_folder(folder)
 
     def read(self, number: int, rows: int, columns: int) -> Tensor | None:
         """The rows if they are there and whole."""
-        found = None if self._folder is None else read_checkpoint(self._path(number), self._belongs_to)
+        found = None if self._folder is None else read_checkpoint(self._path(number), self._key)
         gram = None if found is None else found.get("rows")
         if gram is None or gram.shape != (rows, columns) or gram.dtype != torch.float64:
             return None
@@ -160,11 +163,11 @@ class _Rows:
 
     def write(self, number: int, rows: Tensor) -> None:
         if self._folder is not None:
-            write_checkpoint(self._path(number), {"rows": rows}, self._belongs_to)
+            write_checkpoint(self._path(number), {"rows": rows}, self._key)
 
     def remove(self) -> None:
         if self._folder is not None and self._folder.is_dir():
-            for path in self._folder.glob("gram_*"):
+            for path in [*self._folder.glob("gram_*"), *self._folder.glob(".gram_*.part")]:
                 path.unlink(missing_ok=True)
             if not any(self._folder.iterdir()):
                 self._folder.rmdir()

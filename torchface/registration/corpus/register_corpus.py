@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -11,9 +10,11 @@ from itertools import chain
 from pathlib import Path
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.content_keys import content_key
 from torchface.files.job_lock import within_job
 from torchface.io.length_units import millimetres_per
 from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.meshes.named_files import named_files
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.registration.corpus.processes import in_processes
@@ -27,6 +28,8 @@ from torchface.registration.scan_preparation import check_template
 
 SCAN_ENDINGS = (*MESH_ENDINGS, ".glb", ".gltf")
 SUMMARY = "summary.csv"
+_METHOD = "register/2"
+"""What results are made with; another number where the same scan and settings come to give another result."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +77,10 @@ def register_corpus(
 
     A scan that cannot be registered is named in report, record and table, and the others go on. Results are complete
     files and a record comes after its result: a run that was killed, started again, takes what is finished and goes
-    on with the rest. A scan is registered anew when its files (those beside it of the same name included), its
-    landmarks, the template or the settings have changed, or its record has been deleted; one that failed for
-    another reason than what it holds (a process that died) is tried again.
+    on with the rest. A scan is registered anew when the content of its files (those beside it of the same name and
+    those it names included), its landmarks, the template with all annotations, the settings, the model or the version
+    of this package has changed, when its result is no longer what was written, or its record has been deleted; one
+    that failed for another reason than what it holds (a process that died) is tried again.
 
     Args:
         template: a face, millimetres.
@@ -126,7 +130,7 @@ def register_corpus(
         None if detector is None else _folder("detector", detector),
         None if model is None else LinearShape.of(shape_model(model, template)),
     )
-    tasks = _tasks(job, files, marks)
+    tasks = corpus_tasks(job, files, marks)
     progress = progress or silent
     with within_job(folder):
         kept = [entry for task in tasks if (entry := finished_entry(task, job.out)) is not None]
@@ -172,15 +176,37 @@ def _registered(job: CorpusJob, todo: list[CorpusTask], jobs: int, cluster: str 
     return in_processes(job, todo, jobs) if jobs > 1 else map(job.run, todo)
 
 
-def _tasks(job: CorpusJob, files: list[Path], marks: Path | None) -> list[CorpusTask]:
-    shared = _digest(job)
+def corpus_tasks(job: CorpusJob, files: list[Path], marks: Path | None) -> list[CorpusTask]:
+    """What is to be done: a task a scan, with a name and a key of everything that its result depends on.
+
+    Args:
+        job: what all scans share.
+        files: of the scans, absolute.
+        marks: the folder of landmarks, where there is one.
+    """
+    shared = content_key(
+        _METHOD,
+        template=job.template,
+        schedule=job.schedule,
+        texture_size=job.texture_size,
+        unit=job.unit,
+        detector=job.detector,
+        model=job.model,
+    )
     beside = {folder: _named(folder) for folder in {path.parent for path in files}}
     tasks = []
     for name, scan in zip(_names(files), files, strict=True):
         points = None if marks is None else landmark_file(marks, scan)
-        own = [_state(path) for path in beside[scan.parent].get(scan.stem, [])]
-        stamp = json.dumps([shared, str(scan), own, None if points is None else _state(points)])
-        tasks.append(CorpusTask(name, scan, points, hashlib.sha256(stamp.encode()).hexdigest()))
+        own = sorted({scan, *beside[scan.parent].get(scan.stem, []), *named_files(scan)})
+        key = content_key(
+            _METHOD,
+            shared=shared,
+            scan=str(scan),
+            files={str(path): path for path in own},
+            landmark_file=None if points is None else points.name,
+            landmarks=points,
+        )
+        tasks.append(CorpusTask(name, scan, points, key))
     return tasks
 
 
@@ -209,30 +235,6 @@ def _named(folder: Path) -> dict[str, list[Path]]:
             for end in range(1, len(parts)):
                 found.setdefault(".".join(parts[:end]), []).append(path)
     return found
-
-
-def _state(path: Path) -> list[str | int]:
-    try:
-        state = path.stat()
-    except OSError:
-        return [path.name]
-    return [path.name, state.st_size, state.st_mtime_ns]
-
-
-def _digest(job: CorpusJob) -> str:
-    """Of what all scans share."""
-    digest = hashlib.sha256()
-    template = job.template
-    for tensor in (template.vertices, template.faces, template.uvs, template.uv_faces):
-        if tensor is not None:
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    if template.annotations is not None and template.annotations.landmarks is not None:
-        digest.update(template.annotations.landmarks.cpu().contiguous().numpy().tobytes())
-    detector = None if job.detector is None else [_state(path) for path in sorted(job.detector.iterdir())]
-    digest.update(repr((job.schedule, job.texture_size, job.unit, detector)).encode())
-    for tensor in () if job.model is None else (job.model.mean, job.model.modes):
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def _folder(what: str, path: str | Path) -> Path:

@@ -6,6 +6,7 @@ import base64
 import csv
 import io
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,11 +17,12 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
+from torchface.files.content_keys import file_digest
 from torchface.files.documents import Value, read_json, write_json
 from torchface.files.whole_files import write_file
 from torchface.registration.nonrigid.stage_record import RegistrationRecord
 
-_FORMAT = "torchface.registered-scan/1"
+_FORMAT = "torchface.registered-scan/2"
 _MAX_RECORD = 16 * 2**20
 _STEP, _NOT_SHOWN = 0.01, 65535
 _COLUMNS = (
@@ -125,7 +127,7 @@ def write_record(
         "scan": str(entry.scan),
         "landmark_file": None if task.landmarks is None else str(task.landmarks),
         "result": None if entry.result is None else entry.result.name,
-        "result_bytes": 0 if entry.result is None else entry.result.stat().st_size,
+        "result_sha256": None if entry.result is None else file_digest(entry.result),
         "error": entry.error,
         "start": entry.start,
         **{key: getattr(entry, name) for name, key in _NUMBERS.items()},
@@ -215,7 +217,10 @@ def _entry(document: Value, task: CorpusTask, folder: Path) -> CorpusEntry | Non
     if document["status"].found == "skipped":
         return entry
     result = folder / f"{task.name}.glb"
-    if document["result"].found != result.name or result.stat().st_size != document["result_bytes"].found:
+    if document["result"].found != result.name or not result.is_file():
+        return None
+    if file_digest(result) != document["result_sha256"].found:
+        warnings.warn(f"{result}: found other content than was written, the scan is registered again", stacklevel=2)
         return None
     numbers: dict[str, Any] = {
         name: document[key].number() if document[key] else math.nan for name, key in _NUMBERS.items()

@@ -12,10 +12,9 @@ from torch import nn
 from torchface import zoo
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.models import read_record
+from torchface.files.content_keys import content_key
 from torchface.landmarks import AppearanceModel, LandmarkTrees
 from torchface.rig import BlendshapeRig
-from torchface.workflows.track.track_state import digest
 
 DEFAULT_LANDMARKS = "face_landmarks"
 """The model of the zoo that finds landmarks where none is named."""
@@ -79,8 +78,8 @@ def load_track_models(
         priors.shapes,
         priors.dynamics,
         priors.unlearned,
-        digest(*(_hash(name) for name in (landmarks, appearance))),
-        digest(*(_hash(name) for name in (prior, dynamics))),
+        content_key("seeing", trees=_folder(landmarks), appearance=_folder(appearance)),
+        content_key("solving", prior=_folder(prior), dynamics=_folder(dynamics), fps=fps),
     )
 
 
@@ -122,5 +121,5 @@ def _read(option: str, name: str | Path, kind: type[_Model]) -> _Model:
     return model
 
 
-def _hash(name: str | Path | None) -> str:
-    return "" if name is None else read_record(zoo.find(name)).sha256
+def _folder(name: str | Path | None) -> Path | None:
+    return None if name is None else zoo.find(name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key, file_digest
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import make_folder
 
@@ -19,9 +20,8 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_FORMAT = "torchface.track/1"
+_METHOD = "tracked frames/2"
 _LANDMARKS = 68
-_BLOCK = 2**22
 _MAX_PIECE_BYTES = 2**28
 
 
@@ -63,15 +63,13 @@ class TrackedFrames:
 class TrackState:
     """The state of one run in its folder; a run killed at any moment finds what it had finished.
 
-    Landmarks are kept in pieces, each a complete file; pieces of other videos, models or settings, damaged ones and
-    those behind them are deleted.
+    Landmarks are kept in pieces, each a complete file with the hash of its content; pieces of other videos, models or
+    settings, damaged ones and those behind them are deleted, damaged ones with a warning; so is what a killed run left
+    under a temporary name. The folder of results must be held for this run.
 
     Args:
         out: the folder of results; it is made with the first piece.
-        key: says what the landmarks come from, see :func:`digest`.
-
-    Raises:
-        FileFormatError: a piece cannot be read.
+        key: says what the landmarks come from, see :func:`~torchface.files.content_keys.content_key`.
     """
 
     def __init__(self, out: str | Path, key: str) -> None:
@@ -97,17 +95,23 @@ class TrackState:
         """
         make_folder(self.folder)
         kept = TrackedFrames(*(tensor.float() for tensor in (piece.landmarks, piece.confidence, piece.boxes)))
-        write_checkpoint(self._path(len(self._pieces)), vars(kept), self._belongs_to())
+        write_checkpoint(self._path(len(self._pieces)), vars(kept), self._piece_key())
         self._pieces.append(kept)
 
     def is_current(self, product: Path, key: str) -> bool:
-        """Whether a file is there and was made from what ``key`` says."""
-        return product.is_file() and self._record().get(product.name) == key
+        """Whether a file is there, was made from what ``key`` says, and is as it was made; a damaged one is told."""
+        made_from, content = self._record().get(product.name, ("", ""))
+        if made_from != key or not product.is_file():
+            return False
+        if file_digest(product) == content:
+            return True
+        warnings.warn(f"{product}: found other content than was written, it is made anew", stacklevel=2)
+        return False
 
     def made(self, product: Path, key: str) -> None:
         """Notes that a complete file was made from what ``key`` says."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(self.folder / _RECORD, {**self._record(), product.name: key})
+        write_json(self.folder / _RECORD, {**self._record(), product.name: [key, file_digest(product)]})
 
     def clear(self) -> None:
         """Deletes everything; folders that are empty then go too."""
@@ -119,6 +123,8 @@ class TrackState:
         self._pieces.clear()
 
     def _take_up(self) -> None:
+        for left_over in self.folder.glob(".*.part"):
+            left_over.unlink(missing_ok=True)
         for number, path in enumerate(self._files()):
             piece = self._read(path) if path == self._path(number) else None
             if piece is None:
@@ -130,15 +136,18 @@ class TrackState:
     def _read(self, path: Path) -> TrackedFrames | None:
         """A piece, if it is one of this run and whole."""
         if path.stat().st_size > _MAX_PIECE_BYTES:
-            raise FileFormatError(f"{path}: found {path.stat().st_size} bytes, expected at most {_MAX_PIECE_BYTES}")
-        found = read_checkpoint(path, self._belongs_to())
+            warnings.warn(
+                f"{path}: found a damaged piece of {path.stat().st_size} bytes, it is made anew", stacklevel=4
+            )
+            return None
+        found = read_checkpoint(path, self._piece_key())
         try:
             return None if found is None else TrackedFrames(**found)
         except (ShapeError, TypeError):
             return None
 
-    def _belongs_to(self) -> dict[str, str]:
-        return {"format": _FORMAT, "key": self.key, "begin": str(self.done)}
+    def _piece_key(self) -> str:
+        return content_key(_METHOD, run=self.key, begin=self.done)
 
     def _files(self) -> list[Path]:
         return sorted(self.folder.glob("landmarks_*.safetensors"))
@@ -146,32 +155,10 @@ class TrackState:
     def _path(self, number: int) -> Path:
         return self.folder / f"landmarks_{number:06d}.safetensors"
 
-    def _record(self) -> dict[str, str]:
+    def _record(self) -> dict[str, tuple[str, str]]:
+        """Of each product what it was made from, and the hash of its content."""
         try:
-            return {name: key.text() for name, key in read_json(self.folder / _RECORD).table().items()}
+            rows = read_json(self.folder / _RECORD).table().items()
+            return {name: (texts[0], texts[1]) for name, row in rows if len(texts := row.texts()) == 2}
         except FileFormatError:
             return {}  # what is not known is made anew
-
-
-def digest(*parts: str) -> str:
-    """Thirty-two hex digits that differ where any part does."""
-    whole = hashlib.sha256()
-    for part in parts:
-        whole.update(f"{len(part)}:{part}".encode())
-    return whole.hexdigest()[:32]
-
-
-def file_digest(path: Path) -> str:
-    """The hash of a file's content, read a block at a time.
-
-    Raises:
-        FileFormatError: it cannot be read.
-    """
-    whole = hashlib.sha256()
-    try:
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                whole.update(block)
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from error
-    return whole.hexdigest()

@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-import torchface
 from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
 from torchface.capture.video.head_pose import HeadPoses, measure_poses, smooth_poses, track_pose
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
 from torchface.errors import AlignmentError, ValueRangeError
+from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none
@@ -42,12 +42,13 @@ from torchface.workflows.track.track_files import (
 from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
 from torchface.workflows.track.track_overlay import video_light, write_overlay
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
-from torchface.workflows.track.track_state import TrackedFrames, TrackState, digest, file_digest
+from torchface.workflows.track.track_state import TrackedFrames, TrackState
 
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
 
-_VERSION = torchface.__version__  # another one may track and solve differently
+_METHOD = "track/2"
+"""Of the keys; another number where the same inputs, or another ``PIECE``, come to give other results."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     check_length(clip.count, models, clip.path)
     if settings.texture is not None:
         check_texture(actor, settings.texture)
-    see_key = digest(_VERSION, file_digest(clip.path), models.seeing, str(settings.face))
+    see_key = content_key(_METHOD, video=clip.path, models=models.seeing, face=settings.face)
     state = TrackState(out, see_key)
     reused = state.done
     seconds: dict[str, float] = {}
@@ -125,14 +126,16 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, clip.path)
     seconds["pose"] = time.perf_counter() - begin
     solver = solver_for(actor, models, calibration)
-    solve_key = digest(
-        see_key,
-        models.solving,
-        actor_digest(actor),
-        str(calibration.intrinsics.tolist()),
-        str(calibration.distortion.tolist()),
-        str(settings.whole_take),
-        str(solver.settings),
+    solve_key = content_key(
+        _METHOD,
+        landmarks=see_key,
+        models=models.solving,
+        neutral=actor.neutral,
+        deltas=actor.deltas,
+        names=actor.names,
+        calibration=calibration,
+        whole_take=settings.whole_take,
+        solver=solver.settings,
     )
     solution = kept_solution(state, solve_key, len(frames), len(actor.names))
     if solution is None:
@@ -147,8 +150,7 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     with all_or_none():
         products |= write_curves(tracked, out)
     if settings.overlay:
-        texture_key = "" if settings.texture is None else file_digest(settings.texture)
-        overlay_key = digest(solve_key, texture_key)
+        overlay_key = content_key(_METHOD, solution=solve_key, texture=settings.texture)
         products["overlay"] = out / OVERLAY
         if settings.texture is not None:
             tracked = replace(tracked, light=_light(tracked, state, solve_key, progress))
@@ -214,13 +216,6 @@ def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalib
     """The solver of a rig, for landmarks that the models find."""
     settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None)
     return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
-
-
-def actor_digest(rig: BlendshapeRig) -> str:
-    """Changes where anything of a rig does that weights depend on."""
-    tensors = (rig.vertices, rig.deltas, rig.neutral.faces, rig.neutral.landmarks)
-    numbers = (tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors)
-    return digest(*(digest(data.hex()) for data in numbers), *rig.names)
 
 
 def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:

@@ -1,0 +1,52 @@
+"""Runs in a forked process of a test: one that is killed in its middle, one that holds a folder of results."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from torchface.files.job_lock import job_lock
+
+
+def killed(work: Callable[[Callable[..., None]], object], step: str, done: int) -> None:
+    """Runs work, which is given a progress, in another process, and kills it with SIGKILL at a step of it."""
+
+    def progress(what: str, number: int = 0, total: int = 0) -> None:
+        if (what, number) == (step, done):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    process = os.fork()
+    if process == 0:
+        try:
+            torch.set_num_threads(1)  # threads do not come along
+            work(progress)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == -signal.SIGKILL
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[int]:
+    """Another process holds the folder, as a run does; its number."""
+    read, write = os.pipe()
+    process = os.fork()
+    if process == 0:
+        try:
+            with job_lock(folder):
+                os.write(write, b"held")
+                signal.pause()
+        finally:
+            os._exit(1)
+    try:
+        assert os.read(read, 4) == b"held"
+        yield process
+    finally:
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        os.close(read)
+        os.close(write)
