@@ -174,7 +174,7 @@ def spoiled(pixels: Tensor, share: float = 0.3) -> Tensor:
 
 @pytest.mark.parametrize(
     ("scene", "slower"),
-    [("68 landmarks", 4.0), ("13 landmarks", 2.0), ("13, any pose", 2.0), ("13, any pose, flat face", 2.0)],
+    [("68 landmarks", 4.0), ("13 landmarks", 1.5), ("13, any pose", 1.5), ("13, any pose, flat face", 1.5)],
 )
 def test_many_frames_at_once_beside_opencv(scene: str, slower: float, print_machine: Callable[..., None]) -> None:
     if "any" in scene:
@@ -239,9 +239,10 @@ def joined(frames: list[Found]) -> Found:
 
 
 def test_temples_that_are_off_beside_opencv(print_machine: Callable[..., None]) -> None:
-    """Why ours is there: temples 12 pixels off on one side, as detectors put them, must not make poses jump.
+    """What weights are worth: temples 12 pixels off on one side, as detectors put them, must not make poses jump.
 
-    They are the least exact of the thirteen landmarks, and tell most of nodding: weighed, they are of use.
+    They are the least exact of the thirteen landmarks, and tell most of nodding. Nobody finds the bias itself: the mean
+    error is about the same with weights and without.
     """
     stable = list(STABLE_LANDMARKS)
     points, rotation, _, pixels = filmed(0.7)
@@ -281,7 +282,7 @@ def test_temples_that_are_off_beside_opencv(print_machine: Callable[..., None]) 
         )
     ours = "torchface, temples weigh 1/4"
     assert all(jumps[ours][0] < jumps[name][0] for name in PEERS)
-    assert jumps[ours][0] < 1.5 * jumps[ours][1]
+    assert jumps[ours][0] < 1.05 * jumps[ours][1]
 
 
 def test_poses_along_time() -> None:

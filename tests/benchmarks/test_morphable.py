@@ -107,9 +107,10 @@ def test_as_exact_as_float64_and_as_fast_as_float32(
     for name, took in seconds.items():
         ratio = took / seconds["torchface"]
         print(f"{name:>34} {took:8.2f} {ratio:6.2f} {gaps[name]:16.1e} {1 - cosines[name]:17.1e}")
-    assert gaps["torchface"] <= 1e-6
+    assert gaps["torchface"] <= 1e-7
     assert cosines["torchface"] > 1 - 1e-6
-    assert seconds["torchface"] <= 1.3 * seconds["numpy eigh of Gram, float64"]
+    assert seconds["torchface"] <= 0.8 * seconds["numpy eigh of Gram, float64"]
+    assert seconds["torchface"] <= 3.5 * seconds["numpy eigh of Gram, float32"]
     assert seconds["scikit-learn full, float32"] >= 5 * seconds["torchface"]
 
 
