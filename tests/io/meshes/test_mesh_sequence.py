@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,30 @@ def test_meshes_that_are_not_as_they_were_written_are_told(tmp_path: Path) -> No
     assert not MeshSequence(path).is_whole()
     save_file({"vertices": MESHES, "faces": FACES}, path)
     assert MeshSequence(path).is_whole()  # another program's
+
+
+def test_no_more_is_noted_than_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, calls = tmp_path / "heads.safetensors", list[str]()
+
+    def sync(handle: int) -> None:
+        name = Path(os.readlink(f"/proc/self/fd/{handle}")).name
+        calls.append("meshes" if name == "heads.safetensors.part" else "note" if ".part.json." in name else "")
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with MeshSequenceWriter(path, 7, 4, FACES) as writer:
+        for mesh in MESHES:
+            writer.append(mesh)
+        # A disk is waited for once a second, not after each mesh.
+        assert [call for call in calls if call] == ["meshes", "note"]
+    assert [call for call in calls if call] == [*["meshes", "note"] * 2, "meshes"]  # the last: the hash of all
+
+
+def test_what_a_planted_link_names_is_not_written_to(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("kept")
+    (tmp_path / "heads.safetensors.part").symlink_to(precious)
+    assert len(MeshSequence(written(tmp_path / "heads.safetensors"))) == 7
+    assert precious.read_text() == "kept"
 
 
 def test_other_meshes_are_refused(tmp_path: Path) -> None:

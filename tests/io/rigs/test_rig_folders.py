@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 import re
 import shutil
 from pathlib import Path
@@ -157,6 +159,31 @@ def test_names_that_make_no_files_and_other_endings_are_refused(tmp_path: Path) 
     with pytest.raises(FileFormatError, match="cannot be written"):
         save_rig(rig, tmp_path / "file" / "actor")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_full_disk_leaves_the_rig_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "actor")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "actor").iterdir()}
+    other = BlendshapeRig(rig.neutral.with_vertices(2 * rig.neutral.vertices), rig.deltas, rig.names)
+    whole, written = os.write, 0
+
+    def full(handle: int, data: bytes) -> int:
+        nonlocal written
+        written += len(data)
+        if written > 3000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return whole(handle, data)
+
+    for target in ("actor", "new/actor"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", full)
+            with pytest.raises(FileFormatError, match="cannot be written: the disk is full"):
+                save_rig(other, tmp_path / target)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "actor").iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["actor"]
+    save_rig(other, tmp_path / "actor")
+    assert load_rig(tmp_path / "actor").vertices.allclose(other.vertices, atol=1e-3)
 
 
 def test_broken_notes_are_named(tmp_path: Path) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.io.video import open_video, write_video
+from torchface.io.video import open_video, video_writing, write_video
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +128,33 @@ def test_what_cannot_be_written_is_said(frames: torch.Tensor, tmp_path: Path) ->
     with pytest.raises(FileFormatError, match="cannot be written"):
         write_video([frames], tmp_path / "missing" / "a.avi", 60.0)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv", ".mp4"])
+@pytest.mark.parametrize("kept", [0.0, 0.4, 0.9])
+def test_a_video_cut_off_without_a_word_does_not_replace_the_one_before(
+    suffix: str, kept: float, frames: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An encoder that reports success on a full disk."""
+    path = tmp_path / f"a{suffix}"
+    write_video([frames[:3]], path, 60.0)
+    before, opened = path.read_bytes(), av.open
+
+    @contextmanager
+    def cut_off(file: str) -> Iterator[object]:
+        with opened(file, "w") as container:
+            yield container
+        os.truncate(file, int(kept * Path(file).stat().st_size))
+
+    def on_a_full_disk(file: str, mode: str, **options: object) -> object:
+        return cut_off(file) if mode == "w" else opened(file, mode, **options)  # type: ignore[call-overload]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(video_writing.av, "open", on_a_full_disk)
+        with pytest.raises(FileFormatError, match=rf"a{suffix}: cannot be written.*read back.*is the disk full"):
+            write_video([frames], path, 60.0)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 @pytest.mark.real

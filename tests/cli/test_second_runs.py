@@ -1,0 +1,77 @@
+"""A second run into a place that another run writes into is refused before it reads or writes anything."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from torchface.cli import main
+from torchface.files.job_lock import file_lock, job_lock
+from train.runner import run
+
+Lock = Callable[[Path], AbstractContextManager[Path]]
+
+
+@pytest.mark.parametrize(
+    ("lock", "words"),
+    [
+        (job_lock, "track video.mp4 --rig rig.glb"),
+        (job_lock, "track --live 0 --rig rig.glb"),
+        (job_lock, "demo"),
+        (job_lock, "evaluate a.csv b.csv"),
+        (job_lock, "register template.glb scans"),
+        (job_lock, "annotate video.mp4 --no-browser"),
+        (file_lock, "rig scan.ply --template template.glb"),
+        (file_lock, "fit photo.jpg --model head"),
+        (file_lock, "solve rig.glb take.c3d --attachment attachment.json"),
+        (file_lock, "attach rig.glb take.c3d"),
+    ],
+)
+def test_a_second_run_of_a_command_is_refused(
+    lock: Lock, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with lock(out):
+        there = sorted(tmp_path.rglob("*"))
+        with pytest.raises(SystemExit) as ended:
+            main([*words.split(), "--out", str(out), "--quiet"])
+        assert sorted(tmp_path.rglob("*")) == there
+    assert ended.value.code == 2
+    assert f"found another run writing into {out} (process" in " ".join(capsys.readouterr().err.split())
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of a recipe that only writes."""
+
+    out: Path
+
+
+def test_a_second_run_of_a_recipe_is_refused_and_the_lock_goes_with_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "model"
+    monkeypatch.setattr(sys, "argv", ["recipe", "--out", str(out)])
+    calls: list[str] = []
+
+    def first(settings: Settings, _: object) -> str:
+        calls.append("first")
+        (settings.out / "model.toml").write_text("first")
+        with pytest.raises(SystemExit, match=r"another run writing into .*model \(process"):
+            run(Settings, second, None, lambda *_: [])
+        return "trained"
+
+    def second(settings: Settings, _: object) -> str:
+        calls.append("second")
+        (settings.out / "model.toml").write_text("second")
+        return "trained"
+
+    run(Settings, first, None, lambda *_: [])
+    assert (calls, (out / "model.toml").read_text()) == (["first"], "first")
+    run(Settings, second, None, lambda *_: [])
+    assert [path.name for path in out.iterdir()] == ["model.toml"]
