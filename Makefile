@@ -18,9 +18,9 @@ $(VENV)/.installed-%: $(STAMP)
 	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
 	touch $@
 
-# Two processes of one thread each; what is costly to make once (a filmed performer, a browser) stays in one of them.
+# Two processes of one thread each, the longest files first; what is costly to make once (a synthetic video, a browser) stays in one.
 test: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s
