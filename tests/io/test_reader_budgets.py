@@ -15,6 +15,7 @@ from torchface.errors import FileFormatError
 from torchface.files.documents import read_json, read_toml
 from torchface.files.models import read_record
 from torchface.io import load_calibration, load_landmark_points, load_mesh, load_take
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
@@ -111,6 +112,41 @@ def test_words_of_a_large_obj_do_not_fill_the_memory(lines: str, tmp_path: Path)
     cost = measure(load_mesh, path)
     assert cost.refused == ""
     assert cost.megabytes < 20 * cost.file_megabytes + 110  # of one piece of the text
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "line", "count", "end"),
+    [
+        ("mesh.ply", "ply\nformat ascii 1.0\nelement vertex 150000\nproperty float x\nproperty float y\n"
+         "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n",
+         "0 0 0\n", 150_000, "3 0 1 2\n"),
+        ("mesh.stl", "solid\n", "vertex 0 1 0\nvertex 1 0 0\nvertex 0 0 0\n", 40_000, "endsolid\n"),
+        ("mesh.off", "OFF\n150000 1 0\n", "0 0 0\n", 150_000, "3 0 1 2\n"),
+        ("points.pts", "{\n", "1 1\n", 400_000, "}\n"),
+    ],
+)  # fmt: skip
+def test_words_of_a_large_text_do_not_fill_the_memory(
+    name: str, head: str, line: str, count: int, end: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path / name, head + line * count + end)
+    cost = measure(load_landmark_points if name.endswith("pts") else load_mesh, path)
+    assert cost.refused == ""
+    assert cost.megabytes < 20 * cost.file_megabytes + 40
+
+
+def test_rows_of_no_use_in_a_ply_cost_little(tmp_path: Path) -> None:
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty char x\nproperty char y\nproperty char z\n"
+        "element odd 400000\nproperty list uchar char a\nelement face 1\n"
+        "property list uchar char vertex_indices\nend_header\n"
+    )
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(head.encode() + bytes(9) + b"\1\1" + bytes(399_999) + b"\3\0\1\2")
+    assert check_budget(load_mesh, path).megabytes < 30
+
+
+def test_tags_without_end_are_refused(tmp_path: Path) -> None:
+    assert "nested more than 32 deep" in check_budget(load_dlib_faces, written(tmp_path / "a.xml", "<a>" * 99)).refused
 
 
 def test_a_line_of_megabytes_is_refused(tmp_path: Path) -> None:

@@ -56,6 +56,9 @@ def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
     return _read(read_document(path), millimetres_per(unit))[0]
 
 
+_AT_ONCE = 2**20  # numbers
+
+
 @dataclass(frozen=True)
 class _Piece:
     """An instance in millimetres, with its vertices welded."""
@@ -110,8 +113,9 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
     vertices = _moved(part.positions[joined.row_of], linear, translation)
     deltas = np.zeros((len(part.deltas), len(vertices), 3), np.float32)
-    for row, delta in zip(deltas, part.deltas, strict=True):
-        row[:] = _moved(delta[joined.row_of], linear)
+    blocks = 1 + part.deltas.size // _AT_ONCE
+    for some, given in zip(np.array_split(deltas, blocks), np.array_split(part.deltas, blocks), strict=True):
+        some[:] = _moved(given[:, joined.row_of], linear)
     if not np.isfinite(vertices).all() or not np.isfinite(deltas).all():
         raise document.error(f"meshes[{instance.mesh}]", "positions that overflow", "finite millimetres")
     extras, triangles = part.extras.get("torchface"), part.triangles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.primitive_reading import Part
 
 _STIR = np.uint64(0x9E3779B97F4A7C15)
+_AT_ONCE = 2**18
 
 
 @dataclass(frozen=True)
@@ -50,21 +50,23 @@ def _by_id(part: Part, ids: NDArray[np.int64]) -> Weld | None:
 
 def _by_position(part: Part) -> Weld:
     """Vertices numbered by first appearance; lips that touch at rest stay apart because they move differently."""
-    vertex_of, row_of = merge_equal_rows(_keys([part.positions, *part.deltas]))
+    vertex_of, row_of = merge_equal_rows(_keys(part.positions[None]) + _keys(part.deltas))
     return Weld(vertex_of, row_of, False)
 
 
-def _keys(tables: Sequence[NDArray[np.float32]]) -> NDArray[np.int64]:
-    """Two numbers (C,2) for the rows of all tables (C,3), equal where all these are.
+def _keys(tables: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Two numbers (C,2) for the rows of all tables (N,C,3), equal where all these are.
 
     Each is a sum of the rows' words, stirred and times odd numbers drawn by chance: no file can aim at two rows that
     have the same two keys and differ, and by chance they do once in 2^100.
     """
     generator = np.random.default_rng()
-    keys = np.zeros((len(tables[0]), 2), np.uint64)
-    for table in tables:  # one at a time, since all at once take three times the memory
-        words = (table + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 equals 0
-        words *= _STIR
+    count = tables.shape[1]
+    keys = np.zeros((count, 2), np.uint64)
+    for some in np.array_split(tables, 1 + tables.size // _AT_ONCE):  # all at once take three times the memory
+        flat = (some + np.float32(0)).transpose(1, 0, 2).reshape(count, -1)  # -0 equals 0
+        words = flat.view(np.uint32).astype(np.uint64) * _STIR
         words ^= words >> np.uint64(32)
-        keys += words @ (generator.integers(2**63, size=(3, 2), dtype=np.uint64) * np.uint64(2) + np.uint64(1))
+        odd = generator.integers(2**63, size=(words.shape[1], 2), dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+        keys += words @ odd
     return keys.view(np.int64)

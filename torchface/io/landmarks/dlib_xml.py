@@ -17,6 +17,7 @@ _MAX_PARTS = 1000
 _MAX_FACES = 100_000
 _MAX_ROWS = 10_000_000
 _MAX_COORDINATE = 1e6
+_MAX_DEPTH = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +77,16 @@ class _Reader:
         self._image: str | None = None
         self._box: Tensor | None = None
         self._ignored = False
-        self._rows = 0
+        self._rows = self._depth = 0
         self._parts: dict[int, tuple[float, float]] = {}
 
     def entity(self, *_: object) -> int:
         raise FileFormatError(f"{self.path}: found an XML entity declared, expected none")
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > _MAX_DEPTH:
+            raise FileFormatError(f"{self.path}: found tags nested more than {_MAX_DEPTH} deep, expected dlib's XML")
         if tag == "dataset":
             self.is_dataset = True
         elif tag == "image":
@@ -107,6 +111,7 @@ class _Reader:
             self._parts[int(name)] = self._number(attributes, "x", tag), self._number(attributes, "y", tag)
 
     def end(self, tag: str) -> None:
+        self._depth -= 1
         if tag == "image":
             self._image = None
         elif tag == "box" and self._box is not None:

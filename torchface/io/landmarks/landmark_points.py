@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -189,15 +191,22 @@ def _pts(path: Path) -> LandmarkPoints:
     if not brace or not end:
         raise FileFormatError(f"{path}: found no points between braces, expected iBUG's PTS")
     declared = [line.partition(":")[2].strip() for line in head.splitlines() if line.strip().startswith("n_points")]
-    rows = [line.split() for line in body.splitlines() if line.strip()]
-    if declared and declared[0] != str(len(rows)):
-        raise FileFormatError(f"{path}: found {len(rows)} points, expected the n_points: {declared[0]} of its head")
-    if not rows or len(rows[0]) not in (2, 3) or any(len(row) != len(rows[0]) for row in rows):
-        raise FileFormatError(f"{path}: found rows of different width or none, expected two or three numbers each")
+    numbers = array("d")
+    width = count = 0
     try:
-        points = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)
+        for line in StringIO(body):  # text comes by the line
+            if words := line.split():
+                numbers.extend(map(float, words))
+                count, width = count + 1, width or len(words)
+                if len(words) != width or width not in (2, 3):
+                    raise FileFormatError(f"{path}: found rows of different width, expected two or three numbers each")
     except ValueError as error:
         raise FileFormatError(f"{path}: found text among the points, expected numbers ({error})") from error
+    if declared and declared[0] != str(count):
+        raise FileFormatError(f"{path}: found {count} points, expected the n_points: {declared[0]:.40} of its head")
+    if not 0 < count <= _MAX_POINTS:
+        raise FileFormatError(f"{path}: found {count} points, expected 1 to {_MAX_POINTS}")
+    points = torch.tensor(numbers, dtype=torch.float64).reshape(count, width)
     if torch.isinf(points).any():
         raise FileFormatError(f"{path}: found an infinite position, expected finite numbers")
     return LandmarkPoints(points - 1 if points.shape[1] == 2 else points, source=str(path))

@@ -31,7 +31,7 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
         TopologyError: a face names a vertex that is not there.
     """
     path, scale = Path(path), millimetres_per(unit)
-    tables, elements = read_tables(path, read_file(path))
+    tables, elements = read_tables(path, read_file(path), ("vertex", "face"))
     columns = tables.get("vertex", {})
     if not all(isinstance(columns.get(axis), np.ndarray) and len(columns[axis]) for axis in "xyz"):
         raise FileFormatError(f"{path}: found no vertices with x, y and z, expected a PLY mesh")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchface.errors import FileFormatError
+from torchface.files.line_pieces import word_pieces
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -25,6 +27,7 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MAX_HEADER = 2**16
+_ROWS = 2**16
 
 
 @dataclass
@@ -44,8 +47,8 @@ class Lists:
     values: NDArray[Any]
 
 
-def read_tables(path: Path, data: bytes) -> tuple[dict[str, dict[str, Any]], list[Element]]:
-    """Every element's columns by name, arrays (P,) or ``Lists``, and the elements as the header names them.
+def read_tables(path: Path, data: bytes, wanted: Collection[str]) -> tuple[dict[str, dict[str, Any]], list[Element]]:
+    """The columns by name of the wanted elements, arrays (P,) or ``Lists``, and all elements as the header names them.
 
     Raises:
         FileFormatError: no PLY, another format, truncated, or text among the numbers.
@@ -56,7 +59,10 @@ def read_tables(path: Path, data: bytes) -> tuple[dict[str, dict[str, Any]], lis
     tables: dict[str, dict[str, Any]] = {}
     at = 0
     for element in elements:
-        tables[element.name], at = _columns(path, element, order, body, at) if element.count else ({}, at)
+        if element.name in wanted:
+            tables[element.name], at = _columns(path, element, order, body, at) if element.count else ({}, at)
+        else:
+            at = _end(path, element, order, body, at)
     return tables, elements
 
 
@@ -92,9 +98,10 @@ def _header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
 
 def _words(path: Path, body: bytes) -> NDArray[np.float64]:
     try:
-        return np.array(list(map(float, body.split())), dtype=np.float64)
+        pieces = [np.array(list(map(float, words)), dtype=np.float64) for words in word_pieces(path, body)]
     except ValueError as error:
         raise FileFormatError(f"{path}: found text among the numbers ({error})") from error
+    return np.concatenate(pieces) if pieces else np.zeros(0)
 
 
 def _columns(path: Path, element: Element, order: str, body: NDArray[Any], at: int) -> tuple[dict[str, Any], int]:
@@ -116,6 +123,19 @@ def _columns(path: Path, element: Element, order: str, body: NDArray[Any], at: i
     return columns, int(spans[-1, -1].sum())
 
 
+def _end(path: Path, element: Element, order: str, body: NDArray[Any], at: int) -> int:
+    """Where the element behind one that nobody reads begins."""
+    if all(count is None for _, _, count in element.properties):
+        size = element.count * sum(_width(order, kind) for _, kind, _ in element.properties)
+        if size > len(body) - at:
+            raise _truncated(path, element, len(body) - at, str(size))
+        return at + size
+    for first in range(0, element.count, _ROWS):
+        spans = _spans(path, element, order, body, at, min(_ROWS, element.count - first))
+        at = int(spans[-1, -1].sum())
+    return at
+
+
 def _equal_rows(element: Element, order: str, rows: NDArray[Any], spans: NDArray[np.int64]) -> dict[str, Any] | None:
     """The columns of rows (P,R) whose lists all have the lengths of the first row's; none where they do not."""
     columns: dict[str, Any] = {}
@@ -133,7 +153,7 @@ def _equal_rows(element: Element, order: str, rows: NDArray[Any], spans: NDArray
 
 def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int, rows: int) -> NDArray[np.int64]:
     """First unit and number of units of every property in the first rows, (rows, properties, 2)."""
-    if element.count > len(body) - at:
+    if rows > len(body) - at:
         raise _truncated(path, element, len(body) - at, f"at least {element.count}")
     if any(count is not None and order and np.dtype(count).kind == "f" for _, _, count in element.properties):
         raise _truncated(path, element, len(body) - at, "an integer that gives a list's length")
@@ -141,8 +161,8 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
         (_width(order, kind), None if count is None else _length_reader(order, count), _width(order, count or kind))
         for _, kind, count in element.properties
     ]
-    units = body if rows == 1 else body.tobytes() if order else body.tolist()  # quicker one by one
-    found: list[tuple[int, int]] = []
+    units = memoryview(body)  # quicker one by one
+    found = array("q")
     end = len(body)
     for _ in range(rows):  # where a row begins is known only after the one before
         for width, read_length, before in plan:
@@ -150,11 +170,12 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
             if read_length is not None:
                 length = read_length(units, at) if at + before <= end else -1
                 at += before
-            found.append((at, length * width))
+            if not 0 <= length * width <= end - at:
+                raise _truncated(path, element, max(end - at, 0), f"a list of {length}")
+            found.append(at)
+            found.append(length * width)
             at += length * width
-            if length < 0 or at > end:
-                raise _truncated(path, element, max(end - found[-1][0], 0), f"a list of {length}")
-    return np.array(found, np.int64).reshape(rows, -1, 2)
+    return np.frombuffer(found, np.int64).reshape(rows, -1, 2)
 
 
 def _length_reader(order: str, kind: str) -> Callable[[Any, int], int]:
