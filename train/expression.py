@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression
 from torchface.progress import Progress, silent
@@ -204,7 +205,7 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
     )
     if comparison is not None and comparison.predicted:
         folder = settings.out / "pictures"
-        folder.mkdir(exist_ok=True)
+        make_folder(folder)
         for row, name in enumerate(people.names[:3]):
             save_rendered_image(picture(people, comparison, row), folder / f"{name}.png")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling import HeadModel
 from torchface.modeling.morphable.model_quality import ModelQuality
@@ -43,7 +44,7 @@ def draw(
         learn, test: the heads that it has learned from and others, where there are any.
         progress: called with each step and how far it is.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     known, others = (
         torch.cat([model.shape.project(part.read(*block)) for block in blocks(part)])
         if part is not None and part.shape[0]

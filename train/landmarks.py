@@ -19,6 +19,7 @@ from torch import Tensor
 from torchface import TorchfaceError, zoo
 from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
+from torchface.files.whole_files import make_folder
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
@@ -97,7 +98,7 @@ def train(settings: Settings, progress: Progress | None = None) -> tuple[Landmar
     progress = progress or silent
     learn, test = split(settings, progress)
     progress(f"{len(learn)} faces to learn from, {len(test)} to test on")
-    settings.out.mkdir(parents=True, exist_ok=True)
+    make_folder(settings.out)
     checkpoint = settings.out / "checkpoint.safetensors"
     model = LandmarkTrees.fit(
         learn.images, learn.boxes, learn.landmarks, settings.trees, progress, checkpoint=checkpoint

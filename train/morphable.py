@@ -15,6 +15,7 @@ import torch
 
 from torchface import TorchfaceError, zoo
 from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import SampleRange, Samples, blocks
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
@@ -103,7 +104,7 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
     source, held_out = _source(settings)
     template, rig = (None, None) if settings.template is None else load_template(settings.template, settings.part)
     work = settings.out.parent / f".{settings.out.name}.training"
-    work.mkdir(parents=True, exist_ok=True)
+    make_folder(work)
     gathered = gather(source, held_out, work, template, progress)
     count = len(gathered.shapes) - gathered.held_out
     progress(f"{count} heads to learn from, {gathered.held_out} to test on")

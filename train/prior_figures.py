@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.capture.priors import DynamicsPrior, windows_of
-from torchface.files.whole_files import write_file
+from torchface.files.whole_files import make_folder, write_file
 from train.prior_trials import OneStep
 
 _SHOWN = 4
@@ -89,7 +89,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Writes a figure as PNG; the file appears when it is complete."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_file(path, content.getvalue())
 
 

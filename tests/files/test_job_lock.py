@@ -77,9 +77,11 @@ def test_files_of_one_folder_are_held_each_on_its_own(tmp_path: Path) -> None:
     with ExitStack() as held:
         for name in ("a", "b", long):
             held.enter_context(file_lock(tmp_path / f"{name}.glb"))
+        (tmp_path / "folder").mkdir()
+        held.enter_context(file_lock(tmp_path / "folder"))
         with pytest.raises(ValueRangeError, match=r"a\.glb"):
             held.enter_context(file_lock(tmp_path / "a.glb"))
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder"]
 
 
 def test_a_folder_that_was_made_for_nothing_goes_and_another_stays(tmp_path: Path) -> None:

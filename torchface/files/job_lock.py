@@ -76,7 +76,7 @@ def file_lock(file: str | Path) -> Iterator[Path]:
     """Holds one file of results, and what is written beside it, for one run; see :func:`job_lock`.
 
     Args:
-        file: what ``--out`` names; its folder is made where it is missing.
+        file: what ``--out`` names, or a folder that is written as a whole; what is missing above is made.
 
     Returns:
         The file.
@@ -86,7 +86,10 @@ def file_lock(file: str | Path) -> Iterator[Path]:
         FileFormatError: its folder cannot be made or written to.
     """
     file = Path(file)
-    check_writable(file)
+    if file.is_dir():
+        check_writable(folder=file)
+    else:
+        check_writable(file)
     with made_folder(file.parent) as folder, _locked(folder.resolve() / f".{shortened(file.name)}{LOCK}", file):
         yield file
 

@@ -110,7 +110,7 @@ class TrackState:
 
     def made(self, product: Path, key: str) -> None:
         """Notes that a complete file was made from what ``key`` says."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         write_json(self.folder / _RECORD, {**self._record(), product.name: [key, file_digest(product)]})
 
     def clear(self) -> None:
