@@ -12,6 +12,8 @@ import torch
 
 from torchface.files.job_lock import job_lock
 
+_SECONDS = 120  # after which a child is ended that does not come to its step
+
 
 def killed(work: Callable[[Callable[..., None]], object], step: str, done: int) -> None:
     """Runs work, which is given a progress, in another process, and kills it with SIGKILL at a step of it."""
@@ -23,6 +25,7 @@ def killed(work: Callable[[Callable[..., None]], object], step: str, done: int) 
     process = os.fork()
     if process == 0:
         try:
+            signal.alarm(_SECONDS)
             torch.set_num_threads(1)  # threads do not come along
             work(progress)
         finally:

@@ -12,9 +12,10 @@ from torchface.files.whole_files import read_file
 
 _MAX_NAMES = 1000  # in one file
 _URI = re.compile(rb'"uri"\s*:\s*"((?!data:)[^"\\]{1,1024})"')
+# What begins with a word is found fast, and a name too many does no harm.
 _NAMES = {
-    ".obj": re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]{1,1024})", re.MULTILINE),
-    ".mtl": re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]{1,1024})", re.MULTILINE),
+    ".obj": re.compile(rb"mtllib[ \t]+([^\r\n]{1,1024})"),
+    ".mtl": re.compile(rb"map_Kd[ \t]+([^\r\n]{1,1024})"),
     ".gltf": _URI,
     ".glb": _URI,
 }
