@@ -56,6 +56,11 @@ def test_part_keeps_positions_seams_and_masks() -> None:
     assert part.annotations.contacts.tolist() == [[1, 2]]
 
 
+def test_a_mesh_without_vertices_is_refused() -> None:
+    with pytest.raises(TopologyError, match="found no vertices"):
+        Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64))
+
+
 def test_part_by_ids_equals_part_by_mask() -> None:
     mesh = grid()
     mask = mesh.vertices[:, 1] < 2

@@ -27,8 +27,19 @@ def test_disagreements_are_named() -> None:
         Track(("a", "b"), torch.zeros(4, 3, 3))
     with pytest.raises(ShapeError, match="'markers': 4, 'weights': 5"):
         Take(60.0, markers=track, weights=Track(("w",), torch.zeros(5, 1, 1)))
-    with pytest.raises(ValueRangeError, match="found 0 frames a second"):
-        Take(0)
+
+
+@pytest.mark.parametrize("fps", [0, -60.0, 1e9, 1e-9, float("nan"), float("inf"), True, "60"])
+def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
+    with pytest.raises(ValueRangeError, match=r"take: found .* frames a second, expected 0\.01 to 10000"):
+        Take(fps)
+
+
+@pytest.mark.parametrize(("name", "width"), [("markers", 3), ("landmarks", 2), ("weights", 1)])
+def test_a_track_of_another_kind_is_refused(name: str, width: int) -> None:
+    for wrong in {0, 1, 2, 3, 4} - {width}:
+        with pytest.raises(ShapeError, match=rf"take: found {name} \(4, 1, {wrong}\), expected \(T,C,{width}\)"):
+            Take(60.0, **{name: Track(("a",), torch.zeros(4, 1, wrong))})  # type: ignore[arg-type]
 
 
 def test_length_is_the_number_of_frames() -> None:

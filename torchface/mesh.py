@@ -61,7 +61,8 @@ class Mesh:
 
     Raises:
         ShapeError: a tensor has the wrong shape.
-        TopologyError: an index points outside, or ``faces`` is not the fan triangulation of ``polygons``.
+        TopologyError: there is no vertex, an index points outside, or ``faces`` is not the fan triangulation of
+            ``polygons``.
         ValueRangeError: a position is NaN or infinite.
     """
 
@@ -77,6 +78,8 @@ class Mesh:
     def __post_init__(self) -> None:
         _check_shape("vertices", self.vertices, (None, 3))
         _check_shape("faces", self.faces, (None, 3))
+        if len(self.vertices) == 0:
+            raise TopologyError("mesh: found no vertices, expected at least one")
         if not torch.isfinite(self.vertices).all():
             bad = int((~torch.isfinite(self.vertices)).any(-1).sum())
             raise ValueRangeError(f"mesh: {bad} of {len(self.vertices)} vertices are NaN or infinite; expected none")

@@ -12,6 +12,8 @@ from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 LARGEST_WEIGHT = 1e12
 """The largest weight that a term of an energy may have: beyond it rounding leaves nothing of the other terms."""
 
+LARGEST_SEED = 2**32 - 1
+"""What every generator of random numbers takes."""
 MIN_FPS, MAX_FPS = 0.01, 10_000.0
 """Frames a second: from a picture every hundred seconds to what no marker camera reaches."""
 
@@ -93,7 +95,7 @@ def _real(value: object) -> float:
 
 
 def _range_text(kind: str, least: float, most: float, above: bool = False) -> str:
-    if math.isinf(most) or most in (2**31 - 1, LARGEST_WEIGHT):
+    if math.isinf(most) or most == 2**31 - 1:
         return f"{kind} above {least:g}" if above else kind if math.isinf(least) else f"{kind} of at least {least:g}"
     low = f"above {least:g} and at most " if above else f"from {least:g} to "
     return f"{kind} {low}{most:.7g}"

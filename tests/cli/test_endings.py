@@ -8,12 +8,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.figure import Figure
+from rich.table import Table
 
 from torchface.cli import main
 from torchface.cli.exit_messages import plain_errors
+from torchface.cli.progress import PlainConsole, print_path
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import save_rig, save_take
+from torchface.rendering.compositing import from_figure
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import place_markers, record
 
@@ -75,3 +79,98 @@ def test_ctrl_c_ends_a_command_without_a_traceback() -> None:
     assert done.returncode == 130
     assert "stopped" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+HOSTILE = (
+    "[bold red]evil[/bold red]",
+    "[/nothing]",
+    "\x1b[2J\x1b]0;title\x07",
+    "a\rb\x9bc\u202ed",
+    "$\\foo$ </script><b>",
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_are_printed_as_they_are_and_control_characters_spelled(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit), plain_errors():
+        raise FileFormatError(f"{name}: broken")
+    with pytest.raises(SystemExit):
+        main(["info", str(tmp_path / name.replace("/", "_"))])
+    table = Table(name, title=name)
+    table.add_row(name)
+    console = PlainConsole()
+    console.print(table, name)
+    told = capsys.readouterr().err
+    spelled = name.encode("unicode_escape").decode().replace("\\\\", "\\")
+    assert told.count(spelled) == (5 if "/" in name else 6)
+    assert f"error: {spelled}: broken" in told
+    assert not any(sign in told for sign in "\x1b\x07\r\x9b\u202e")
+
+
+def test_a_path_goes_to_a_program_as_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    print_path(Path("a\x1b[31m.csv"))
+    assert capsys.readouterr().out == "a\x1b[31m.csv\n"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    print_path(Path("a\x1b[31m.csv"))
+    assert capsys.readouterr().out == "a\\x1b[31m.csv\n"
+
+
+def test_hostile_names_pass_through_a_solve_and_its_report(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, ["jawOpen", *HOSTILE[:3]])
+    rig_path, take, sites = tmp_path / "rig.glb", tmp_path / "take.c3d", place_markers(dome_rig, 12)
+    save_rig(rig, rig_path)
+    sites.save(tmp_path / "sites.json")
+    save_take(record(rig, sites, torch.rand(6, 4), torch.Generator().manual_seed(0)).take, take)
+    image = from_figure(motion_figure("$\\foo$ \x1b[31m"))
+    assert image.shape[0] == 3
+    words = ["solve", rig_path, take, "--attachment", tmp_path / "sites.json", "--frame-by-frame", "--quiet"]
+    main([str(word) for word in (*words, "--out", tmp_path / "[red]w.csv")])
+    assert (tmp_path / "[red]w.csv").is_file()
+
+
+def motion_figure(name: str) -> Figure:
+    figure = Figure(figsize=(2, 2))
+    axes = figure.subplots()
+    axes.plot([1, 2], [3, 40], label=name)
+    axes.set(title=name, xlabel=name, yscale="log")
+    axes.set_xticks([1, 2], [name, name])
+    axes.legend()
+    return figure
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("solve", "--sparsity", "1e300"),
+        ("solve", "--sparsity", "nan"),
+        ("solve", "--ridge", "-1"),
+        ("solve", "--stream", "udp://a..b:1"),
+        ("render", "--height", "0"),
+        ("render", "--height", "1000000000"),
+        ("render", "--height", "20", "--yaw", "nan"),
+        ("demo", "--seed", str(10**23)),
+        ("view", "--port", "99999"),
+        ("view", "--port", "-1"),
+        ("pick", "--port", "65536"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(
+    stage: Path, tmp_path: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    if words[0] in ("view", "pick"):
+        pytest.importorskip("viser")
+    given = {
+        "solve": (stage / "rig.glb", stage / "take.c3d", "--attachment", stage / "attachment.json"),
+        "demo": (),
+        "pick": (stage / "rig.glb", "--out", tmp_path / "out.json"),
+    }.get(words[0], (stage / "rig.glb",))
+    out = () if words[0] in ("view", "pick") else ("--out", tmp_path / ("out" if words[0] == "demo" else "out.png"))
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in (words[0], *given, *words[1:], *out)])
+    assert ended.value.code == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert words[-2].lstrip("-") in told
+    assert "found" in told
+    assert "expected" in told or "not known" in told

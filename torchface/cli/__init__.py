@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import tyro
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from torchface import __version__
 from torchface.cli.annotate import annotate
@@ -28,6 +27,7 @@ from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.pick import pick
+from torchface.cli.progress import PlainConsole
 from torchface.cli.register import register
 from torchface.cli.render import render
 from torchface.cli.retarget import retarget
@@ -89,8 +89,8 @@ def _overview() -> None:
     table = Table(box=None, show_header=False, padding=(0, 2))
     for name, command in (COMMANDS | {"export": _export_help}).items():
         summary = " ".join((command.__doc__ or "").partition("\n\n")[0].split())
-        table.add_row(f"[bold]{name}[/]", escape(re.split(r"[:;,.](?:\s|$)", summary)[0]))
-    page = Console()
+        table.add_row(Text(name, "bold"), re.split(r"[:;,.](?:\s|$)", summary)[0])
+    page = PlainConsole(stderr=False)
     page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
     page.print(table, highlight=False)
     page.print("\ntorchface COMMAND --help shows more of each; torchface --version.", highlight=False)

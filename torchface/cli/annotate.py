@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -48,9 +48,11 @@ def annotate(
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
 
     if browser:
-        from torchface.viz.browser.browser_page import import_viser
+        from torchface.viz.browser.browser_page import HOST, import_viser
+        from torchface.viz.browser.free_port import free_port
 
         import_viser()
+        free_port(HOST, port)
     with job_lock(out):
         with progress_bars(quiet) as progress:
 
@@ -72,7 +74,7 @@ def annotate(
             annotation = prepare_annotation(video, out, track, count, key)
         if not browser:
             for path in write_proposals(annotation):
-                print(path)
+                print_path(path)
             return
         from torchface.viz.browser.annotation_session import AnnotationSession
         from torchface.viz.browser.landmark_editor import LandmarkEditor

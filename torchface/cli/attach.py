@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, print_lines, progress_bars
+from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
 
 
 def attach(
@@ -57,4 +57,4 @@ def attach(
         options = MarkerOptions(unit, labels, frames, flip)
         report = find_sites(rig, rom, out, initial, standoff, picture, part, progress, options, insist)
     print_lines(report.lines())
-    print(out)
+    print_path(out)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 from torchface.errors import ValueRangeError
 
 
@@ -40,6 +40,6 @@ def calibrate(
     with progress_bars(quiet) as progress:
         report = run(images, Board(int(match[1]), int(match[2]), square), out, progress)
     for line in report.lines():
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     for path in (report.overlay_path, out):
-        print(path)
+        print_path(path)

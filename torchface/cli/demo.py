@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def demo(
@@ -33,9 +33,11 @@ def demo(
         quiet: Show no progress.
     """
     from torchface.files.job_lock import job_lock
+    from torchface.number_checks import LARGEST_SEED, checked_count
     from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
     from torchface.workflows.demo.run_demo import run_demo, scene_from
 
+    checked_count("--seed", seed, 0, LARGEST_SEED)
     with job_lock(out), progress_bars(quiet) as progress:
         progress("preparing head and take")
         scene = scene_from(template, take, target, seed)
@@ -44,7 +46,7 @@ def demo(
     console.print(_table(scene.title, scene_rows(result)))
     console.print(_table("against the truth", result_rows(result), ("", "whole take", "frame by frame")))
     console.print(_table("solver.onnx", result.solver.rows()))
-    print(page)
+    print_path(page)
 
 
 def _table(title: str, rows: Sequence[Sequence[str]], heading: Sequence[str] = ("", "")) -> Table:

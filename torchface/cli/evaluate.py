@@ -8,7 +8,7 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def evaluate(
@@ -56,12 +56,15 @@ def evaluate(
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import job_lock
+    from torchface.number_checks import checked_count
+    from torchface.viz.figures.face_views import PICTURE_HEIGHTS
     from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings
     from torchface.workflows.evaluate.compare_with_truth import evaluate as run
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
 
     if align and as_is:
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
+    checked_count("--height", height, *PICTURE_HEIGHTS)
     choice = True if align else False if as_is else None
     settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
     with job_lock(out), progress_bars(quiet) as progress:
@@ -76,5 +79,5 @@ def evaluate(
         table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.4e}", str(figures.vertices))
     console.print(table)
     for line in found.lines():
-        console.print(line, highlight=False, markup=False)
-    print(page)
+        console.print(line, highlight=False)
+    print_path(page)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.markup import escape
+from rich.text import Text
 
 from torchface.cli.progress import console
 from torchface.errors import TorchfaceError
@@ -36,4 +36,4 @@ def plain_errors() -> Iterator[None]:
 
 
 def _say(what: str, line: str) -> None:
-    console.print(f"[bold red]{what}:[/] {escape(line)}", highlight=False, soft_wrap=True)
+    console.print(Text(f"{what}:", "bold red"), line, highlight=False, soft_wrap=True)

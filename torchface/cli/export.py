@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 if TYPE_CHECKING:
     from torchface.onnx import SolverReport
@@ -68,7 +68,7 @@ def _write_solver(
     for row in report.rows():
         table.add_row(*row)
     console.print(table)
-    print(out)
+    print_path(out)
 
 
 def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
@@ -100,7 +100,7 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     for row in report.rows():
         table.add_row(*row)
     console.print(table)
-    print(out)
+    print_path(out)
 
 
 def video_solver(
@@ -134,13 +134,16 @@ def video_solver(
         part: Keep this region of the rig only, such as face.
         quiet: Show no progress.
     """
-    from torchface.errors import FileFormatError
+    from torchface.errors import FileFormatError, ValueRangeError
     from torchface.io import load_rig, load_take
     from torchface.io.camera_files import load_calibration
+    from torchface.number_checks import check_rate
     from torchface.onnx import export_video_solver
     from torchface.workflows.track.track_models import load_priors
 
     with progress_bars(quiet) as progress:
+        if fps is not None:
+            check_rate(fps, "--fps", ValueRangeError)
         progress("reading rig, camera and priors")
         loaded, calibration = load_rig(rig, part=part), load_calibration(camera)
         priors = load_priors(loaded, prior, dynamics, fps)
@@ -154,8 +157,8 @@ def video_solver(
         table.add_row(*row)
     console.print(table)
     if priors.unlearned:
-        console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", markup=False, soft_wrap=True)
-    print(out)
+        console.print(f"the priors say nothing of {', '.join(priors.unlearned)}", soft_wrap=True)
+    print_path(out)
 
 
 EXPORTS: dict[str, Callable[..., None]] = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
@@ -44,4 +44,4 @@ def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
     for row in report.rows():
         table.add_row(*row)
     console.print(table)
-    print(out)
+    print_path(out)

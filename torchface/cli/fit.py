@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def fit(
@@ -83,8 +83,8 @@ def fit(
             insist,
         )
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     marks = (overlay.with_suffix(".pts") for overlay in made.overlays[: len(made.found)])
     cameras = (overlay.with_suffix(".toml") for overlay in made.overlays)
     for path in (*marks, *cameras, *made.overlays, out):
-        print(path)
+        print_path(path)

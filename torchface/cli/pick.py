@@ -47,7 +47,8 @@ def pick(
     from torchface.io.rigs.ict_facekit import region
     from torchface.mesh import Mesh, submesh
     from torchface.rig import BlendshapeRig
-    from torchface.viz.browser.browser_page import import_viser
+    from torchface.viz.browser.browser_page import HOST, import_viser
+    from torchface.viz.browser.free_port import free_port
     from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
     from torchface.viz.browser.picker import Picker
 
@@ -63,6 +64,7 @@ def pick(
         return found if part is None else submesh(found, region(found, part)).mesh
 
     import_viser()
+    free_port(HOST, port)
     with progress_bars(quiet) as progress:
         progress("reading")
         head = read()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,8 +15,23 @@ from rich.text import Text
 from tyro.conf import arg
 
 from torchface.progress import Progress, silent
+from torchface.shown_text import visible
 
-console = Console(stderr=True)
+
+class PlainConsole(Console):
+    """A console that takes every text for what it says: names from files hold neither markup nor escape sequences.
+
+    Styles are given as ``style=`` or by ``rich.text.Text``, for which ``visible`` must be called.
+    """
+
+    def __init__(self, stderr: bool = True) -> None:
+        super().__init__(stderr=stderr, markup=False, emoji=False)
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        return super().render_str(visible(text), **how)
+
+
+console = PlainConsole()
 
 Quiet = Annotated[bool, arg(aliases=["-q"])]
 """The option of every command that shows progress."""
@@ -23,10 +39,19 @@ Quiet = Annotated[bool, arg(aliases=["-q"])]
 _LOG_INTERVAL = 30.0  # seconds between two lines of one step where the output is not a terminal
 
 
+def print_path(path: object) -> None:
+    """Prints where a result lies on standard output: as it is for a program, control characters spelled for people."""
+    text = str(path)
+    try:
+        print(visible(text) if sys.stdout.isatty() else text, flush=True)
+    except UnicodeEncodeError:  # a name that is no text in the terminal's encoding
+        print(visible(text).encode("ascii", "backslashreplace").decode("ascii"), flush=True)
+
+
 def print_lines(lines: Iterable[str]) -> None:
     """Prints a report, its warnings so that they are seen."""
     for line in lines:
-        console.print(line, style="bold yellow" if line.startswith("warning: ") else None, markup=False)
+        console.print(line, style="bold yellow" if line.startswith("warning: ") else None)
 
 
 @contextmanager
@@ -110,7 +135,7 @@ def _rate(items: float, seconds: float) -> str:
 
 class _Name(ProgressColumn):
     def render(self, task: Task) -> Text:
-        return Text(task.description)
+        return Text(visible(task.description))
 
 
 class _Bar(BarColumn):

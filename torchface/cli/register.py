@@ -5,11 +5,11 @@ from __future__ import annotations
 from math import isnan
 from pathlib import Path
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 _MAX_ROWS = 40
 _NAMED = 3
@@ -60,7 +60,7 @@ def register(
 
     def tell_skipped(entry: CorpusEntry) -> None:
         if not entry.registered and not quiet:
-            console.print(f"[yellow]skipped[/] {escape(entry.scan.name)}: {escape(entry.error)}", highlight=False)
+            console.print(Text("skipped", "yellow"), f"{entry.scan.name}: {entry.error}", highlight=False)
 
     with progress_bars(quiet) as progress:
         done = register_scans(
@@ -95,7 +95,7 @@ def register(
         )
         if not entry.registered:
             numbers = ("skipped", "", "", "")
-        table.add_row(escape(entry.name), *numbers, entry.start, f"{entry.seconds:.1f}")
+        table.add_row(entry.name, *numbers, entry.start, f"{entry.seconds:.1f}")
     console.print(table)
     console.print(
         "95 %: distance of the 95th percentile; on the scan: of what faces outward, the rest is the template's; slid: "
@@ -109,8 +109,8 @@ def register(
             remarks.setdefault(remark, []).append(entry.name)
     for remark, names in list(remarks.items())[:_MAX_ROWS]:
         who = ", ".join(names) if len(names) <= _NAMED else f"{len(names)} of {len(entries)} scans"
-        console.print(f"{escape(who)}: {escape(remark)}", highlight=False)
+        console.print(f"{who}: {remark}", highlight=False)
     if len(entries) > _MAX_ROWS:
         console.print(f"the {_MAX_ROWS} worst; all are in {done.report.summary}")
-    print(done.report.summary)
-    print(done.contact_sheet)
+    print_path(done.report.summary)
+    print_path(done.contact_sheet)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, progress_bars
+from torchface.cli.progress import Quiet, print_path, progress_bars
 
 
 def render(
@@ -36,10 +36,12 @@ def render(
         part: Keep this region only, such as face.
         quiet: Show no progress.
     """
+    from torchface.number_checks import checked_count
     from torchface.rendering.compositing import save_rendered_image
-    from torchface.viz.figures.face_views import clay_colors, face_views
+    from torchface.viz.figures.face_views import PICTURE_HEIGHTS, clay_colors, face_views
     from torchface.workflows.posed_mesh import load_posed, pose_weights
 
+    checked_count("--height", height, *PICTURE_HEIGHTS)
     with progress_bars(quiet) as progress:
         progress("reading")
         posed = load_posed(path, pose_weights(weights), take, frame, part)
@@ -47,4 +49,4 @@ def render(
         colors = clay_colors(posed.mesh) if clay else None
         image = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
         save_rendered_image(image, out)
-    print(out)
+    print_path(out)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, print_lines, progress_bars
+from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
 
 _MAX_NAMES = 12
 
@@ -51,4 +51,4 @@ def retarget(
             more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
             console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)
     print_lines(f"warning: {warning}" for warning in done.warnings)
-    print(out)
+    print_path(out)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def rig(
@@ -70,5 +70,5 @@ def rig(
     with progress_bars(quiet) as progress:
         report = rig_actor(scan, template, out, landmarks, examples, detail, options, progress)
     for line in [*report.lines(), *naming_lines(report.rig, names)]:
-        console.print(line, highlight=False, markup=False)
-    print(out)
+        console.print(line, highlight=False)
+    print_path(out)

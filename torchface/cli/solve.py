@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, print_lines, progress_bars
+from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
 
 
 def solve(
@@ -97,4 +97,4 @@ def solve(
             rig, take, attachment, out, animation, settings, part, report, stream, camera, progress, options, live_link
         )
     print_lines(done.lines())
-    print(out)
+    print_path(out)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def track(
@@ -85,9 +85,9 @@ def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> N
         progress("writing the report")
         page = write_track_page(tracked, out, settings.texture)
     for line in tracked.lines():
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
     for path in (*tracked.products.values(), page):
-        print(path)
+        print_path(path)
 
 
 def _live(
@@ -101,6 +101,6 @@ def _live(
     with nullcontext() if out is None else job_lock(out), progress_bars(quiet) as progress:
         report = track_live(camera, rig, address, out, settings, seconds, progress)
     for line in report.lines():
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
     if report.path is not None:
-        print(report.path)
+        print_path(report.path)

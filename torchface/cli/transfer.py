@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, progress_bars
+from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
 def transfer(
@@ -47,7 +47,7 @@ def transfer(
         save_rig(renamed(transferred.rig, names), out)
     console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
     for line in naming_lines(transferred.rig, names):
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     if summary := transferred.report.summary():
         console.print(summary)
-    print(out)
+    print_path(out)

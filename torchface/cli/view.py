@@ -31,10 +31,12 @@ def view(
         quiet: Show no progress.
     """
     from torchface.io import load_detail_maps, load_rig, load_take
-    from torchface.viz.browser.browser_page import import_viser
+    from torchface.viz.browser.browser_page import HOST, import_viser
+    from torchface.viz.browser.free_port import free_port
     from torchface.viz.browser.rig_viewer import RigViewer
 
     import_viser()  # what is missing should be said before a large rig is read
+    free_port(HOST, port)
     if out is None:
         out = Path("edited_weights.csv") if weights is None else weights.with_name(f"{weights.stem}_edited.csv")
     with progress_bars(quiet) as progress:

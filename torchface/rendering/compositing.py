@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -11,11 +12,13 @@ import torch
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import make_folder, write_file
+from torchface.shown_text import visible
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
@@ -65,9 +68,15 @@ def from_pillow(image: Image.Image) -> Tensor:
 
 
 def from_figure(figure: Figure) -> Tensor:
-    """(3,H,W) in [0,1] of a matplotlib figure."""
+    """(3,H,W) in [0,1] of a matplotlib figure; its texts are taken for what they say, names with dollar signs too."""
+    for text in figure.findobj(Text):
+        if text.get_text():  # those of ticks that have none yet are matplotlib's own
+            text.set_text(visible(text.get_text()))
+            text.set_parse_math(False)
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a name's sign that the font lacks is drawn as a box
+        canvas.draw()
     return torch.from_numpy(np.asarray(canvas.buffer_rgba())[..., :3].copy()).permute(2, 0, 1).float() / 255
 
 

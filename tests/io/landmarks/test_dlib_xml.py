@@ -56,6 +56,8 @@ def test_entities_are_refused_before_they_grow(tmp_path: Path) -> None:
         ("<dataset><images>", "not readable XML"),
         ("no xml", "not readable XML"),
         ("<faces/>", "found no <dataset>"),
+        (FACE.format("<image file='b.jpg'/>"), "found an <image> inside another"),
+        ("<dataset><images><image file='a'><image file='b'/></image></images></dataset>", "inside another"),
         (FACE.format(PART.format("x", 1, 2)), "found a part named 'x', expected 0 to 999"),
         (FACE.format(PART.format(999999, 1, 2)), "found a part named '999999'"),
         (FACE.format(PART.format(1, "nan", 2)), "found x='nan' in a <part>"),

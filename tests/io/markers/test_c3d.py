@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import warnings
 from pathlib import Path
@@ -270,6 +271,10 @@ def _broken(change: str) -> bytes:
         return good[:515] + b"\x01" + good[516:]
     if change == "scale":
         return _build(points, parameters={(1, "SCALE"): (4, (), struct.pack("<f", math.nan))})
+    if change.startswith("data start "):
+        start = struct.pack("<f", float(change.split()[-1]))
+        moved = _build(points, parameters={(1, "DATA_START"): (4, (), start)})
+        return moved[:16] + bytes(2) + moved[18:]  # the header leaves it to the parameter
     return b"solid cube" + bytes(2000)
 
 
@@ -290,6 +295,10 @@ def _broken(change: str) -> bytes:
         ("long parameter", r"parameter 'LABELS': found it to run past the end"),
         ("processor", r"found processor type 1, expected 84"),
         ("scale", r"POINT:SCALE: found nan, expected a number"),
+        *(
+            (f"data start {number}", rf"found the data in block {re.escape(number)}, expected block 3 or later")
+            for number in ("nan", "inf", "-inf", "-3", "1.5", "1e+30")
+        ),
         ("other file", r"found no C3D header, expected"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 
@@ -92,3 +93,40 @@ def test_nan_is_not_encoded() -> None:
 def test_another_version_is_named() -> None:
     with pytest.raises(FileFormatError, match="found version 07, expected 06"):
         decode_frame(b"\x07" + encode_frame(a_frame())[1:])
+
+
+HOSTS = ("a..b", "x" * 300, "x" * 64 + ".org", "\x00", "-", "1.2.3.4.5", "\u00e9", ".", "[::1::]", "no-such.invalid")
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_hosts_that_cannot_be_are_refused(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def resolver(name: str, *_: object, **__: object) -> list[object]:
+        name.encode("idna")  # as the real one does, without a network
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolver)
+    with pytest.raises(ValueRangeError, match=r"^stream: found 'udp://"):
+        LiveLinkSender(f"udp://{host}:11111", ARKIT, 60.0)
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, 1e9, 1e-9, float("nan"), float("inf")])
+def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
+    with pytest.raises(ValueRangeError, match=r"stream: found .* frames a second"):
+        LiveLinkSender("udp://127.0.0.1:11111", ARKIT, fps)
+
+
+def test_broadcast_is_allowed_and_what_cannot_be_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with LiveLinkSender("udp://255.255.255.255:9", ARKIT, 60.0) as sender:
+        own = sender._socket
+        assert own.getsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST) != 0
+
+        class Cut:
+            def sendto(self, *_: object) -> None:
+                raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+            def close(self) -> None:
+                own.close()
+
+        monkeypatch.setattr(sender, "_socket", Cut())
+        with pytest.raises(ValueRangeError, match=r"cannot send to udp://255.* \(Network is unreachable\)"):
+            sender.send(torch.zeros(52))

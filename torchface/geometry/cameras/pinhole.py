@@ -8,6 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.number_checks import checked_count, checked_number
+
+MAX_SIDE = 16384
+"""Pixels that an image may have a side."""
+MAX_ANGLE = 36000.0
+"""Degrees; beyond a hundred turns rounding tells."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -18,6 +25,9 @@ class Camera:
         rotation: world to camera, (3,3).
         translation: world to camera, (3,), millimetres.
         width, height: of the image, pixels.
+
+    Raises:
+        ValueRangeError: a side is not 1 to 16384 pixels.
     """
 
     intrinsics: Tensor
@@ -25,6 +35,10 @@ class Camera:
     translation: Tensor
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            checked_count(f"camera: {name}", getattr(self, name), 1, MAX_SIDE)
 
     @property
     def centre(self) -> Tensor:
@@ -66,7 +80,13 @@ def look_at(
         span: how many millimetres the image's height covers at the target.
         width, height: pixels.
         field_of_view: vertical, degrees; small is a long lens from far away.
+
+    Raises:
+        ValueRangeError: an angle, ``span`` or a size is NaN or out of range.
     """
+    for name, angle in (("yaw", yaw), ("pitch", pitch)):
+        checked_number(name, angle, -MAX_ANGLE, MAX_ANGLE)
+    checked_number("span", span, above=True)
     distance = span / 2 / math.tan(math.radians(field_of_view) / 2)
     a, b = math.radians(yaw), math.radians(pitch)
     viewing_direction = torch.tensor(

@@ -15,6 +15,7 @@ import torch
 from torchface.errors import TorchfaceError
 from torchface.files.extra_packages import import_extra
 from torchface.mesh import Mesh
+from torchface.viz.browser.free_port import free_port
 from torchface.viz.browser.origin_check import only_this_page
 
 if TYPE_CHECKING:
@@ -47,8 +48,10 @@ def start_server(label: str, port: int = 8080) -> viser.ViserServer:
 
     Raises:
         MissingExtraError: viser is not installed.
+        ValueRangeError: no such port, or none from there is free.
     """
     viser = import_viser()
+    port = free_port(HOST, port)
     with _quiet(), only_this_page(f"{label} – torchface" if label != "torchface" else label):
         server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
     # Any page open in the browser could ask viser for a public tunnel to this one; there is none.

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+from html import escape as escape_markup
+
+from torchface.shown_text import visible
 
 _MAX_SHAPES = 8
+
+
+def escape(text: str) -> str:
+    """Text as it is, not as markup."""
+    return escape_markup(visible(text))
 
 
 def shape_list(active: Sequence[tuple[str, float]]) -> str:

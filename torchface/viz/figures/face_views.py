@@ -17,6 +17,8 @@ from torchface.rendering.compositing import caption, from_figure, heat_colors, s
 from torchface.viz.figures.region_colors import as_seen
 
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
+PICTURE_HEIGHTS = (16, 4096)
+"""Least and largest height that a command draws a view in, pixels."""
 
 
 def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:

@@ -11,11 +11,13 @@ from torch import Tensor
 
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.pinhole import MAX_SIDE
 from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.landmark_view import JAW
+from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -118,6 +120,9 @@ def fit_photographs(
     """
     progress = progress or silent
     check_out(out)
+    checked_count("texture_size", texture_size, 0, MAX_SIDE)
+    if face is not None:
+        checked_count("face", face)
     progress("reading the model")
     heads, rig = matching(load_head_model(model), template, part)
     progress(f"reading {len(photographs)} photographs")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,9 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
-from torchface.io.weights.live_link_stream import LiveLinkSender, parse_address
+from torchface.io.weights.live_link_stream import LiveLinkSender, find_receiver
 from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -136,9 +138,12 @@ def track_live(
         FileFormatError: the camera or the video cannot be opened.
     """
     progress = progress or silent
-    parse_address(address)
+    find_receiver(address)
+    if seconds is not None:
+        checked_number("seconds", seconds, above=True)
     actor = load_actor(rig, settings.part)
-    source: Camera | PlayedVideo = Camera(int(camera)) if camera.isdecimal() else PlayedVideo(Path(camera))
+    device = re.fullmatch("[0-9]{1,3}", camera)
+    source: Camera | PlayedVideo = Camera(int(camera)) if device else PlayedVideo(Path(camera))
     with source:
         models = load_track_models(
             actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.video.fps

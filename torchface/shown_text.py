@@ -1,0 +1,18 @@
+"""Text from files as people may see it: what moves a cursor, colours a terminal or turns the line round is spelled."""
+
+from __future__ import annotations
+
+import re
+
+# C0 but for tab and line feed, DEL, C1, marks that change a line's direction, line separators, halves of surrogates.
+_HARMFUL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def visible(text: str) -> str:
+    r"""The text with control characters spelled as Python does.
+
+    Example:
+        >>> visible("smile\x1b[2Jleft")
+        'smile\\x1b[2Jleft'
+    """
+    return _HARMFUL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
