@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -103,6 +104,16 @@ def test_what_a_planted_link_names_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="cannot be written: found a link"), job_lock(tmp_path / "out"):
         pass
     assert (tmp_path / "precious").read_text() == "kept"
+
+
+def test_a_file_system_without_locks_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", fail)
+    with pytest.warns(UserWarning, match="the file system has no locks"), job_lock(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_one_of_many_gets_in_at_any_time(tmp_path: Path) -> None:

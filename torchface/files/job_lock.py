@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
@@ -38,8 +39,11 @@ else:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        except OSError:  # a file system without locks
-            pass
+        except OSError as error:
+            warnings.warn(
+                f"the file system has no locks ({error.strerror}): another run into the same place goes unnoticed",
+                stacklevel=6,
+            )
         return True
 
 

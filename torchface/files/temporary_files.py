@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from platform import node
 
-_NAME = re.compile(r"\.(?P<of>.+)\.(?P<process>\d+)-(?P<machine>[0-9a-f]{8})-[0-9a-f]{8}\.part(\.\w+)?", re.DOTALL)
+_NAME = re.compile(r"\.(?P<of>.+)\.(?P<process>\d+)-(?P<machine>[0-9a-f]{8})-[0-9a-f]{8}\.part", re.DOTALL)
 _LONGEST = 180  # bytes of the name that a temporary one begins with; file systems take 255 in all
 _DAY = 86400
 # On Windows a file is text, its line ends changed, unless it is said to be none; links are Unix's.
@@ -25,19 +25,18 @@ def shortened(name: str) -> str:
     return os.fsencode(name)[:_LONGEST].decode(errors="ignore")
 
 
-def temporary_name(path: Path, ending: str = "") -> Path:
+def temporary_name(path: Path) -> Path:
     """A name beside ``path`` that is nobody else's: of this process, drawn at random, hidden."""
     own = f"{os.getpid()}-{_machine()}-{secrets.token_hex(4)}"
-    return path.with_name(f".{shortened(path.name)}.{own}.part{ending}")
+    return path.with_name(f".{shortened(path.name)}.{own}.part")
 
 
-def new_temporary(path: Path, mode: int = 0o666, ending: str = "") -> tuple[int, Path]:
+def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
     """A new file under a temporary name beside ``path``, open for reading and writing.
 
     Args:
         path: of what it will become.
         mode: permissions, of which the process's umask takes its part.
-        ending: of the temporary name, for writers that go by it.
 
     Returns:
         The descriptor and the temporary path.
@@ -46,7 +45,7 @@ def new_temporary(path: Path, mode: int = 0o666, ending: str = "") -> tuple[int,
         OSError: it cannot be made.
     """
     while True:
-        temporary = temporary_name(path, ending)
+        temporary = temporary_name(path)
         with suppress(FileExistsError):  # drawn before by a process of the same number that died
             return open_plain(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode), temporary
 

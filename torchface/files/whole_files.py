@@ -14,7 +14,7 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 from torchface.files.temporary_files import new_temporary, remove_left_over, temporary_name
-from torchface.files.write_errors import unmade, unwritten
+from torchface.files.write_errors import unmade, unsettled, unwritten
 
 LARGEST_FILE = 2**31
 """Bytes; what a head rig with hundreds of shapes stays well below."""
@@ -51,14 +51,14 @@ def write_file(path: str | Path, data: bytes) -> None:
         FileFormatError: the folder is missing or cannot be written to.
     """
     path = Path(path)
-    with _replaced(path, "") as (handle, _):
+    with _replaced(path) as (handle, _):
         rest = memoryview(data)
         while rest:  # a system takes 2 GB at a time at most
             rest = rest[os.write(handle, rest) :]
 
 
 @contextmanager
-def replaced_file(path: str | Path, ending: str = "") -> Iterator[Path]:
+def replaced_file(path: str | Path) -> Iterator[Path]:
     """A temporary file for a writer that needs a path; it takes the place of ``path`` at the end of the block.
 
     Before it does it is on the disk. An error in the block, or a process that is killed, leaves what was there before.
@@ -66,7 +66,6 @@ def replaced_file(path: str | Path, ending: str = "") -> Iterator[Path]:
 
     Args:
         path: of the file.
-        ending: of the temporary name, for writers that go by it.
 
     Returns:
         The temporary path: an empty file beside ``path``.
@@ -74,7 +73,7 @@ def replaced_file(path: str | Path, ending: str = "") -> Iterator[Path]:
     Raises:
         FileFormatError: it cannot be written; an ``OSError`` of the block is taken for one of its writing.
     """
-    with _replaced(Path(path), ending) as (_, temporary):
+    with _replaced(Path(path)) as (_, temporary):
         yield temporary
 
 
@@ -177,11 +176,11 @@ def check_writable(*files: Path | None, folder: Path | None = None) -> None:
 
 
 @contextmanager
-def _replaced(path: Path, ending: str) -> Iterator[tuple[int, Path]]:
+def _replaced(path: Path) -> Iterator[tuple[int, Path]]:
     try:
         mode = _permissions(path)
         remove_left_over(path.parent, path.name)
-        handle, temporary = new_temporary(path, 0o666 if mode is None else mode, ending)
+        handle, temporary = new_temporary(path, 0o666 if mode is None else mode)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise unwritten(path, error) from error
     waiting = None
@@ -196,7 +195,6 @@ def _replaced(path: Path, ending: str) -> Iterator[tuple[int, Path]]:
         waiting = _waiting.get()
         if waiting is None:
             os.replace(temporary, path)
-            sync_folder(path.parent)
         else:
             waiting.append((temporary, path))
     except OSError as error:
@@ -204,6 +202,11 @@ def _replaced(path: Path, ending: str) -> Iterator[tuple[int, Path]]:
     finally:
         if waiting is None:  # where it has its place already, the temporary name is gone
             _delete(temporary)
+    if waiting is None:
+        try:
+            sync_folder(path.parent)
+        except OSError as error:
+            raise unsettled(path, error) from error
 
 
 def _permissions(path: Path) -> int | None:

@@ -23,6 +23,11 @@ def unwritten(path: Path, error: Exception) -> FileFormatError:
     return FileFormatError(f"{path}: cannot be written: {_reason(path, error)}{kept}")
 
 
+def unsettled(path: Path, error: Exception) -> FileFormatError:
+    """The error of a file that has its place, on a disk that does not say that it will keep it."""
+    return FileFormatError(f"{path}: written, and may be lost in a power cut: {_reason(path, error)}")
+
+
 def unmade(folder: Path, error: Exception) -> FileFormatError:
     """The error of a folder that could not be made; see :func:`unwritten`."""
     return FileFormatError(f"{folder}: found no folder, and it cannot be made: {_reason(folder, error)}")

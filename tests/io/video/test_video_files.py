@@ -141,13 +141,13 @@ def test_a_video_cut_off_without_a_word_does_not_replace_the_one_before(
     before, opened = path.read_bytes(), av.open
 
     @contextmanager
-    def cut_off(file: str) -> Iterator[object]:
-        with opened(file, "w") as container:
+    def cut_off(file: str, container_format: str) -> Iterator[object]:
+        with opened(file, "w", format=container_format) as container:
             yield container
         os.truncate(file, int(kept * Path(file).stat().st_size))
 
-    def on_a_full_disk(file: str, mode: str, **options: object) -> object:
-        return cut_off(file) if mode == "w" else opened(file, mode, **options)  # type: ignore[call-overload]
+    def on_a_full_disk(file: str, mode: str, format: str, **options: object) -> object:
+        return cut_off(file, format) if mode == "w" else opened(file, mode, format, **options)  # type: ignore[call-overload]
 
     with monkeypatch.context() as patch:
         patch.setattr(video_writing.av, "open", on_a_full_disk)

@@ -24,7 +24,7 @@ from torchface.io.video.packets import read_packets
 from torchface.io.video.video_file import VideoFile, open_video
 from torchface.number_checks import check_rate
 
-_SUFFIXES = (".avi", ".mkv", ".mp4")
+_FORMATS = {".avi": "avi", ".mkv": "matroska", ".mp4": "mp4"}
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
 _LOSSY = ("yuv420p", "yuv444p")
 _MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30
@@ -46,16 +46,16 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
         ValueRangeError: ``fps`` is no camera's.
     """
     path = Path(path)
-    if path.suffix.lower() not in _SUFFIXES:
-        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_SUFFIXES)}")
+    if path.suffix.lower() not in _FORMATS:
+        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected {', '.join(_FORMATS)}")
     check_rate(fps, "fps", ValueRangeError)
     single = _single(frames)
     first = next(single, None)
     if first is None:
         raise ShapeError(f"{path}: found no frame, expected at least one")
-    with replaced_file(path, path.suffix.lower()) as temporary:
+    with replaced_file(path) as temporary:
         try:
-            with av.open(str(temporary), "w") as container:
+            with av.open(str(temporary), "w", format=_FORMATS[path.suffix.lower()]) as container:
                 count = _encode(container, first, single, fps)
         except av.FFmpegError as error:
             if isinstance(error, OSError):
