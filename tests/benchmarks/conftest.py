@@ -13,6 +13,29 @@ import pytest
 import torch
 from threadpoolctl import threadpool_limits
 
+# Of every comparison, as PyPI names them.
+PEERS = (
+    "numpy",
+    "scipy",
+    "scikit-learn",
+    "opencv-contrib-python-headless",
+    "onnxruntime",
+    "trimesh",
+    "daqp",
+    "piqp",
+    "osqp",
+    "proxsuite",
+    "quadprog",
+    "eos-py",
+    "dlib",
+    "menpofit",
+)
+
+
+def pytest_report_header() -> list[str]:
+    """Machine and versions of all peers, above the tables that print none of their own."""
+    return machine(*PEERS)
+
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
@@ -29,12 +52,14 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture
 def print_machine() -> Callable[..., None]:
     """Prints processor, cores, threads, and the versions of the packages (names on PyPI) that are compared."""
+    return lambda *packages: print("", *machine(*packages), sep="\n")
 
-    def show(*packages: str) -> None:
-        print(f"\n{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads; processor time")
-        print(", ".join(f"{name} {_version(name)}" for name in ("torch", *packages)))
 
-    return show
+def machine(*packages: str) -> list[str]:
+    return [
+        f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads; processor time",
+        ", ".join(f"{name} {_version(name)}" for name in ("torch", *packages)),
+    ]
 
 
 def _processor() -> str:

@@ -1,5 +1,5 @@
-"""Claim: learned from 30 scanned performers, landmarks of 20 others are found to 8 pixels at 1024², lip and lid lines
-to 3; with and without texture; on a real scan eyes, nose and mouth to 6 mm."""
+"""Claim: learned from 30 scanned performers, landmarks of 20 others are found to 2.4 pixels at 1024², lip and lid lines
+to half a pixel, by their texture; by form alone to 8; on a real scan eyes, nose and mouth to 6 mm."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ def detectors(scans: list[AnnotatedScan]) -> dict[str, UVLandmarkDetector]:
     return {"texture": fit(scans[:LEARN], "texture"), "curvature": fit(scans[:LEARN], "curvature")}
 
 
-@pytest.mark.parametrize(("kind", "line_limit"), [("texture", 3.0), ("curvature", None)])
+@pytest.mark.parametrize(("kind", "limit", "line_limit"), [("texture", 2.5, 0.5), ("curvature", 8.0, None)])
 def test_landmarks_of_scanned_performers(
     kind: str,
+    limit: float,
     line_limit: float | None,
     scans: list[AnnotatedScan],
     detectors: dict[str, UVLandmarkDetector],
@@ -60,7 +61,7 @@ def test_landmarks_of_scanned_performers(
     for name, value in zip(UV_LANDMARK_NAMES, each.tolist(), strict=True):
         print(f"    {name:30}{value:8.2f}")
     save_rendered_image(sheet(pictures[:6], 3), PICTURES / f"performers_{kind}.png")
-    assert table["mean error, pixels"] <= 8.0
+    assert table["mean error, pixels"] <= limit
     if line_limit is not None:
         assert max(table[f"{line}, pixels"] for line in ("right_lids", "left_lids", "lips")) <= line_limit
 
