@@ -258,8 +258,10 @@ def test_one_frame_at_a_time(
     assert rows[0].gap <= 1e-5
     assert rows[1].gap <= 1e-12
     assert rows[2].gap <= 1e-6
-    if "OSQP 1e-5" in found:
-        assert rows[0].milliseconds < found["OSQP 1e-5"].milliseconds
+    # DAQP is the quicker one here.
+    for name, share in (("OSQP 1e-5", 0.75), ("DAQP", 7.0)):
+        if name in found:
+            assert rows[0].milliseconds < share * found[name].milliseconds
 
 
 def test_an_h_a_frame_when_markers_are_missing(
