@@ -48,7 +48,7 @@ def test_without_viser_the_extra_is_named_before_anything_is_read(monkeypatch: p
 @on_linux
 def test_the_page_listens_on_the_loopback_address_and_nowhere_else(viewer: RigViewer) -> None:
     port = viewer.server.get_port()
-    assert viewer.url == f"http://127.0.0.1:{port}"
+    assert viewer.url.startswith(f"http://127.0.0.1:{port}/")
     loopback = "".join(f"{byte:02X}" for byte in reversed((127, 0, 0, 1)))
     assert listening_addresses(port) == {loopback}
 

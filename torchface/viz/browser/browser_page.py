@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import secrets
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from torchface.files.extra_packages import import_extra
 from torchface.mesh import Mesh
 from torchface.viz.browser.free_port import free_port
 from torchface.viz.browser.origin_check import only_this_page
+from torchface.viz.browser.page_messages import MessageCheck
 
 if TYPE_CHECKING:
     import viser
@@ -39,11 +41,12 @@ def import_viser() -> Any:
     return import_extra("viser", "viser", "viewer", "the viewer")
 
 
-def start_server(label: str, port: int = 8080) -> viser.ViserServer:
-    """A page on ``http://127.0.0.1:PORT``, or on the next port that is free.
+def start_server(label: str, token: str, port: int = 8080) -> viser.ViserServer:
+    """A page on ``http://127.0.0.1:PORT/TOKEN/``, or on the next port that is free.
 
     Args:
         label: heads the panel, and names the browser's tab.
+        token: what the page's address must name: other users of this machine do not know it.
         port: the first to try; 0 takes any that is free.
 
     Raises:
@@ -52,8 +55,11 @@ def start_server(label: str, port: int = 8080) -> viser.ViserServer:
     """
     viser = import_viser()
     port = free_port(HOST, port)
-    with _quiet(), only_this_page(f"{label} – torchface" if label != "torchface" else label):
+    messages = MessageCheck()
+    title = f"{label} – torchface" if label != "torchface" else label
+    with _quiet(), only_this_page(title, token, messages.accepts):
         server = viser.ViserServer(host=HOST, port=port, label=label, verbose=False)
+    messages.watch(server)
     # Any page open in the browser could ask viser for a public tunnel to this one; there is none.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
     server.scene.set_up_direction("+y")
@@ -79,12 +85,13 @@ class BrowserPage:
     def __init__(self, label: str, port: int) -> None:
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self.server = start_server(label, port)
+        self._token = secrets.token_urlsafe(16)
+        self.server = start_server(label, self._token, port)
 
     @property
     def url(self) -> str:
-        """Where the page is."""
-        return f"http://{HOST}:{self.server.get_port()}"
+        """Where the page is; who knows the whole of it may use the page."""
+        return f"http://{HOST}:{self.server.get_port()}/{self._token}/"
 
     def stop(self) -> None:
         """Closes the page."""

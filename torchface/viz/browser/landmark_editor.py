@@ -205,28 +205,30 @@ class LandmarkEditor(BrowserPage):
             return
         eye = torch.tensor(event.client.camera.position, dtype=torch.float64)
         with self._lock:
-            if event.phase == "start":
-                self.chosen = event.instance_index
-                self.session.grab(self.chosen)
-                grabbed = self._under(eye, event.start_position)
-                self._offset = self.session.landmarks[self.chosen] - grabbed
             try:
+                if event.phase == "start":
+                    self.session.grab(event.instance_index)
+                    self.chosen = event.instance_index
+                    grabbed = self._under(eye, event.start_position)
+                    self._offset = self.session.landmarks[self.chosen] - grabbed
                 self.session.drag(
                     self._under(eye, event.end_position) + self._offset, self._reach.value * self.session.extent
                 )
-            except TorchfaceError:  # an undo in between has let it go, or the pointer left the image's plane
+            except TorchfaceError:  # no such dot, an undo has let it go, or the pointer left the image's plane
                 return
-            if event.phase == "end":
-                self.session.let_go()
+            finally:
+                if event.phase == "end":
+                    self.session.let_go()
             self._refresh()
 
     def _under(self, eye: Tensor, point: tuple[float, float, float]) -> Tensor:
         return self.to_pixels(eye, torch.tensor(point, dtype=torch.float64) - eye)
 
     def _dot_clicked(self, event: Any) -> None:
-        with self._lock:
-            self.chosen = event.instance_index
-            self._refresh()
+        if event.instance_index in range(len(self.session.landmarks)):
+            with self._lock:
+                self.chosen = event.instance_index
+                self._refresh()
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         """Brings the chosen landmark to a click on the image; a click on a dot has just chosen it."""

@@ -1,10 +1,11 @@
-"""Requests that a page answers: its own, and none of another page in the same browser."""
+"""Requests that a page answers: those with its token, and none of another page in the same browser."""
 
 from __future__ import annotations
 
 import importlib
+import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from html import escape
 from http import HTTPStatus
@@ -16,10 +17,19 @@ if TYPE_CHECKING:
 
 _HOSTS = ("127.0.0.1", "localhost")
 _TITLE = b"<title>Viser</title>"
-_NO_FRAMING = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
+_HEADERS = {
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",  # the address holds the token
+    "Cache-Control": "no-store",
+}
+_LARGEST_MESSAGE = 2**16
+"""Bytes; what a page's inputs, clicks and camera have to say takes a hundredth of that."""
+_MAX_REFUSED = 100
 _starting = threading.Lock()
 
 Serve = Callable[["ServerConnection", "Request"], "Response | None"]
+Listen = Callable[["ServerConnection"], Awaitable[None]]
 
 
 def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
@@ -38,18 +48,43 @@ def is_allowed(host: str | None, origin: str | None, port: int) -> bool:
     return host in places and (origin is None or origin in {f"http://{place}" for place in places})
 
 
-@contextmanager
-def only_this_page(title: str) -> Iterator[None]:
-    """Servers that viser starts meanwhile answer their own page alone, show it in no frame, and call it by ``title``.
+def without_token(path: str, token: str) -> str | None:
+    """A request's path without the token that it must begin with; None where it does not.
 
-    viser hands its server's handshake to ``websockets`` and has no setting for either.
+    Args:
+        path: of the request, such as ``/TOKEN/index.html``.
+        token: of the page.
+
+    Example:
+        >>> without_token("/secret/index.html?a=1", "secret"), without_token("/index.html", "secret")
+        ('/index.html?a=1', None)
+    """
+    bare, mark, query = path.partition("?")
+    first, _, rest = bare.removeprefix("/").partition("/")
+    same = bare.startswith("/") and secrets.compare_digest(first.encode(), token.encode())
+    return f"/{rest}{mark}{query}" if same else None
+
+
+@contextmanager
+def only_this_page(title: str, token: str, accepts: Callable[[bytes | str], bool]) -> Iterator[None]:
+    """Servers that viser starts meanwhile answer their own page alone, under a path that begins with the token.
+
+    The page is shown in no frame, and called by ``title``. viser hands its server's handshake to ``websockets`` and has
+    no setting for any of these.
+
+    Args:
+        title: of the browser's tab.
+        token: that a request for the page, and for its socket, must name.
+        accepts: which messages of a browser get through; a browser that sends a hundred others is disconnected.
     """
     server: Any = importlib.import_module("websockets.asyncio.server")
     with _starting:
         before = server.serve
 
-        def serve(*arguments: Any, process_request: Serve, **more: Any) -> Any:
-            return before(*arguments, process_request=_guarded(process_request, title), **more)
+        def serve(listen: Listen, *arguments: Any, process_request: Serve, **more: Any) -> Any:
+            more["max_size"] = _LARGEST_MESSAGE
+            guarded = _guarded(process_request, title, token)
+            return before(_filtered(listen, accepts), *arguments, process_request=guarded, **more)
 
         server.serve = serve
         try:
@@ -58,7 +93,26 @@ def only_this_page(title: str) -> Iterator[None]:
             server.serve = before
 
 
-def _guarded(answer: Serve, title: str) -> Serve:
+def _filtered(listen: Listen, accepts: Callable[[bytes | str], bool]) -> Listen:
+    async def listen_to_accepted(connection: ServerConnection) -> None:
+        receive = connection.recv
+        refused = 0
+
+        async def next_accepted() -> bytes | str:
+            nonlocal refused
+            while not accepts(message := await receive()):
+                refused += 1
+                if refused > _MAX_REFUSED:
+                    await connection.close(1008, "This page takes no such messages.")
+            return message
+
+        setattr(connection, "recv", next_accepted)  # noqa: B010
+        await listen(connection)
+
+    return listen_to_accepted
+
+
+def _guarded(answer: Serve, title: str, token: str) -> Serve:
     named = b"<title>" + escape(title).encode() + b"</title>"
 
     def process(connection: ServerConnection, request: Request) -> Response | None:
@@ -67,13 +121,17 @@ def _guarded(answer: Serve, title: str) -> Serve:
         port = connection.local_address[1]
         if len(hosts) != 1 or len(origins) > 1 or not is_allowed(hosts[0], origins[0] if origins else None, port):
             return connection.respond(HTTPStatus.FORBIDDEN, "This page is for this machine's own browser alone.\n")
+        path = without_token(request.path, token)
+        if path is None:
+            return connection.respond(HTTPStatus.FORBIDDEN, "Open the whole address that torchface has printed.\n")
+        request.path = path
         document = request.path.partition("?")[0] in ("/", "/index.html")
         if document and "Accept-Encoding" in request.headers:
             # As it lies on disk: a packed one could not be given its title.
             del request.headers["Accept-Encoding"]
         response = answer(connection, request)
         if response is not None:
-            for name, value in _NO_FRAMING.items():
+            for name, value in _HEADERS.items():
                 response.headers[name] = value
             if document and response.body is not None:
                 response.body = response.body.replace(_TITLE, named, 1)

@@ -228,6 +228,8 @@ class PickSession:
 
 
 def _first_hit(caster: RayCaster, mesh: Mesh, origin: Tensor, direction: Tensor) -> SurfacePoint | None:
+    if not (torch.isfinite(origin).all() and torch.isfinite(direction).all() and direction.any()):
+        raise ValueRangeError(f"click: found a ray {origin.tolist()}, {direction.tolist()}, expected a finite one")
     unit = torch.nn.functional.normalize(direction.double(), dim=0)
     hits = caster.cast(origin.double()[None], unit[None])
     triangle = int(hits.triangle[0])
