@@ -20,7 +20,8 @@ def view(
     """Show a rig in the browser: a slider a shape, symmetric editing, playback of a take, wrinkle maps,
     saving edited weights.
 
-    The page is at 127.0.0.1 and no other machine can open it. Needs the extra: pip install '.[viewer]' in a checkout.
+    The page is at 127.0.0.1, no other machine can open it, and none but who knows the whole address that is printed.
+    Needs the extra: pip install '.[viewer]' in a checkout.
 
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.

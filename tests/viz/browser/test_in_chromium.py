@@ -70,6 +70,9 @@ def thumb(chromium: Any, label: str, which: int = 0) -> Any:
     return element
 
 
+_BOX = "return arguments[0].closest('[id]').parentElement.querySelector('input[inputmode]')"
+
+
 @pytest.fixture(scope="module")
 def viewer(chromium: Any, ball_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigViewer]:
     ramp = torch.linspace(0, 1, 240)[:, None, None]
@@ -110,6 +113,22 @@ def test_a_slider_moves_the_mesh_that_the_browser_shows(chromium: Any, viewer: R
     assert torch.equal(shown(chromium, "/head/part1")[1], nose)
     until(lambda: np.abs(picture(chromium) - before).max() > 40)
     until(lambda: "mouthSmileLeft" in chromium.find_element("tag name", "body").text)
+
+
+def test_a_number_that_is_typed_beyond_the_slider_ends_at_its_end(chromium: Any, viewer: RigViewer) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    seen: list[float] = []
+    handle = viewer.sliders["eyeBlinkLeft"].handle
+    handle.on_update(lambda event: seen.append(event.target.value))
+    box = chromium.execute_script(_BOX, thumb(chromium, "Blink L"))
+    box.send_keys(Keys.CONTROL + "a")
+    box.send_keys("57", Keys.TAB)
+    until(lambda: float(viewer.editor.pose[6]) == 1.0)
+    until(lambda: box.get_attribute("value") == "1")
+    assert max(seen) <= 1.0
+    viewer.editor.reset()
+    viewer.show_frame(0)
 
 
 def test_reset_and_save_are_buttons_of_the_page(chromium: Any, viewer: RigViewer) -> None:
