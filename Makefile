@@ -34,6 +34,8 @@ lint: $(VENV)/.installed-lint
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
+	$(VENV)/bin/pip-licenses --output-file $(VENV)/licences.txt
+	$(RUN) -m pytest -q tests/test_licences.py
 
 demo: $(STAMP)
 	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")

@@ -119,7 +119,7 @@ def lsq_solver(H: np.ndarray) -> Solver:
 def installed(module: str) -> bool:
     """Whether a peer is there; where it is not, its row is left out."""
     if find_spec(module) is None:
-        print(f"{module} is not installed (pip install '.[bench]'): its row is left out")
+        print(f"{module} is not installed (pip install {module}): its row is left out")
         return False
     return True
 
