@@ -27,7 +27,6 @@ GPL_PARTS = {
 }
 """Packages whose wheels may hold libraries, or texts of licences, that the GPL governs, and why."""
 LGPL_PARTS = {
-    "pebble": "Python, imported as it is: whoever ships it can replace it",
     "opencv-contrib-python-headless": "FFmpeg without GPL parts, as shared libraries beside",
     "setuptools": "a package inside that builds setuptools; nothing of torchface imports it",
 }
@@ -103,7 +102,7 @@ def packages() -> dict[str, list[PackagePath]]:
 
 
 def test_what_the_core_needs_is_here(packages: dict[str, list[PackagePath]]) -> None:
-    assert {"torch", "numpy", "scipy", "opencv-contrib-python-headless", "av", "qdldl", "pebble"} <= set(packages)
+    assert {"torch", "numpy", "scipy", "opencv-contrib-python-headless", "av", "qdldl"} <= set(packages)
     assert not {"quadprog", "cholespy"} & set(packages)
 
 
