@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import resource
 import stat
 import subprocess
@@ -311,3 +312,43 @@ def test_a_folder_that_was_made_for_nothing_goes(tmp_path: Path) -> None:
     with pytest.raises(KeyError), made_folder(tmp_path / "a" / "b"):
         raise KeyError
     assert names(tmp_path) == []
+
+
+KILLED_HALF_WAY = """
+import os, sys
+from pathlib import Path
+from torchface.files.whole_files import all_or_none, write_file
+rename = os.replace
+def second_kills(source, target):
+    if target.name == "b":
+        os.kill(os.getpid(), 9)
+    rename(source, target)
+os.replace = second_kills
+with all_or_none():
+    for name in "abc":
+        write_file(Path(sys.argv[1]) / name, b"after")
+"""
+
+
+def test_a_group_killed_between_two_renames_leaves_whole_files_and_the_next_run_mends_it(tmp_path: Path) -> None:
+    for name in "abc":
+        (tmp_path / name).write_bytes(b"before")
+    assert subprocess.run([sys.executable, "-c", KILLED_HALF_WAY, tmp_path], check=False).returncode == -9
+    assert [(tmp_path / name).read_bytes() for name in "abc"] == [b"after", b"before", b"before"]
+    with job_lock(tmp_path), all_or_none():
+        for name in "abc":
+            write_file(tmp_path / name, b"after")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys("abc", b"after")
+
+
+def test_nothing_in_the_library_writes_past_whole_files() -> None:
+    root = Path(__file__).resolve().parents[2]
+    past = re.compile(r"os\.re(place|name)\(|\.write_(bytes|text)\(|\bopen\([^)\n]*[\"'][rb]*[wax]|\.touch\(|\.mkdir\(")
+    own = {"torchface/files/whole_files.py", "torchface/io/meshes/mesh_sequence.py"}  # the latter grows in its place
+    found = {
+        path.relative_to(root).as_posix()
+        for folder in ("torchface", "train")
+        for path in (root / folder).rglob("*.py")
+        if past.search(path.read_text())
+    }
+    assert found == own
