@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,11 @@ from torchface.errors import FileFormatError
 _MAX_BYTES = 2**36
 _MAX_SIDE = 8192
 _MAX_PIXELS = 4096 * 4096
+_BYTES_ALWAYS, _BYTES_PER_BYTE = 490 * 2**20, 18
+_REFERENCES = {"h264": 16, "hevc": 16, "vvc": 16, "vp9": 8, "libdav1d": 10, "av1": 10, "libaom-av1": 10}
+_FEW_REFERENCES = 3  # of other codecs, those that keep every frame whole among them
+_CONVERTED_BYTES = 6  # a pixel, as red, green and blue and in the chunk that is given
+_USUAL_BITS = 12  # a pixel, where only a frame will tell
 _MOV_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 
 
@@ -23,15 +29,17 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container of a file and its video stream, ready to be decoded.
 
     FFmpeg would also follow playlists that name other files and addresses: the demuxer is named here, by the file's
-    first bytes. No frame of more than 4096 x 4096 pixels is decoded.
+    first bytes. No frame of more than 4096 x 4096 pixels is decoded, nor one of which as many as the codec may hold
+    take more than 490 MiB, or 18 times the file.
 
     Raises:
         FileFormatError: the file is missing, no video, of a codec that is not there, or of absurd size.
     """
     demuxer = _demuxer(path)
     limit = {"max_pixels": str(_MAX_PIXELS)}
+    opening = limit | {"skip_frame": "all"}  # FFmpeg would decode a frame of each stream, and there may be hundreds
     try:
-        container = av.open(str(path.resolve()), "r", format=demuxer, options=limit, metadata_errors="replace")
+        container = av.open(str(path.resolve()), "r", format=demuxer, options=opening, metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         raise FileFormatError(f"{path}: cannot be opened as a video: cut off or damaged ({reason(error)})") from error
     with container:
@@ -47,7 +55,35 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             )
         context.options = limit
         context.thread_type = "AUTO"
+        bits = _USUAL_BITS if context.format is None else context.format.padded_bits_per_pixel
+        beside = frames_beside(path, context.name, width, height, bits)
+        context.thread_count = beside if beside < (os.cpu_count() or 1) else 0  # 0: as FFmpeg likes
         yield container, stream
+
+
+def frames_beside(path: Path, codec: str, width: int, height: int, bits: int) -> int:
+    """How many frames may be decoded beside one another, at least one, within the budget of memory.
+
+    Args:
+        path: the file.
+        codec: FFmpeg's name.
+        width, height: pixels.
+        bits: of a pixel.
+
+    Raises:
+        FileFormatError: as many frames as the codec may refer to would take more than a file of this size may.
+    """
+    pixels, size = width * height, path.stat().st_size
+    frame = max(1, pixels * bits // 8)
+    room = max(_BYTES_ALWAYS, _BYTES_PER_BYTE * size)
+    room -= _REFERENCES.get(codec, _FEW_REFERENCES) * frame + _CONVERTED_BYTES * pixels
+    if room < 0:
+        raise FileFormatError(
+            f"{path}: found frames of {width} x {height} pixels, {bits} bits each, in a file of {size} bytes, expected "
+            f"frames whose decoding takes at most {_BYTES_ALWAYS >> 20} MiB. To convert it: "
+            f"ffmpeg -i {path.name} -vf scale=iw/2:ih/2 -pix_fmt yuv420p {path.stem}_half.mp4"
+        )
+    return max(1, room // frame)
 
 
 def reason(error: Exception) -> str:

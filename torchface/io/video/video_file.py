@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,7 @@ from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.video.container import open_container, reason
+from torchface.io.video.container import frames_beside, open_container, reason
 from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
 from torchface.io.video.timing import check_even_rate
 from torchface.number_checks import check_rate
@@ -67,8 +67,7 @@ class VideoFile:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
             ValueRangeError: ``frames`` is not positive.
         """
-        grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in self._decoded())
-        yield from _chunks(grey, frames, (self.height, self.width))
+        yield from self._chunks(frames, (self.height, self.width), _grey_into)
 
     def color_chunks(self, frames: int = 16) -> Iterator[Tensor]:
         """The frames in colour as uint8 tensors (t,3,H,W), red first, up to ``frames`` at a time, as ``chunks``.
@@ -77,8 +76,7 @@ class VideoFile:
             FileFormatError: the video ends before it should, changes its frames' size, or has a variable frame rate.
             ValueRangeError: ``frames`` is not positive.
         """
-        planes = (np.stack(cv2.split(frame)) for frame in self._decoded())
-        yield from _chunks(planes, frames, (3, self.height, self.width))
+        yield from self._chunks(frames, (3, self.height, self.width), _planes_into)
 
     def frames(self) -> Iterator[Tensor]:
         """The frames one by one, uint8 (H,W)."""
@@ -102,6 +100,23 @@ class VideoFile:
             if i == number:
                 return frame
         raise ValueRangeError(f"{self.path}: asked for frame {number}, found fewer")
+
+    def _chunks(
+        self, most: int, shape: tuple[int, ...], fill: Callable[[np.ndarray, np.ndarray], None]
+    ) -> Iterator[Tensor]:
+        """Up to ``most`` frames together and as many of this shape as 32 MiB hold, each copied to where it stays."""
+        if most < 1:
+            raise ValueRangeError(f"frames: found {most}, expected at least 1")
+        size = max(1, min(most, _CHUNK_BYTES // math.prod(shape)))
+        decoded = self._decoded()
+        while True:
+            chunk, count = np.empty((size, *shape), np.uint8), 0
+            for count, frame in enumerate(islice(decoded, size), 1):  # a decoder gives one frame at a time
+                fill(frame, chunk[count - 1])
+            if count:
+                yield torch.from_numpy(chunk[:count])
+            if count < size:
+                return
 
     def _decoded(self) -> Iterator[np.ndarray]:
         """Checked frames, red first, (H,W,3)."""
@@ -161,28 +176,20 @@ def open_video(path: str | Path) -> VideoFile:
 
 def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[np.ndarray]:
     """Upright frames (H,W,3) of the packets that can be decoded; what is wrong with the others goes to ``errors``."""
-    reformatter = VideoReformatter()
+    reformatter, path, codec = VideoReformatter(), Path(container.name), stream.codec_context.name
     for packet in packets_of(container, stream, errors):  # a decoder takes one packet at a time
         try:
             for frame in stream.decode(packet):
+                frames_beside(path, codec, frame.width, frame.height, frame.format.padded_bits_per_pixel)
                 rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BICUBIC)
                 yield np.ascontiguousarray(np.rot90(rgb.to_ndarray(), quarter_turns(frame)))
         except (av.FFmpegError, ValueError) as error:
             errors.append(f" ({reason(error)})")
 
 
-def _chunks(frames: Iterable[np.ndarray], most: int, shape: tuple[int, ...]) -> Iterator[Tensor]:
-    """Frames of a shape, up to ``most`` together and as many as 32 MiB hold, copied where they stay."""
-    if most < 1:
-        raise ValueRangeError(f"frames: found {most}, expected at least 1")
-    size = max(1, min(most, _CHUNK_BYTES // math.prod(shape)))
-    iterator = iter(frames)
-    while True:
-        chunk = np.empty((size, *shape), np.uint8)
-        count = 0
-        for count, frame in enumerate(islice(iterator, size), 1):  # a decoder gives one frame at a time
-            chunk[count - 1] = frame
-        if count:
-            yield torch.from_numpy(chunk[:count])
-        if count < size:
-            return
+def _grey_into(frame: np.ndarray, place: np.ndarray) -> None:
+    cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY, dst=place)
+
+
+def _planes_into(frame: np.ndarray, place: np.ndarray) -> None:
+    cv2.split(frame, list(place))
