@@ -25,6 +25,7 @@ from torchface.synthetic.stages.portrait_video import (
     render_portrait_video,
 )
 from torchface.viz.browser.annotation_session import AnnotationSession
+from torchface.workflows import annotate_video
 from torchface.workflows.annotate_video import PROPOSALS, prepare_annotation, write_proposals
 from train.appearance import Settings, train
 
@@ -64,7 +65,9 @@ def test_proposals_are_the_frames_that_differ_and_wait_for_the_next_run(
     chosen = choose_frames(tracker.landmarks, 5).tolist()
     assert [frame.name for frame in found.frames] == [f"actor_{number:06d}" for number in chosen]
     for number, frame in zip(chosen, found.frames, strict=True):
-        torch.testing.assert_close(frame.image, film.frames[number].float().expand(3, -1, -1) / 255, atol=2e-2, rtol=0)
+        assert frame.image.dtype == torch.uint8  # as floats fifteen frames in 4K take 1.5 GB
+        shown = film.frames[number].float().expand(3, -1, -1) / 255
+        torch.testing.assert_close(frame.image.float() / 255, shown, atol=2e-2, rtol=0)
         torch.testing.assert_close(frame.landmarks.float(), tracker.landmarks[number])
     assert not found.saved
     again = prepare_annotation(video, tmp_path, tracker, 5)
@@ -211,3 +214,11 @@ def test_the_command_writes_proposals_of_the_zoos_tracker(
         main(["annotate", str(video), "--out", str(tmp_path / "new"), "--landmarks", "head", "--no-browser", "--quiet"])
     assert ended.value.code == 2
     assert not (tmp_path / "new").exists()
+
+
+def test_frames_that_do_not_fit_into_memory_are_refused(
+    video: Path, tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(annotate_video, "_MAX_PIXEL_BYTES", 10**6)
+    with pytest.raises(ValueRangeError, match=r"count: found \d+ frames of \d+ x \d+ pixels, expected at most \d"):
+        prepare_annotation(video, tmp_path, tracker, 15)

@@ -23,6 +23,7 @@ _FORMAT = "torchface proposals 2"
 _METHOD = "annotation proposals/2"
 _MAX_BYTES = 16 * 2**20
 _MAX_FRAMES = 1000
+_MAX_PIXEL_BYTES = 2**31
 Tracker = Callable[[VideoFile], tuple[Tensor, Tensor | None]]
 """Landmarks (T,68,2) of a video, NaN where lost, and the confidence of each, (T,68) in [0,1]."""
 
@@ -117,11 +118,22 @@ def _points(folder: Path, video: VideoFile, number: int) -> Path:
 
 
 def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
-    """Frames (3,H,W) in [0,1] by number, in one pass: codecs seek wrongly too often."""
+    """Frames (3,H,W), uint8, by number, in one pass: codecs seek wrongly too often.
+
+    Raises:
+        FileFormatError: the video is shorter.
+        ValueRangeError: they do not fit into memory.
+    """
     wanted, found = set(numbers), {}
+    most = _MAX_PIXEL_BYTES // (3 * video.width * video.height)
+    if len(wanted) > most:
+        raise ValueRangeError(
+            f"count: found {len(wanted)} frames of {video.width} x {video.height} pixels, expected at most {most}, "
+            f"which take {_MAX_PIXEL_BYTES >> 20} MiB"
+        )
     for number, frame in enumerate(video.color_frames()):
         if number in wanted:
-            found[number] = frame.float() / 255
+            found[number] = frame.clone()  # not the chunk that it came in
             if len(found) == len(wanted):
                 break
     missing = wanted - set(found)

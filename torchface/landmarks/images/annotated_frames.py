@@ -22,7 +22,7 @@ class AnnotatedFrame:
 
     Args:
         name: of its files, without ending.
-        image: (3,H,W) in [0,1].
+        image: (3,H,W), uint8 or in [0,1].
         landmarks: iBUG's 68, (68,2) pixels.
     """
 
@@ -66,6 +66,6 @@ def save_annotated_frame(frame: AnnotatedFrame, folder: str | Path) -> Path:
     image_path, points = folder / f"{frame.name}.png", folder / f"{frame.name}.pts"
     with made_folder(folder), all_or_none():
         if not image_path.exists():
-            save_image(frame.image, image_path)
+            save_image(frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image, image_path)
         save_pts(torch.as_tensor(frame.landmarks), points)
     return points

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import TorchfaceError
+from torchface.io.video import to_bytes
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.viz.browser.browser_page import BrowserPage, icon
 from torchface.viz.browser.html_lists import caption, pick_list
@@ -135,7 +136,7 @@ class LandmarkEditor(BrowserPage):
 
     def _show_frame(self) -> None:
         session = self.session
-        image = (session.frame.image.permute(1, 2, 0).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        image = to_bytes(session.frame.image).permute(1, 2, 0).contiguous().numpy()
         height, width = image.shape[:2]
         scene = self.server.scene
         with self.server.atomic():

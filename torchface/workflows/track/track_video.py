@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from pathlib import Path
 
 import torch
@@ -223,26 +224,29 @@ def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, p
     tracker = LandmarkTracker(models.trees, models.appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
-    for chunk in clip.chunks(PIECE):
+    frames = clip.frames()
+    for first in frames:
         if at == 0:
-            faces = len(find_faces(chunk[0]))
-        if at >= kept:
-            if len(last):
-                # Each piece starts from the one before alone, so that a run that was killed gives the same landmarks.
-                tracker.resume(last.landmarks[-1], last.confidence[-1])
-            found = []
-            for number, frame in enumerate(chunk):  # a frame's box is the one before's
-                found.append(tracker.step(frame))
-                progress("tracking landmarks", at + number + 1, max(clip.count, at + number + 1))
-            last = TrackedFrames(
-                torch.stack([one.landmarks for one in found]),
-                torch.stack([one.confidence for one in found]),
-                torch.stack([one.box for one in found]),
-            )
-            state.append(last)
-        at += len(chunk)
-        if at <= kept:
+            faces = len(find_faces(first))
+        piece = chain([first], islice(frames, PIECE - 1))  # one by one: 64 frames in 4K take half a gigabyte
+        if at < kept:
+            at += sum(1 for _ in piece)
             progress("tracking landmarks", at, max(clip.count, at))
+            continue
+        if len(last):
+            # Each piece starts from the one before alone, so that a run that was killed gives the same landmarks.
+            tracker.resume(last.landmarks[-1], last.confidence[-1])
+        found = []
+        for frame in piece:  # a frame's box is the one before's
+            found.append(tracker.step(frame))
+            at += 1
+            progress("tracking landmarks", at, max(clip.count, at))
+        last = TrackedFrames(
+            torch.stack([one.landmarks for one in found]),
+            torch.stack([one.confidence for one in found]),
+            torch.stack([one.box for one in found]),
+        )
+        state.append(last)
     return faces
 
 
