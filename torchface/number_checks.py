@@ -102,5 +102,7 @@ def _range_text(kind: str, least: float, most: float, above: bool = False) -> st
 
 
 def _shown(value: object) -> str:
+    if isinstance(value, torch.Tensor) and value.numel() == 1:
+        value = value.item()
     number = _real(value)
     return repr(value)[:40] if math.isnan(number) and not isinstance(value, float) else f"{number:.7g}"

@@ -112,7 +112,7 @@ class WholeTakeSolver:
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
-        check_rate(fps, "whole take", ValueRangeError)
+        check_rate(fps, "fps", ValueRangeError)
         return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
 
     def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:

@@ -120,10 +120,10 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
     if not np.isfinite(scale) or scale == 0:
         raise FileFormatError(f"{path}: POINT:SCALE: found {scale}, expected a number other than 0")
     word = 4 if scale < 0 else 2
-    block = header.data_block or _number(sections, "POINT:DATA_START", 0)
-    if not (2 <= block <= _MAX_COUNT and float(block).is_integer()):
-        raise FileFormatError(f"{path}: found the data in block {block:g}, expected block 3 or later")
-    start = BLOCK * (int(block) - 1)
+    first_block = header.data_block or _number(sections, "POINT:DATA_START", 0)
+    if not (2 <= first_block <= _MAX_COUNT and float(first_block).is_integer()):
+        raise FileFormatError(f"{path}: found the data in block {first_block:g}, expected block 3 or later")
+    start = BLOCK * (int(first_block) - 1)
     frame_size = word * (4 * header.points + header.analog)
     room = max(0, len(data) - start) // frame_size
     counts = [count for count in _frame_counts(sections) if count >= 1 and float(count).is_integer()]
