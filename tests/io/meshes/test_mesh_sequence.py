@@ -69,6 +69,24 @@ def test_meshes_that_are_not_as_they_were_written_are_told(tmp_path: Path) -> No
     assert MeshSequence(path).is_whole()  # another program's
 
 
+def test_what_only_lacks_its_name_is_not_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, rename = tmp_path / "heads.safetensors", os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        if target == path:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            written(path)
+    with MeshSequenceWriter(path, 7, 4, FACES) as writer:
+        assert writer.done == 7
+    assert MeshSequence(path).is_whole()
+    assert torch.equal(MeshSequence(path).read(0, 7), MESHES)
+
+
 def test_no_more_is_noted_than_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, calls = tmp_path / "heads.safetensors", list[str]()
 
