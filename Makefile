@@ -27,7 +27,7 @@ bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest -m bench
 
 fuzz: $(VENV)/.installed-test
-	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k mutated
+	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k 'mutated or built'
 
 lint: $(VENV)/.installed-lint
 	$(VENV)/bin/ruff check .

@@ -57,6 +57,7 @@ def test_whole_numbers_of_more_than_64_bits_are_refused(
         ("[1, " + "7" * 25 + "]", "a whole number of 25 digits"),
         ("[" + "[]," * 2**20 + "[]]", "1048578 lists and tables"),
         ("[9223372036854775808]", "a whole number of 19 digits"),
+        ("[" * 2**23, "more than 4194304 brackets"),
     ],
 )
 def test_json_is_measured_before_it_is_built(text: str, found: str, tmp_path: Path) -> None:
@@ -65,7 +66,7 @@ def test_json_is_measured_before_it_is_built(text: str, found: str, tmp_path: Pa
 
 
 def test_json_that_only_looks_deep_or_large_is_read(tmp_path: Path) -> None:
-    rows = ["[[" * 100, 'a \\" {{{ \\\\', 1.2345678901234567890123, -9223372036854775807, 1e300]
+    rows = ["[[" * 100, 'a \\" {{{ \\\\', "7" * 30, 1.2345678901234567890123, -9223372036854775807, 1e300]
     text = json.dumps(rows).replace("1.2345678901234567", "1.2345678901234567890123")
     assert read_json(written(tmp_path / "good.json", text)).found == rows
 

@@ -27,9 +27,9 @@ _MAX_WHOLE = 2**63
 _MAX_DEPTH, _MAX_CONTAINERS = 64, 2**20
 _MAX_DOTS = 16  # in a key: TOML's parser takes time and memory by the square of them
 
-_JSON_TEXT = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
+_ESCAPE = re.compile(rb"\\.", re.DOTALL)
+_BRACKETS = (b"[", b"]", b"{", b"}")
 _LONG_WHOLE_NUMBER = re.compile(rb"(?<![\d.eE+-])-?(\d{19,})(?![\d.eE])")
-_NOT_BRACKETS = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _DOTTED_KEY = re.compile(
     rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_MAX_DOTS + 1}}}""", re.ASCII
 )
@@ -163,16 +163,25 @@ def parse_json(data: bytes) -> Any:
     Raises:
         ValueError: not JSON, nested too deep, too many lists and tables, or a whole number of more than 64 bits.
     """
-    bare = _JSON_TEXT.sub(b"", data)
-    brackets = np.frombuffer(bare.translate(None, _NOT_BRACKETS), np.uint8)
-    opening = (brackets == ord("[")) | (brackets == ord("{"))
+    plain = _ESCAPE.sub(b"", data) if b"\\" in data else data
+    if sum(map(plain.count, _BRACKETS)) > 4 * _MAX_CONTAINERS:
+        raise ValueError(
+            f"more than {4 * _MAX_CONTAINERS} brackets, expected at most {_MAX_CONTAINERS} lists and tables"
+        )
+    letters = np.frombuffer(plain, np.uint8)
+    quotes = np.flatnonzero(letters == ord('"'))
+    folded = letters | 0x20  # one letter for both opening brackets, one for both closing ones
+    places = np.flatnonzero((folded == ord("{")) | (folded == ord("}")))
+    places = places[np.searchsorted(quotes, places) % 2 == 0]  # those in texts are behind an odd number of quotes
+    opening = folded[places] == ord("{")
     if np.count_nonzero(opening) > _MAX_CONTAINERS:
         raise ValueError(f"{np.count_nonzero(opening)} lists and tables, expected at most {_MAX_CONTAINERS}")
     depth = int(np.where(opening, 1, -1).cumsum().max(initial=0))
     if depth > _MAX_DEPTH:
         raise ValueError(f"nested {depth} deep, expected at most {_MAX_DEPTH}")
-    for match in _LONG_WHOLE_NUMBER.finditer(bare):
-        if len(match[1]) > 19 or int(match[1]) >= _MAX_WHOLE:
+    for match in _LONG_WHOLE_NUMBER.finditer(plain):
+        too_long = len(match[1]) > 19 or int(match[1]) >= _MAX_WHOLE
+        if too_long and np.searchsorted(quotes, match.start()) % 2 == 0:
             raise ValueError(f"a whole number of {len(match[1])} digits, expected at most 64 bits")
     return json.loads(data.decode("utf-8-sig"))
 

@@ -116,7 +116,7 @@ def read_sections(data: bytes, path: Path) -> Sections:
 def _read_parameters(section: bytes, order: str, path: Path) -> dict[str, Parameter]:
     groups: dict[int, str] = {}
     found: list[tuple[int, str, Parameter]] = []
-    at = 0
+    at = taken = 0
     while at + 2 <= len(section):
         length, group = struct.unpack_from("bb", section, at)
         if length == 0 or group == 0:
@@ -130,6 +130,9 @@ def _read_parameters(section: bytes, order: str, path: Path) -> dict[str, Parame
             groups[-group] = name
         else:
             found.append((group, name, _read_parameter(section, at + 2, name, path)))
+            taken += len(found[-1][2].data)
+            if taken > len(section):
+                raise FileFormatError(f"{path}: parameter {name[:40]!r}: found it to overlap others, expected it apart")
         if offset == 0:
             break
         if offset < 2:

@@ -22,7 +22,7 @@ MAX_TABLE_BYTES = 2**29
 _MAX_ROW = 2**22
 _MAX_NUMBER = float(np.finfo(np.float32).max)
 _SHARED_TEXT = 3  # letters; there are few texts so short, and a table may hold each a million times
-_BLOCK = 2**16
+_BLOCK = 2**20
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,9 @@ class Table:
         """Some columns (T,C) in this order."""
         wanted = [self._index[name] for name in names]
         found = np.empty((len(self.numbers), len(wanted)), dtype)
-        for first in range(0, len(found), _BLOCK):  # so that no second copy of a long take is made
-            found[first : first + _BLOCK] = self.numbers[first : first + _BLOCK, wanted]
+        rows = 1 + _BLOCK // max(1, len(wanted))
+        for first in range(0, len(found), rows):  # so that no second copy of a long take is made
+            found[first : first + rows] = self.numbers[first : first + rows, wanted]
         return found
 
 

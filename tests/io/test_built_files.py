@@ -1,0 +1,68 @@
+"""Readers take files whose parts disagree as they take good ones: a value, or an error of ours."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from built_files import check_built
+
+from torchface.attachment import Attachment
+from torchface.capture.action_units.shape_table import load_shape_table
+from torchface.capture.retargeting import load_shape_rules
+from torchface.files.models import read_record
+from torchface.io import (
+    load_calibration,
+    load_correspondences,
+    load_landmark_points,
+    load_landmarks,
+    load_mesh,
+    load_rig,
+    load_take,
+)
+from torchface.io.action_labels import load_action_labels
+from torchface.io.gltf import load_detail_maps, read_gltf_rig
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.landmarks.dlib_xml import load_dlib_faces
+from torchface.landmarks.scans.scan_annotations import load_annotations
+
+CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "24"))
+
+
+def load_attachment(path: Path) -> Attachment:
+    return Attachment.load(path)
+
+
+READERS: list[tuple[Callable[[Path], object], str]] = [
+    (load_mesh, "obj_files"),
+    (load_mesh, "ply_files"),
+    (load_mesh, "stl_files"),
+    (load_mesh, "off_files"),
+    (load_mesh, "gltf_files"),
+    (read_gltf_rig, "gltf_files"),
+    (read_gltf_weights, "gltf_files"),
+    (load_detail_maps, "gltf_files"),
+    (load_rig, "rig_folders"),
+    (load_take, "c3d_files"),
+    (load_take, "trc_files"),
+    (load_take, "csv_files"),
+    (load_dlib_faces, "dlib_files"),
+    (load_landmark_points, "pts_files"),
+    (load_landmark_points, "ljson_files"),
+    (load_landmarks, "landmark_files"),
+    (load_correspondences, "correspondence_files"),
+    (load_attachment, "attachment_files"),
+    (load_annotations, "annotation_files"),
+    (load_calibration, "camera_files"),
+    (load_shape_rules, "shape_rule_files"),
+    (load_shape_table, "shape_table_files"),
+    (read_record, "model_files"),
+    (load_action_labels, "action_label_files"),
+]
+
+
+@pytest.mark.parametrize(("reader", "strategy"), READERS)
+def test_a_built_file_is_read_or_refused(reader: Callable[[Path], object], strategy: str) -> None:
+    check_built(reader, strategy, CASES)
