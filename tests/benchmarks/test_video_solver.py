@@ -320,9 +320,10 @@ def test_heads_in_the_model(faces: Faces, learned: Learned) -> None:
     rows = table(filmed, learned.ways())
     gauss, default, dynamic = rows["one Gaussian"], rows["default"], rows["default + dynamics"]
     # What the default alone gains on vertices differs much from take to take: see the next test.
-    assert default.weights < 0.9 * gauss.weights
-    assert dynamic.vertices < 0.8 * gauss.vertices
-    assert dynamic.weights < 0.8 * gauss.weights
+    assert default.vertices < gauss.vertices
+    assert default.weights < 0.85 * gauss.weights
+    assert dynamic.vertices < 0.52 * gauss.vertices
+    assert dynamic.weights < 0.55 * gauss.weights
     assert rows["default + dynamics, whole take"].vertices < dynamic.vertices
 
 
@@ -348,7 +349,7 @@ def test_priors_on_every_take(faces: Faces) -> None:
             print(f"{takes:12s}{name:16s}{prior.strength:9.2f}{row.vertices:9.3f}{row.weights:9.4f}", flush=True)
     gain = sums["default"] / sums["one Gaussian"] - 1
     print(f"the default against the Gaussian, all six takes: {gain[0]:+.0%} vertices, {gain[1]:+.0%} weights")
-    assert gain.max() < -0.1
+    assert gain.max() < -0.33
 
 
 def test_heads_outside_the_model(faces: Faces, learned: Learned) -> None:
