@@ -78,10 +78,12 @@ def test_the_command_runs(python: Path, tmp_path: Path) -> None:
 
 def test_every_model_of_the_zoo_loads(wheel: Path, python: Path, tmp_path: Path) -> None:
     code = """
-import json, torchface
+import json, sys, torchface
 from torchface import zoo
 names = zoo.list_models()
 kinds = {name: type(zoo.get_model(name)).__name__ for name in names}
+import torchface.cli
+assert "av" not in sys.modules, "what PyAV's wheel brings is loaded with a video alone"
 print(json.dumps([torchface.__file__, kinds, [str(zoo.find(name)) for name in names]]))
 """
     file, kinds, folders = json.loads(run(python, code, tmp_path).splitlines()[-1])

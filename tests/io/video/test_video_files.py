@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.io.video import open_video, video_writing, write_video
+from torchface.errors import FileFormatError, MissingExtraError, ShapeError, ValueRangeError
+from torchface.io.video import open_video, write_video
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +131,17 @@ def test_what_cannot_be_written_is_said(frames: torch.Tensor, tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
+def test_without_pyav_a_video_asks_for_it(
+    frames: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video = write_video([frames], tmp_path / "a.avi", 30)
+    monkeypatch.setitem(sys.modules, "av", None)
+    for use in (lambda: open_video(video.path), lambda: write_video([frames], tmp_path / "b.avi", 30)):
+        with pytest.raises(MissingExtraError, match=r"video needs av, .* -m pip install 'av'"):
+            use()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.avi"]
+
+
 @pytest.mark.parametrize("suffix", [".avi", ".mkv", ".mp4"])
 @pytest.mark.parametrize("kept", [0.0, 0.4, 0.9])
 def test_a_video_cut_off_without_a_word_does_not_replace_the_one_before(
@@ -150,7 +162,7 @@ def test_a_video_cut_off_without_a_word_does_not_replace_the_one_before(
         return cut_off(file, format) if mode == "w" else opened(file, mode, format, **options)  # type: ignore[call-overload]
 
     with monkeypatch.context() as patch:
-        patch.setattr(video_writing.av, "open", on_a_full_disk)
+        patch.setattr(av, "open", on_a_full_disk)
         with pytest.raises(FileFormatError, match=rf"a{suffix}: cannot be written.*read back.*is the disk full"):
             write_video([frames], path, 60.0)
     assert path.read_bytes() == before

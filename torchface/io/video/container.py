@@ -6,12 +6,14 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-import av
-from av.container import InputContainer
-from av.video.stream import VideoStream
+from typing import TYPE_CHECKING, Any
 
 from torchface.errors import FileFormatError
+from torchface.files.extra_packages import import_extra
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
 
 _MAX_BYTES = 2**36
 _MAX_SIDE = 8192
@@ -24,6 +26,15 @@ _USUAL_BITS = 12  # a pixel, where only a frame will tell
 _MOV_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 
 
+def pyav() -> Any:
+    """PyAV, loaded with the first video: its wheel brings GPL libraries, which nothing else should load or need.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    return import_extra("av", "av", "", "video")
+
+
 @contextmanager
 def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container of a file and its video stream, ready to be decoded.
@@ -34,7 +45,9 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
     Raises:
         FileFormatError: the file is missing, no video, of a codec that is not there, or of absurd size.
+        MissingExtraError: PyAV is not installed.
     """
+    av = pyav()
     demuxer = _demuxer(path)
     limit = {"max_pixels": str(_MAX_PIXELS)}
     opening = limit | {"skip_frame": "all"}  # FFmpeg would decode a frame of each stream, and there may be hundreds
@@ -44,7 +57,7 @@ def open_container(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         raise FileFormatError(f"{path}: cannot be opened as a video: cut off or damaged ({reason(error)})") from error
     with container:
         stream = container.streams.best("video")
-        if not isinstance(stream, VideoStream) or stream.codec_context is None:
+        if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
             raise FileFormatError(f"{path}: found no video stream of a codec that FFmpeg knows, expected one")
         context = stream.codec_context
         width, height = context.width, context.height

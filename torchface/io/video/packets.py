@@ -6,15 +6,17 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import av
 import numpy as np
-from av.container import InputContainer
-from av.packet import Packet
-from av.video.frame import VideoFrame
-from av.video.stream import VideoStream
 
-from torchface.io.video.container import open_container, reason
+from torchface.io.video.container import open_container, pyav, reason
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ def packets_of(container: InputContainer, stream: VideoStream, errors: list[str]
         for packet in container.demux(stream):
             if packet.size:
                 yield packet
-    except (av.FFmpegError, ValueError) as error:
+    except (pyav().FFmpegError, ValueError) as error:
         errors.append(f" ({reason(error)})")
     yield None
 
@@ -78,7 +80,7 @@ def key_frame_sizes(path: Path) -> Iterator[tuple[float, int, int]]:
                     for frame in stream.decode(packet):
                         size = (frame.height, frame.width) if quarter_turns(frame) % 2 else (frame.width, frame.height)
                         yield (np.nan if frame.pts is None else frame.pts * tick), *size
-                except (av.FFmpegError, ValueError):  # decoding every frame says what is wrong
+                except (pyav().FFmpegError, ValueError):  # decoding every frame says what is wrong
                     continue
 
 

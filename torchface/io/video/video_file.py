@@ -7,21 +7,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import av
 import cv2
 import numpy as np
 import torch
-from av.container import InputContainer
-from av.video.reformatter import Interpolation, VideoReformatter
-from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io.video.container import frames_beside, open_container, reason
+from torchface.io.video.container import frames_beside, open_container, pyav, reason
 from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
 from torchface.io.video.timing import check_even_rate
 from torchface.number_checks import check_rate
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
 
 _MAX_FRAMES = 2**31 - 1
 _CHUNK_BYTES = 32 * 2**20
@@ -166,7 +167,7 @@ def open_video(path: str | Path) -> VideoFile:
             raise FileFormatError(
                 f"{path}: no frame can be decoded{''.join(errors[:1])}; expected a video of a codec that FFmpeg knows"
             )
-        declared = stream.frames or round((container.duration or 0) / av.time_base * fps)
+        declared = stream.frames or round((container.duration or 0) / pyav().time_base * fps)
     whole = len(packets.seconds) + packets.hidden >= 0.99 * declared - 1
     count = len(packets.seconds) if whole else declared - packets.hidden
     if not 1 <= count <= _MAX_FRAMES:
@@ -176,12 +177,13 @@ def open_video(path: str | Path) -> VideoFile:
 
 def _rgb_frames(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[np.ndarray]:
     """Upright frames (H,W,3) of the packets that can be decoded; what is wrong with the others goes to ``errors``."""
-    reformatter, path, codec = VideoReformatter(), Path(container.name), stream.codec_context.name
+    av, path, codec = pyav(), Path(container.name), stream.codec_context.name
+    reformatter, bicubic = av.video.reformatter.VideoReformatter(), av.video.reformatter.Interpolation.BICUBIC
     for packet in packets_of(container, stream, errors):  # a decoder takes one packet at a time
         try:
             for frame in stream.decode(packet):
                 frames_beside(path, codec, frame.width, frame.height, frame.format.padded_bits_per_pixel)
-                rgb = reformatter.reformat(frame, format="rgb24", interpolation=Interpolation.BICUBIC)
+                rgb = reformatter.reformat(frame, format="rgb24", interpolation=bicubic)
                 yield np.ascontiguousarray(np.rot90(rgb.to_ndarray(), quarter_turns(frame)))
         except (av.FFmpegError, ValueError) as error:
             errors.append(f" ({reason(error)})")

@@ -7,22 +7,22 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-import av
 import numpy as np
 import torch
-from av.container import OutputContainer
-from av.video.frame import VideoFrame
-from av.video.reformatter import VideoReformatter
-from av.video.stream import VideoStream
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.whole_files import replaced_file
-from torchface.io.video.container import reason
+from torchface.io.video.container import pyav, reason
 from torchface.io.video.packets import read_packets
 from torchface.io.video.video_file import VideoFile, open_video
 from torchface.number_checks import check_rate
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
+    from av.video.stream import VideoStream
 
 _FORMATS = {".avi": "avi", ".mkv": "matroska", ".mp4": "mp4"}
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
@@ -53,6 +53,7 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     first = next(single, None)
     if first is None:
         raise ShapeError(f"{path}: found no frame, expected at least one")
+    av = pyav()
     with replaced_file(path) as temporary:
         try:
             with av.open(str(temporary), "w", format=_FORMATS[path.suffix.lower()]) as container:
@@ -97,7 +98,8 @@ def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor],
     stream = _add_stream(container, first, fps)
     layout = "rgb24" if first.ndim == 3 else "gray"
     lossy = {"dst_colorspace": _BT709, "dst_color_range": _LIMITED} if stream.pix_fmt in _LOSSY else {}
-    reformatter = VideoReformatter()
+    av = pyav()
+    reformatter = av.video.reformatter.VideoReformatter()
     count = 0
     for frame in chain([first], others):  # the encoder takes one frame at a time
         if frame.shape != first.shape:
@@ -105,7 +107,7 @@ def _encode(container: OutputContainer, first: Tensor, others: Iterator[Tensor],
         pixels = to_bytes(frame).numpy()
         if pixels.ndim == 3:
             pixels = np.ascontiguousarray(pixels.transpose(1, 2, 0))
-        coded = reformatter.reformat(VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
+        coded = reformatter.reformat(av.VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
         coded.pts, coded.time_base = count, 1 / stream.codec_context.framerate
         container.mux(stream.encode(coded))
         count += 1
@@ -117,10 +119,9 @@ def _add_stream(container: OutputContainer, first: Tensor, fps: float) -> VideoS
     """A stream for frames as the first: FFV1 for a lossless container, else H.264 or MPEG-4 in BT.709."""
     height, width = first.shape[-2:]
     lossless = container.format.name != "mp4"
-    codec = "ffv1" if lossless else "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    codec = "ffv1" if lossless else "libx264" if "libx264" in pyav().codecs_available else "mpeg4"
     options = {"preset": "veryfast", "crf": "16"} if codec == "libx264" else {}
-    stream = container.add_stream(codec, rate=_rate(fps, codec), options=options)
-    assert isinstance(stream, VideoStream)
+    stream = cast("VideoStream", container.add_stream(codec, rate=_rate(fps, codec), options=options))
     stream.width, stream.height = width, height
     if lossless:
         stream.pix_fmt = "bgr0" if first.ndim == 3 else "gray"
