@@ -8,6 +8,7 @@ A strategy gives the files by name, the one to read first. Readers are tested al
 from __future__ import annotations
 
 import base64
+import importlib
 import json
 import math
 import struct
@@ -34,20 +35,21 @@ _ODD_FLOATS = (0.5, -1.0, 1e9, 1e30, 1e39, -1e300, 1e-320, 1e308)
 _LINE_ENDS = ("\n", "\n", "\n", "\r\n", "\r")
 
 
-def check_built(reader: Callable[[Path], Any], strategy: str, cases: int) -> None:
+def check_built(reader: Callable[[Path], Any], strategy: str, cases: int, module: str = "built_files") -> None:
     """Drives a reader with built files in a child process; each must give a good value or a ``TorchfaceError``.
 
     Time and memory are those of the budget for small files; a case is shrunk before it is shown.
 
     Args:
         reader: a function of a path, at the top level of its module.
-        strategy: the name of a function of this module that gives the files.
+        strategy: the name of a function that gives the files.
         cases: how many.
+        module: where that function is.
 
     Raises:
         AssertionError: a case escaped; the message holds it.
     """
-    job = {**place_of(reader), "strategy": strategy, "cases": cases}
+    job = {**place_of(reader), "strategy": strategy, "strategies": module, "cases": cases}
     outcome = run_child(_run, job, 120 + SECONDS * cases)
     assert sum(outcome.values()) >= min(cases, 10), outcome
 
@@ -65,7 +67,7 @@ def _run(job: dict[str, Any], folder: Path) -> dict[str, int]:
         suppress_health_check=list(HealthCheck),
         phases=(Phase.generate, Phase.shrink),
     )
-    @given(files=globals()[job["strategy"]]())
+    @given(files=getattr(importlib.import_module(job["strategies"]), job["strategy"])())
     def check(files: Files) -> None:
         for name, data in files.items():
             (folder / name).parent.mkdir(exist_ok=True)
