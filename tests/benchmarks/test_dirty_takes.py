@@ -181,3 +181,6 @@ def test_streamed_takes(real_capture: Capture) -> None:
         late.append(frames_late(streamed, true))
         print(f"{which + 1:4} | {jitters[-1][0]:23.1f} {jitters[-1][1]:9.1f} | {shares[-1]:25.2f} | {late[-1]:11.2f}")
     print(f"mean of the takes: error {float(np.mean(shares)):.2f}, {float(np.mean(late)):.2f} frames late")
+    assert all(streamed <= 4.5 and streamed <= 0.23 * alone for alone, streamed in jitters)
+    assert max(shares) <= 0.83
+    assert max(late) <= 1.4

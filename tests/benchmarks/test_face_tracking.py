@@ -59,7 +59,7 @@ def test_photographed_faces(trees: LandmarkTrees, data: Path) -> None:
         total += len(marks)
         wrong += int((shared.amax(0) < 0.3).sum())
         for one, row in zip(marks, shared, strict=True):
-            if float(row.max()) > 0.3:
+            if len(row) and float(row.max()) > 0.3:
                 found += 1
                 seen = find_landmarks(picture, trees, int(row.argmax()))
                 off[whose].append(float((seen.landmarks - one).norm(dim=1).mean() / (one[36] - one[45]).norm()))

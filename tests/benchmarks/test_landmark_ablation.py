@@ -1,5 +1,5 @@
-"""Claim: the twelve landmarks found by themselves bring registration nearer to the truth than no landmarks, and the
-traced lines bring the lids nearer still (the thesis's figures 12 and 14).
+"""Claim: the twelve landmarks found by themselves bring lips and lids nearer to the truth than no landmarks, and the
+traced lines bring the lids nearer still (the thesis's figures 12 and 14). The face as a whole they do not.
 
 The embedded head, its eyes open, is registered to raw scans of performers with closed eyes, of whom every vertex's true
 place is known. ``$TORCHFACE_BENCH_HEADS`` sets how many scans (6 if absent).
@@ -66,7 +66,12 @@ def some(pairs: LandmarkPairs, names: tuple[str, ...]) -> Landmarks:
     return pairs.vertices[rows], pairs.points[rows]
 
 
-def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
+Table = dict[str, dict[str, float]]
+
+
+@pytest.fixture(scope="module")
+def table(detector: UVLandmarkDetector) -> Table:
+    """Mean distance of each part of the face to its true place, millimetres, by the landmarks that were used."""
     template = neutral_head(texture=False)
     finder = AutomaticLandmarks(detector, template)
     regions, contacts = template.annotations.regions, template.annotations.contacts.flatten()
@@ -94,18 +99,30 @@ def test_each_kind_of_landmark_helps(detector: UVLandmarkDetector) -> None:
     mean = {way: torch.stack(each).mean(0) for way, each in errors.items()}
     print(f"\nmean distance to the true place over {SCANS} scans, millimetres")
     print(f"{'landmarks':16}" + "".join(f"{part:>12}" for part in parts))
-    table = {way: {part: float(error[rows].mean()) for part, rows in parts.items()} for way, error in mean.items()}
-    for way, row in table.items():
+    told = {way: {part: float(error[rows].mean()) for part, rows in parts.items()} for way, error in mean.items()}
+    for way, row in told.items():
         print(f"{way:16}" + "".join(f"{value:12.2f}" for value in row.values()))
     save_rendered_image(sheet([heated(template, error, way) for way, error in mean.items()], 1), PICTURE)
-    for part in ("face", "lids", "lid edges"):
-        assert table["twelve"][part] <= table["none"][part] + 0.02
-        assert table["twelve, lines"][part] <= table["twelve"][part] + 0.02
-        assert table["by itself"][part] <= table["none"][part] + 0.02
+    return told
+
+
+def test_twelve_landmarks_help_lips_and_lids(table: Table) -> None:
+    for part, share in (("lids", 0.99), ("lid edges", 0.99), ("lips", 0.63), ("lip edges", 0.68)):
+        assert table["twelve"][part] <= share * table["none"][part]
+
+
+@pytest.mark.parametrize("way", ["twelve, lines", "by itself"])
+def test_traced_lines_help_lids(table: Table, way: str) -> None:
+    for part, share in (("lids", 0.63), ("lid edges", 0.55)):
+        assert table[way][part] <= share * table["twelve"][part]
     # Lips touch behind the furrow that a scan shows, a millimetre or so; the line pulls them out by some of that.
-    assert table["twelve"]["lips"] <= table["none"]["lips"] + 0.02
-    for way in ("twelve, lines", "by itself"):
-        assert table[way]["lips"] <= table["none"]["lips"] + 0.15
+    assert table[way]["lips"] <= table["none"]["lips"] + 0.15
+
+
+@pytest.mark.xfail(strict=True, reason="1.32 and 1.52 mm from the true place with landmarks, 1.27 mm without")
+@pytest.mark.parametrize("way", ["twelve", "twelve, lines", "by itself"])
+def test_landmarks_help_the_face_as_a_whole(table: Table, way: str) -> None:
+    assert table[way]["face"] <= table["none"]["face"]
 
 
 def heated(template: Mesh, error: Tensor, title: str) -> Tensor:
