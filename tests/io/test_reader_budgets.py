@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,7 +104,6 @@ def test_hundreds_of_material_files_are_refused(tmp_path: Path) -> None:
     "lines",
     [
         "f 1 2 3\n" * 300_000,
-        "f 1/1 2/1 3/1\n" * 150_000,
         "v 0 0 0\n" * 300_000 + "f 1 2 3\n",
         "f" + " 1 2 3" * 150_000 + "\nf 1 2 3\n" * 3,
     ],
@@ -144,6 +144,15 @@ def test_rows_of_no_use_in_a_ply_cost_little(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     path.write_bytes(head.encode() + bytes(9) + b"\1\1" + bytes(399_999) + b"\3\0\1\2")
     assert check_budget(load_mesh, path).megabytes < 30
+
+
+def test_parameters_of_a_c3d_that_share_their_data_are_refused(tmp_path: Path) -> None:
+    parameter = bytes([1, 1, 97, 6, 0, 255, 2, 255, 255])  # text of 255 times 255 letters, the next one 9 bytes on
+    header = b"\2\x50" + struct.pack("<4H", 1, 0, 1, 1)
+    section = b"\1\x50\xff\x54" + parameter * (254 * 512 // 9)
+    path = tmp_path / "take.c3d"
+    path.write_bytes(header.ljust(512, b"\0") + section.ljust(255 * 512, b"\0") + bytes(512))
+    assert "overlap" in check_budget(load_take, path).refused
 
 
 def test_tags_without_end_are_refused(tmp_path: Path) -> None:

@@ -161,7 +161,7 @@ def _spans(path: Path, element: Element, order: str, body: NDArray[Any], at: int
         (_width(order, kind), None if count is None else _length_reader(order, count), _width(order, count or kind))
         for _, kind, count in element.properties
     ]
-    units = memoryview(body)  # quicker one by one
+    units = body.data  # quicker one by one
     found = array("q")
     end = len(body)
     for _ in range(rows):  # where a row begins is known only after the one before

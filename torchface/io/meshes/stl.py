@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from array import array
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.mesh import Mesh
 
 _HEADER, _RECORD = 84, 50
+_AT_ONCE = 2**15  # corners; the words of all take twenty times the memory of their text
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
 
@@ -69,8 +71,9 @@ def write_stl(mesh: Mesh, path: str | Path) -> None:
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
     numbers = array("d")
     try:
-        for match in _VERTEX.finditer(data.lower()):  # all words at once take twenty times the memory of the text
-            numbers.extend(map(float, match.groups()))
+        matches = _VERTEX.finditer(data.lower())
+        while words := [word for match in islice(matches, _AT_ONCE) for word in match.groups()]:
+            numbers.extend(map(float, words))
     except ValueError as error:
         raise FileFormatError(f"{path}: found text in a vertex line, expected numbers ({error})") from error
     if len(numbers) % 9:
