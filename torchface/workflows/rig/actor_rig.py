@@ -42,6 +42,7 @@ from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.register_scans import in_place_of, load_shape_model
 from torchface.workflows.rig.expression_scans import LAYOUT, Expression, expressions_in, neutral_in, weights_row
+from torchface.workflows.rig.expression_side import check_side
 from torchface.workflows.rig.penetration_report import Penetration, penetration
 from torchface.workflows.rig_names import Naming, renamed, renamed_detail
 
@@ -266,12 +267,13 @@ class _Actor:
             try:
                 marks = landmark_file(expression.path.parent, expression.path)
                 found = self.registered(guess, expression.path, marks, texture_size=0)
+                moved = (guess.vertices - neutral.vertices).norm(dim=-1)
+                steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
+                laid = in_place_of(found.mesh, guess, steady.double())
+                check_side(actor, expression.weights, laid.vertices, found.matched & matched)
             except TorchfaceError as error:
                 self.skipped.append(f"example {expression.path.name}: {error}")
                 continue
-            moved = (guess.vertices - neutral.vertices).norm(dim=-1)
-            steady = found.matched / (1 + (moved / _FOLLOWS) ** 2)
-            laid = in_place_of(found.mesh, guess, steady.double())
             vertices.append(seen_example(laid, guess.vertices, found.matched & matched))
             weights.append(expression.weights)
             used.append(expression.name)
