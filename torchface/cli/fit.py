@@ -39,7 +39,7 @@ def fit(
     Args:
         photographs: Image files.
         landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
-            one .xml of dlib's (imglab) that names the photographs; found if absent.
+            one .xml of dlib's (imglab) that names the photographs, in their pixels once upright; found if absent.
         landmark_model: What finds them, a model of the zoo by name, or its folder.
         model: A head model of the zoo by name, or its folder.
         out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.

@@ -11,7 +11,14 @@ from torch import Tensor
 
 from torchface import load_rig, save_rig, zoo
 from torchface.cli import main
-from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, TopologyError
+from torchface.errors import (
+    AlignmentError,
+    FileFormatError,
+    NameMismatchError,
+    ShapeError,
+    TopologyError,
+    ValueRangeError,
+)
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
@@ -28,7 +35,7 @@ from torchface.synthetic.head.identity import anatomy
 from torchface.workflows.fit.fit_checks import one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.found_landmarks import FoundLandmarks
-from torchface.workflows.fit.given_landmarks import landmarks_of
+from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of
 from torchface.workflows.fit.photograph_rig import fit_photographs
 
 YAWS = (-35.0, 0.0, 35.0)
@@ -296,3 +303,13 @@ def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Pat
     photographs, marks = ([studio / f"p{i}.{ending}" for i in range(3)] for ending in ("png", "pts"))
     made = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "rig.glb", texture_size=0)
     assert made.remarks == ()
+
+
+def test_landmarks_counted_before_the_photograph_was_turned_are_refused() -> None:
+    """A phone stores 4032 x 3024 pixels of a portrait that is 3024 x 4032."""
+    columns, rows = torch.meshgrid(torch.linspace(1200, 1800, 17), torch.linspace(3100, 3900, 4), indexing="ij")
+    upright = torch.stack([columns, rows], dim=-1).reshape(1, 68, 2)
+    check_inside([Path("phone.jpg")], upright, [(3024, 4032)])
+    stored = torch.stack([upright[..., 1], 3023 - upright[..., 0]], dim=-1)
+    with pytest.raises(ValueRangeError, match=r"phone.jpg: found 68 of 68 landmarks outside its 3024 x 4032 pixels"):
+        check_inside([Path("phone.jpg")], stored, [(3024, 4032)])

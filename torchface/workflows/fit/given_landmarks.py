@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
@@ -42,6 +42,27 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
         _face_in(file, photograph, face) if file.suffix.lower() == ".xml" else _pixels(file)
         for file, photograph in zip(files, photographs, strict=True)
     ]
+
+
+def check_inside(photographs: Sequence[Path], landmarks: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
+    """Refuses landmarks of which most lie outside their photograph, as those counted before it was turned upright may.
+
+    Args:
+        photographs: image files, P.
+        landmarks: (P,L,2) pixels; NaN where there is none.
+        sizes: width and height of each photograph, upright.
+
+    Raises:
+        ValueRangeError: the message names the photograph.
+    """
+    for photograph, points, (width, height) in zip(photographs, landmarks, sizes, strict=True):  # sizes differ
+        points = points[points.isfinite().all(-1)]
+        inside = (points >= -0.5).all(-1) & (points < points.new_tensor([width, height]) - 0.5).all(-1)
+        if len(points) and float(inside.double().mean()) < 0.5:
+            raise ValueRangeError(
+                f"{photograph}: found {int((~inside).sum())} of {len(points)} landmarks outside its {width} x {height} "
+                "pixels, expected those of this photograph, counted upright, as viewers show it"
+            )
 
 
 def _pixels(file: Path) -> Tensor:

@@ -25,7 +25,7 @@ from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, o
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
 from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
-from torchface.workflows.fit.given_landmarks import landmarks_of
+from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
@@ -116,6 +116,7 @@ def fit_photographs(
         NoFaceError: landmarks are to be found where no face is.
         FileFormatError: ``out`` has another ending or cannot be written to, or a file is broken.
         NameMismatchError: landmarks do not show which photograph or face they are of.
+        ValueRangeError: most landmarks lie outside their photograph.
         TorchfaceError: landmarks or model are of no use; see ``fit_images``.
     """
     progress = progress or silent
@@ -135,6 +136,7 @@ def fit_photographs(
         found = find_in_photographs(photographs, images, landmark_model, face)
         marks = torch.stack([one.confident for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
+    check_inside(photographs, marks, sizes)
 
     def bare(points: Tensor, rows: list[int]) -> ImageFit:
         some = [sizes[row] for row in rows]
