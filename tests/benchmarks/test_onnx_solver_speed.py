@@ -1,4 +1,7 @@
-"""The exported solver on real takes: one thread, batch 1, cold and warm; its gap to the exact solve."""
+"""The exported solver on real takes: one thread, batch 1, cold and warm; its gap to the exact solve.
+
+How long it takes beside other solvers is held in ``test_box_qp_peers.py``.
+"""
 
 from __future__ import annotations
 
@@ -59,4 +62,3 @@ def test_frame_by_frame(
                   f"{float(gap.median()):11.1e}")  # fmt: skip
             if not missing:
                 assert gap.max() <= allowed
-                assert quiet <= 0.08
