@@ -50,28 +50,32 @@ def photographs(data: Path) -> list[tuple[Path, list[Tensor], str]]:
 
 @pytest.mark.real
 def test_photographed_faces(trees: LandmarkTrees, data: Path) -> None:
-    found, wrong, total = 0, 0, 0
-    off: dict[str, list[float]] = {"dlib's": [], "by hand": []}
+    found, total = 0, 0
+    wrong = {"dlib's": 0, "by hand": 0}
+    off: dict[str, list[float]] = {whose: [] for whose in wrong}
     for path, marks, whose in photographs(data):
         picture = (load_image(path) * 255).round().to(torch.uint8)
         faces = find_faces(picture)
         shared = overlaps(torch.stack([box_around(one[None])[0] for one in marks]), faces.boxes)
         total += len(marks)
-        wrong += int((shared.amax(0) < 0.3).sum())
+        wrong[whose] += int((shared.amax(0) < 0.3).sum())
         for one, row in zip(marks, shared, strict=True):
             if len(row) and float(row.max()) > 0.3:
                 found += 1
                 seen = find_landmarks(picture, trees, int(row.argmax()))
                 off[whose].append(float((seen.landmarks - one).norm(dim=1).mean() / (one[36] - one[45]).norm()))
-    print(
-        f"\n{found} of {total} faces found, {wrong} boxes where there is none; landmarks off by, of the eyes' distance"
-    )
-    for whose, shares in off.items():
-        errors = torch.tensor(shares)
-        print(f"  {len(errors):2} faces, landmarks {whose:8}: {errors.mean():.1%} mean, {errors.median():.1%} median")
+    errors = {whose: torch.tensor(shares) for whose, shares in off.items()}
+    print(f"\n{found} of {total} faces found; landmarks off by, of the distance of the eyes' outer corners")
+    for whose, shares in errors.items():
+        print(
+            f"  {len(shares):2} faces, landmarks {whose:8}: {shares.mean():.1%} mean, {shares.median():.1%} median; "
+            f"{wrong[whose]} boxes where there is no face"
+        )
     assert found >= 20
-    assert wrong == 0
-    assert torch.tensor(off["dlib's"]).median() < 0.09
+    assert wrong["dlib's"] == 0
+    assert wrong["by hand"] <= 1  # a collar
+    assert errors["dlib's"].median() < 0.08
+    assert errors["by hand"].mean() < 0.065
 
 
 @pytest.mark.real
