@@ -69,6 +69,7 @@ def test_what_a_system_call_says_is_told_with_the_file(capsys: pytest.CaptureFix
 def test_ctrl_c_ends_a_command_without_a_traceback() -> None:
     program = (
         "import os, signal, torchface.cli as cli\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background job ignores it
         "def info(path: str) -> None:\n"
         "    'Stops itself.'\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
