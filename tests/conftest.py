@@ -32,6 +32,8 @@ settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 LONGEST = (
     "capture/action_units",
+    "onnx",
+    "test_packaging",
     "viz/browser",
     "workflows",
     "train",
@@ -57,7 +59,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def rank(item: pytest.Item) -> int:
         path = item.path.relative_to(REPOSITORY).as_posix()
-        return next((i for i, folder in enumerate(LONGEST) if path.startswith(f"tests/{folder}/")), len(LONGEST))
+        return next((i for i, folder in enumerate(LONGEST) if path.startswith(f"tests/{folder}")), len(LONGEST))
 
     items.sort(key=rank)
     if DATA.is_dir():

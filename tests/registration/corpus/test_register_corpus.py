@@ -140,7 +140,7 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
         process = context.Process(target=register_corpus, args=(template, [scans], out), kwargs=settings)
         process.start()
         limit = time.monotonic() + 60
-        while not (out / ".lock").exists() and time.monotonic() < limit:
+        while not (out / ".lock").exists() and process.is_alive() and time.monotonic() < limit:
             time.sleep(0.01)
         process.join(chance.uniform(0.02, 0.12 * number))
         if process.is_alive():
