@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import onnxruntime
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 names = json.loads(session.get_modelmeta().custom_metadata_map["shape_names"])
 markers = np.load(sys.argv[2]).astype(np.float32)

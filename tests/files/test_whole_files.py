@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -352,3 +353,12 @@ def test_nothing_in_the_library_writes_past_whole_files() -> None:
         if past.search(path.read_text())
     }
     assert found == own
+
+
+def test_a_part_that_fails_is_left_out_of_the_whole(tmp_path: Path) -> None:
+    with all_or_none():
+        write_file(tmp_path / "whole", b"1")
+        with suppress(KeyError), all_or_none():
+            write_file(tmp_path / "part", b"2")
+            raise KeyError
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]

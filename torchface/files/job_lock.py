@@ -121,9 +121,9 @@ def _locked(path: Path, place: Path) -> Iterator[None]:
     except OSError as error:
         raise unwritten(path, error) from error
     try:
-        os.ftruncate(handle, 0)
-        os.lseek(handle, 0, os.SEEK_SET)
         with suppress(OSError):  # a full disk is told by what is written first
+            os.ftruncate(handle, 0)
+            os.lseek(handle, 0, os.SEEK_SET)
             os.write(handle, f"{os.getpid()} {node()}".encode())
         yield
     finally:
@@ -133,7 +133,10 @@ def _locked(path: Path, place: Path) -> Iterator[None]:
 def _taken(path: Path, place: Path) -> int:
     """The lock's file, open and locked."""
     while True:
-        handle = open_plain(path, os.O_RDWR | os.O_CREAT)
+        try:
+            handle = open_plain(path, os.O_RDWR | os.O_CREAT)
+        except PermissionError:  # another user's, left by a run that was killed: locked it can be all the same
+            handle = open_plain(path, os.O_RDONLY)
         if not _take(handle):
             os.lseek(handle, 0, os.SEEK_SET)
             holder = os.read(handle, 300).decode(errors="replace").split()

@@ -11,8 +11,17 @@ _PIECE = 2**20
 """Bytes."""
 
 
-def line_pieces(path: Path, data: bytes, start: int = 0, end: int | None = None) -> Iterator[bytes]:
+def line_pieces(
+    path: Path, data: bytes, start: int = 0, end: int | None = None, unread: tuple[bytes, ...] = ()
+) -> Iterator[bytes]:
     """The text between two places, in pieces that end where a line does.
+
+    Args:
+        path: names the file in errors.
+        data: the whole text.
+        start: where to begin.
+        end: where to stop; the end of the text if absent.
+        unread: beginnings of lines that nobody reads: those of any length are left out.
 
     Raises:
         FileFormatError: a line is longer than a piece.
@@ -24,6 +33,9 @@ def line_pieces(path: Path, data: bytes, start: int = 0, end: int | None = None)
             cut = 1 + data.rfind(b"\n", start, start + _PIECE)
             if cut == 0:  # old machines end lines by a carriage return alone
                 cut = 1 + data.rfind(b"\r", start, start + _PIECE)
+            if cut == 0 and data.startswith(unread, start):
+                start = 1 + data.find(b"\n", start, end) or end
+                continue
             if cut == 0:
                 raise FileFormatError(f"{path}: found a line of more than {_PIECE} bytes, expected shorter ones")
         yield data[start:cut]

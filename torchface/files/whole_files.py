@@ -19,6 +19,7 @@ from torchface.files.write_errors import unmade, unsettled, unwritten
 LARGEST_FILE = 2**31
 """Bytes; what a head rig with hundreds of shapes stays well below."""
 
+_writes: dict[Path, int] = {}
 _waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waiting", default=None)
 
 
@@ -87,8 +88,16 @@ def all_or_none() -> Iterator[None]:
     Raises:
         FileFormatError: they cannot be put into their places.
     """
-    if _waiting.get() is not None:  # a part of a larger whole
-        yield
+    if (whole := _waiting.get()) is not None:  # a part of a larger whole
+        begin = len(whole)
+        try:
+            yield
+        except BaseException:
+            for temporary, _ in whole[begin:]:
+                if temporary is not None:
+                    _delete(temporary)
+            del whole[begin:]
+            raise
         return
     waiting: list[tuple[Path | None, Path]] = []
     token = _waiting.set(waiting)
@@ -179,7 +188,8 @@ def check_writable(*files: Path | None, folder: Path | None = None) -> None:
 def _replaced(path: Path) -> Iterator[tuple[int, Path]]:
     try:
         mode = _permissions(path)
-        remove_left_over(path.parent, path.name)
+        if _is_time_to_look(path.parent):
+            remove_left_over(path.parent, path.name)
         handle, temporary = new_temporary(path, 0o666 if mode is None else mode)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise unwritten(path, error) from error
@@ -187,8 +197,9 @@ def _replaced(path: Path) -> Iterator[tuple[int, Path]]:
     try:
         try:
             yield handle, temporary
-            if mode is not None:
-                os.chmod(handle if os.chmod in os.supports_fd else temporary, mode)
+            if mode is not None and stat.S_IMODE(os.fstat(handle).st_mode) & 0o777 != mode:
+                with suppress(PermissionError):  # of a mounted share: the result matters more
+                    os.chmod(handle if os.chmod in os.supports_fd else temporary, mode)
             _sync(handle)
         finally:
             os.close(handle)
@@ -207,6 +218,12 @@ def _replaced(path: Path) -> Iterator[tuple[int, Path]]:
             sync_folder(path.parent)
         except OSError as error:
             raise unsettled(path, error) from error
+
+
+def _is_time_to_look(folder: Path) -> bool:
+    """Whether to look for left-over files: at first always, then ever more rarely, for a look takes all its names."""
+    count = _writes[folder] = _writes.get(folder, 0) + 1
+    return count <= 16 or count & (count - 1) == 0
 
 
 def _permissions(path: Path) -> int | None:

@@ -7,6 +7,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from image_bytes import (
@@ -112,3 +113,10 @@ def test_a_photograph_of_thousands_of_scans_is_refused(tmp_path: Path) -> None:
     scan = jpeg_segment(0xDA, b"\1\1\0\1\x3f\0")
     (tmp_path / "a.jpg").write_bytes(data[:-2] + scan * 200 + data[-2:])
     assert "scans, expected at most 100" in check_budget(load_image, tmp_path / "a.jpg").refused
+
+
+def test_a_photograph_of_a_large_camera_is_read(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (600, 900, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.tile(noise, (8, 8, 1)), [cv2.IMWRITE_JPEG_QUALITY, 20])
+    assert (tmp_path / "a.jpg").stat().st_size < 4800 * 7200 / 2
+    assert load_image(tmp_path / "a.jpg").shape == (3, 4800, 7200)

@@ -256,3 +256,15 @@ def test_a_chunk_that_no_pixel_needs_changes_nothing(tmp_path: Path) -> None:
     late_header = data[:33] + png_chunk(b"IHDR", b"\0\0\x20\0\0\0\x20\0\x08\x02\0\0\0") + data[33:]
     for one in (data, late_header):
         assert np.array_equal((255 * read(one, tmp_path)).round()[..., :3], image)
+
+
+def test_what_follows_a_photograph_is_none_of_it(tmp_path: Path) -> None:
+    """Phones put a short video behind a photograph; its bytes hold what looks like scans."""
+    image = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    (tmp_path / "alone.jpg").write_bytes(data)
+    (tmp_path / "moving.jpg").write_bytes(data + b"\xff\xda\xff\xd9" * 500)
+    assert torch.equal(load_image(tmp_path / "moving.jpg"), load_image(tmp_path / "alone.jpg"))
+    (tmp_path / "many.jpg").write_bytes(data[:-2] + b"\xff\xda\x00\x02" * 101 + data[-2:])
+    with pytest.raises(FileFormatError, match="a JPEG of 102 scans"):
+        load_image(tmp_path / "many.jpg")

@@ -150,3 +150,9 @@ def test_a_mutated_obj_is_read_or_refused(tmp_path: Path) -> None:
     report = check_reader(load_mesh, [tmp_path / "sheet.obj", tmp_path / "odd.obj"], ".obj")
     assert report.read > 0
     assert report.refused > report.cases / 4
+
+
+def test_a_long_line_that_nobody_reads_is_left_out(tmp_path: Path) -> None:
+    polyline = "l " + "1 2 3 4 " * 150_000
+    path = write(tmp_path / "a.obj", f"{SQUARE}{polyline}\nf 1 2 3 4\n# {'x' * 2**20}")
+    assert load_mesh(path).polygons.tolist() == [[0, 1, 2, 3]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_LONE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_KEPT = (0xE0, 0xEE)  # JFIF and Adobe: what the colours are
 _MOST_SCANS = 100
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # in the pixels: no stuffed byte, no restart
 _RAW_COMPRESSION = 34713  # Nikon's
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _UNSIGNED, _UNTOLD = 1, 4
@@ -153,12 +155,20 @@ def _jpeg(data: bytes, source: str) -> ImageHeader:
             kept.append(view[at:end])
         at = end
     bits, height, width, samples = struct.unpack_from(">BHHB", size)
-    scans = data.count(b"\xff\xda", at)
+    end, scans = at, 0
+    while found := _JPEG_MARKER.search(data, end):  # what follows the end is none of the image, such as a phone's video
+        end = found.end()
+        if found[0] == b"\xff\xd9":
+            break
+        scans += found[0] == b"\xff\xda"
+        end += int.from_bytes(data[end : end + 2], "big")
+    else:
+        end = len(data)
     if scans > _MOST_SCANS:
         raise FileFormatError(f"{source}: found a JPEG of {scans} scans, expected at most {_MOST_SCANS}")
     if bits != 8:
         raise FileFormatError(f"{source}: found a JPEG of {bits} bits a sample, expected 8; save it as TIFF or PNG")
-    kept.append(view[at:])
+    kept.append(view[at:end])
     return ImageHeader("JPEG", width, height, samples, bits, 1, exif_orientation(exif, source), b"".join(kept))
 
 

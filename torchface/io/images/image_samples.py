@@ -16,6 +16,7 @@ from torchface.io.images.image_headers import ImageHeader, read_header
 
 _PIXELS_ALWAYS, _PIXELS_PER_BYTE = 4096 * 4096, 100
 _BYTES_ALWAYS, _BYTES_PER_BYTE = 480 * 2**20, 18
+_PHOTOGRAPH_BYTES, _PHOTOGRAPH_PIXELS_PER_BYTE = 1536 * 2**20, 8
 _BESIDES = {"JPEG": 3, "WEBP": 3}  # bytes a pixel that a decoder holds while the result is made
 _PLAIN_KINDS = ("BMP", "PPM", "TGA")
 _HIGHEST = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535, np.dtype(np.float32): 1}
@@ -58,8 +59,9 @@ def decode_samples(data: bytes, source: str, planes: int = 3) -> Samples:
     """The image in ``data``, turned as its EXIF orientation says.
 
     What decoding takes, with the image as float32 after it, is told from the header and kept below 480 MiB or 18 bytes
-    for a byte of the file; and an image of more than 4096 x 4096 pixels needs a byte for every hundred of them. So no
-    file of some kilobytes unpacks to gigabytes.
+    for a byte of the file, and below 1.5 GiB where each eight pixels have a byte, as photographs and textures of 30 to
+    80 megapixels do; and an image of more than 4096 x 4096 pixels needs a byte for every hundred of them. So no file
+    of some kilobytes unpacks to gigabytes.
 
     Args:
         data: the whole file.
@@ -84,7 +86,8 @@ def _check_memory(header: ImageHeader, planes: int, size: int, source: str) -> N
         raise FileFormatError(f"{source}: no readable image: found {header.width} x {header.height} pixels")
     stored = max(header.samples, 3) * header.bits / 8 * (2 if header.bits == 64 else 1)
     bytes_per_pixel = 4 * planes + stored + _BESIDES.get(header.kind, 1)
-    room = max(_BYTES_ALWAYS, _BYTES_PER_BYTE * size) / bytes_per_pixel
+    photograph = pixels <= _PHOTOGRAPH_PIXELS_PER_BYTE * size
+    room = max(_PHOTOGRAPH_BYTES if photograph else _BYTES_ALWAYS, _BYTES_PER_BYTE * size) / bytes_per_pixel
     allowed = int(min(room, max(_PIXELS_ALWAYS, _PIXELS_PER_BYTE * size)))
     if pixels > allowed:
         raise FileFormatError(

@@ -147,7 +147,8 @@ def _lines_by_keyword(path: Path, data: bytes) -> Iterator[dict[bytes, list[byte
     if b"\0" in data[:4096]:
         raise FileFormatError(f"{path}: found binary data, expected the text of an OBJ")
     vertex_count = coordinate_count = 0
-    for piece in line_pieces(path, data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")):
+    joined = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    for piece in line_pieces(path, joined, unread=(b"l ", b"p ", b"#")):
         known: dict[bytes, list[bytes]] = {b"v": [], b"vt": [], b"f": [], b"mtllib": [], b"usemtl": []}
         vertices, coordinates, faces = known[b"v"], known[b"vt"], known[b"f"]
         for line in piece.splitlines():

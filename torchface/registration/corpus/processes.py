@@ -119,7 +119,7 @@ def _none_started() -> ValueRangeError:
 def _lost(task: CorpusTask, code: int) -> CorpusEntry:
     """The entry of a scan whose process has died."""
     end = f"signal {-code}" if code < 0 else f"status {code}"
-    why = "; the memory may not have sufficed" if code == -signal.SIGKILL else ""
+    why = "; the memory may not have sufficed" if code == -9 else ""
     return CorpusEntry(task.name, task.scan, error=f"the process that registered it ended with {end}{why}")
 
 
@@ -144,11 +144,16 @@ def _work(job: CorpusJob, pipe: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     pipe.send(None)
-    try:
-        while True:
-            pipe.send(job.run(pipe.recv()))
-    except (EOFError, OSError):
-        pass
+    while True:
+        try:
+            task = pipe.recv()
+        except (EOFError, OSError):
+            return
+        entry = job.run(task)
+        try:
+            pipe.send(entry)
+        except OSError:
+            return
 
 
 def _end_with_parent() -> None:

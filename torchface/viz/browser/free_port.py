@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import socket
 
 from torchface.errors import ValueRangeError
@@ -30,11 +31,12 @@ def free_port(host: str, first: int) -> int:
     last = min(first + _TRIES - 1, LAST_PORT)
     for port in range(first, last + 1):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as trial:
-            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if os.name == "posix":  # elsewhere it would take ports that are in use
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 trial.bind((host, port))
             except OSError as error:
-                if error.errno == errno.EACCES:
+                if error.errno == errno.EACCES and port < 1024:
                     raise ValueRangeError(
                         f"port: found {port}, which this user may not listen on; expected one from 1024 to {LAST_PORT}"
                     ) from None

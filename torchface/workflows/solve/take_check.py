@@ -133,8 +133,8 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
     if fit.cause == "mirror":
         return (
             f"mirrored and laid on the rig they lie {fit.corrected:.2g} mm from it, so the coordinates are left-handed "
-            "(add --flip x, y or z, and --align if the take is not in the rig's space), or the labels of left and "
-            "right are swapped (--labels)"
+            "(add --flip x, y or z, or leave it out if it is given; --align if the take is not in the rig's space), or "
+            "the labels of left and right are swapped (--labels)"
         )
     if fit.cause == "slip":
         return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
