@@ -102,6 +102,17 @@ def test_what_was_saved_comes_back_and_is_kept(video: Path, tracker: Tracker, tm
     assert len(load_annotated_frames(tmp_path)) == 4
 
 
+def test_what_was_saved_stays_where_another_tracker_chooses(video: Path, tracker: Tracker, tmp_path: Path) -> None:
+    found = prepare_annotation(video, tmp_path, tracker, 4)
+    AnnotationSession(found.frames, tmp_path, found.saved).save()
+    name = found.frames[0].name
+    tracker.landmarks = tracker.landmarks.roll(1, 0)
+    anew = prepare_annotation(video, tmp_path, tracker, 1, key="another tracker")
+    assert tracker.asked == 2
+    assert name not in [frame.name for frame in anew.frames[:1]]
+    assert anew.saved == [name]
+
+
 def test_folders_and_counts_that_do_not_fit_are_refused(
     film: PortraitVideo, video: Path, tracker: Tracker, tmp_path: Path
 ) -> None:

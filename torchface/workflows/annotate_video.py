@@ -69,6 +69,8 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
         landmarks, confidence = track(opened)
         chosen = choose_frames(landmarks, count, confidence)
         proposed = _Proposals(count, {int(i): landmarks[i].double() for i in chosen}, made_from)
+        for number, points in _annotated(folder, opened).items():  # another tracker may choose other frames
+            proposed.landmarks.setdefault(number, points)
         _write(folder, opened, proposed)
     wanted = list(proposed.landmarks)[:count]
     wanted += [i for i in proposed.landmarks if i not in wanted and _points(folder, opened, i).is_file()]
@@ -115,6 +117,13 @@ def _name(video: VideoFile, number: int) -> str:
 
 def _points(folder: Path, video: VideoFile, number: int) -> Path:
     return folder / f"{_name(video, number)}.pts"
+
+
+def _annotated(folder: Path, video: VideoFile) -> dict[int, Tensor]:
+    """The landmarks (68,2) that lie in the folder for frames of the video, by frame number."""
+    names = {_name(video, number): number for number in range(video.count)}
+    paths = {names[path.stem]: path for path in sorted(folder.glob("*.pts")) if path.stem in names}
+    return {number: load_landmark_points(path).ibug()[:, :2] for number, path in paths.items()}
 
 
 def _images(video: VideoFile, numbers: list[int]) -> dict[int, Tensor]:
