@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from torchface import load_rig, save_rig, zoo
@@ -35,7 +36,7 @@ from torchface.synthetic.head.identity import anatomy
 from torchface.workflows.fit.fit_checks import one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.found_landmarks import FoundLandmarks
-from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of
+from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.fit.photograph_rig import fit_photographs
 
 YAWS = (-35.0, 0.0, 35.0)
@@ -313,3 +314,11 @@ def test_landmarks_counted_before_the_photograph_was_turned_are_refused() -> Non
     stored = torch.stack([upright[..., 1], 3023 - upright[..., 0]], dim=-1)
     with pytest.raises(ValueRangeError, match=r"phone.jpg: found 68 of 68 landmarks outside its 3024 x 4032 pixels"):
         check_inside([Path("phone.jpg")], stored, [(3024, 4032)])
+
+
+def test_a_photograph_that_was_stored_turned_is_warned_of(tmp_path: Path) -> None:
+    orientation = Image.Exif()
+    orientation[0x0112] = 6
+    Image.new("RGB", (8, 6)).save(tmp_path / "phone.jpg", exif=orientation)
+    with pytest.warns(UserWarning, match=r"phone\.jpg.*EXIF orientation 6"):
+        warn_if_stored_turned(tmp_path / "phone.jpg")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.whole_files import read_file
 from torchface.io.images.image_files import load_image
+from torchface.io.images.image_headers import read_header
 from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import find_faces
@@ -63,6 +66,17 @@ def check_inside(photographs: Sequence[Path], landmarks: Tensor, sizes: Sequence
                 f"{photograph}: found {int((~inside).sum())} of {len(points)} landmarks outside its {width} x {height} "
                 "pixels, expected those of this photograph, counted upright, as viewers show it"
             )
+
+
+def warn_if_stored_turned(photograph: Path) -> None:
+    """Warns of a photograph whose given landmarks may count other pixels than are fitted: its EXIF turns it upright."""
+    header = read_header(read_file(photograph), str(photograph))
+    if header is not None and header.orientation != 1:
+        warnings.warn(
+            f"{photograph}: found a photograph that its camera stored turned (EXIF orientation {header.orientation}); "
+            "its landmarks are taken to count upright pixels, as viewers show it, and not stored ones, as dlib's do",
+            stacklevel=2,
+        )
 
 
 def _pixels(file: Path) -> Tensor:

@@ -25,7 +25,7 @@ from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, o
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
 from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
-from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of
+from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
@@ -131,6 +131,8 @@ def fit_photographs(
     found: list[FoundLandmarks] = []
     if landmarks or not photographs:
         marks = torch.stack(landmarks_of(photographs, landmarks, face))
+        for photograph in photographs:
+            warn_if_stored_turned(photograph)
     else:
         progress(f"finding the landmarks of {len(photographs)} photographs")
         found = find_in_photographs(photographs, images, landmark_model, face)
