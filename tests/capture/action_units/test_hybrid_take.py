@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver
@@ -14,6 +15,7 @@ from torchface.synthetic.stages.marker_stage import record
 LED = ("4", "9", "6+43", "18L")
 
 
+@pytest.mark.bench  # test_solve_with_video.py is the quicker one
 def test_weights_that_markers_do_not_show(
     classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:

@@ -109,6 +109,7 @@ def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
         assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 1e-3
 
 
+@pytest.mark.bench
 @pytest.mark.real
 def test_shells_stay_behind_the_closed_lids_of_random_heads(ict_folder: Path) -> None:
     names = ["eyeBlink_L", "eyeBlink_R"]
