@@ -61,12 +61,14 @@ def trained(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Tra
     return train(settings(folder, out)), out
 
 
+@pytest.mark.bench
 def test_landmarks_of_the_scan_held_out_are_found(trained: tuple[Trained, Path]) -> None:
     (errors,) = trained[0].errors
     assert errors.mean_pixels < 8 * SIZE / 512
     assert max(errors.lines.values()) < 4
 
 
+@pytest.mark.bench
 def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder: Path) -> None:
     result, out = trained
     assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "held_out.png"}
@@ -82,6 +84,7 @@ def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder:
     assert torch.allclose(landmark_errors(found, scan, truth).pixels, result.errors[0].pixels, atol=1e-3)
 
 
+@pytest.mark.bench
 def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], folder: Path) -> None:
     scan = load_mesh(folder / "scan_003.obj")
     truth = load_annotations(folder / "annotations.json")["scan_003.obj"]
@@ -100,6 +103,7 @@ def test_pairs_lie_on_the_scan_near_the_truth(trained: tuple[Trained, Path], fol
         assert torch.corrcoef(torch.stack([across.double(), along]))[0, 1] > 0.97
 
 
+@pytest.mark.bench
 def test_registration_is_given_landmarks(trained: tuple[Trained, Path], folder: Path) -> None:
     template = neutral_head(texture=False)
     scan = load_mesh(folder / "scan_003.obj")
@@ -121,6 +125,7 @@ def test_registration_is_given_landmarks(trained: tuple[Trained, Path], folder: 
         finder(scan, scan, inverse)
 
 
+@pytest.mark.bench
 def test_a_detector_of_textures_refuses_a_scan_without(trained: tuple[Trained, Path], folder: Path) -> None:
     scan = replace(load_mesh(folder / "scan_000.obj"), texture=None, uvs=None, uv_faces=None)
     with pytest.raises(ValueRangeError, match="no texture"):
