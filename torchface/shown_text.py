@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 
 # C0 but for tab and line feed, DEL, C1, marks that change a line's direction, line separators, halves of surrogates.
@@ -16,3 +17,8 @@ def visible(text: str) -> str:
         'smile\\x1b[2Jleft'
     """
     return _HARMFUL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+
+
+def as_markup(text: str) -> str:
+    """The visible text for a page: as it is, not as markup."""
+    return html.escape(visible(text))

@@ -1,6 +1,6 @@
 """Images and videos built by chance, of right chunks and boxes with odd sizes and counts: strategies of hypothesis.
 
-Readers are driven by ``built_files.check_built(reader, "picture_files", cases, "built_pictures")``.
+Readers are driven by ``built_files.check_built(reader, "built_pictures", "picture_files", cases)``.
 """
 
 from __future__ import annotations

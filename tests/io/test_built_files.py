@@ -35,34 +35,34 @@ def load_attachment(path: Path) -> Attachment:
     return Attachment.load(path)
 
 
-READERS: list[tuple[Callable[[Path], object], str]] = [
-    (load_mesh, "obj_files"),
-    (load_mesh, "ply_files"),
-    (load_mesh, "stl_files"),
-    (load_mesh, "off_files"),
-    (load_mesh, "gltf_files"),
-    (read_gltf_rig, "gltf_files"),
-    (read_gltf_weights, "gltf_files"),
-    (load_detail_maps, "gltf_files"),
-    (load_rig, "rig_folders"),
-    (load_take, "c3d_files"),
-    (load_take, "trc_files"),
-    (load_take, "csv_files"),
-    (load_dlib_faces, "dlib_files"),
-    (load_landmark_points, "pts_files"),
-    (load_landmark_points, "ljson_files"),
-    (load_landmarks, "landmark_files"),
-    (load_correspondences, "correspondence_files"),
-    (load_attachment, "attachment_files"),
-    (load_annotations, "annotation_files"),
-    (load_calibration, "camera_files"),
-    (load_shape_rules, "shape_rule_files"),
-    (load_shape_table, "shape_table_files"),
-    (read_record, "model_files"),
-    (load_action_labels, "action_label_files"),
+READERS: list[tuple[Callable[[Path], object], str, str]] = [
+    (load_mesh, "built_meshes", "obj_files"),
+    (load_mesh, "built_meshes", "ply_files"),
+    (load_mesh, "built_meshes", "stl_files"),
+    (load_mesh, "built_meshes", "off_files"),
+    (load_mesh, "built_meshes", "gltf_files"),
+    (read_gltf_rig, "built_meshes", "gltf_files"),
+    (read_gltf_weights, "built_meshes", "gltf_files"),
+    (load_detail_maps, "built_meshes", "gltf_files"),
+    (load_rig, "built_meshes", "rig_folders"),
+    (load_take, "built_takes", "c3d_files"),
+    (load_take, "built_takes", "trc_files"),
+    (load_take, "built_takes", "csv_files"),
+    (load_dlib_faces, "built_documents", "dlib_files"),
+    (load_landmark_points, "built_documents", "pts_files"),
+    (load_landmark_points, "built_documents", "ljson_files"),
+    (load_landmarks, "built_documents", "landmark_files"),
+    (load_correspondences, "built_documents", "correspondence_files"),
+    (load_attachment, "built_documents", "attachment_files"),
+    (load_annotations, "built_documents", "annotation_files"),
+    (load_calibration, "built_documents", "camera_files"),
+    (load_shape_rules, "built_documents", "shape_rule_files"),
+    (load_shape_table, "built_documents", "shape_table_files"),
+    (read_record, "built_documents", "model_files"),
+    (load_action_labels, "built_documents", "action_label_files"),
 ]
 
 
-@pytest.mark.parametrize(("reader", "strategy"), READERS)
-def test_a_built_file_is_read_or_refused(reader: Callable[[Path], object], strategy: str) -> None:
-    check_built(reader, strategy, CASES)
+@pytest.mark.parametrize(("reader", "module", "strategy"), READERS)
+def test_a_built_file_is_read_or_refused(reader: Callable[[Path], object], module: str, strategy: str) -> None:
+    check_built(reader, module, strategy, CASES)

@@ -31,4 +31,4 @@ def read_video(path: Path) -> None:
 
 @pytest.mark.parametrize(("reader", "strategy"), [(read_image, "picture_files"), (read_video, "video_files")])
 def test_a_built_picture_is_read_or_refused(reader: Callable[[Path], None], strategy: str) -> None:
-    check_built(reader, strategy, CASES, "built_pictures")
+    check_built(reader, "built_pictures", strategy, CASES)

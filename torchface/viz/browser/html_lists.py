@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape as escape_markup
 
-from torchface.shown_text import visible
+from torchface.shown_text import as_markup
 
 _MAX_SHAPES = 8
-
-
-def escape(text: str) -> str:
-    """Text as it is, not as markup."""
-    return escape_markup(visible(text))
 
 
 def shape_list(active: Sequence[tuple[str, float]]) -> str:
     """Shapes and weights as bars, the first eight, always of one height; says so where there is none."""
     rows = [
         '<div style="display:flex;align-items:center;gap:0.5em;line-height:1.35">'
-        f'<span style="flex:0 0 48%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap">{escape(name)}</span>'
+        f'<span style="flex:0 0 48%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap">{as_markup(name)}</span>'
         '<span style="flex:1;height:0.5em;background:rgba(128,128,128,0.18);border-radius:2px">'
         f'<span style="display:block;height:100%;border-radius:2px;background:#2e5c8a;'
         f'width:{100 * min(abs(weight), 1.0):.0f}%"></span></span>'
@@ -36,8 +30,8 @@ def shape_list(active: Sequence[tuple[str, float]]) -> str:
 def pick_list(counts: Sequence[tuple[str, str]], last: Sequence[str]) -> str:
     """How many of each kind are picked, and the last ones by name."""
     rows = [
-        f'<div style="display:flex;line-height:1.5"><span style="flex:1">{escape(kind)}</span>'
-        f"<b>{escape(count)}</b></div>"
+        f'<div style="display:flex;line-height:1.5"><span style="flex:1">{as_markup(kind)}</span>'
+        f"<b>{as_markup(count)}</b></div>"
         for kind, count in counts
     ]
     names = "".join(f'<div style="line-height:1.4">{_grey(name)}</div>' for name in last)
@@ -50,4 +44,4 @@ def caption(text: str) -> str:
 
 
 def _grey(text: str) -> str:
-    return f'<span style="opacity:0.65">{escape(text)}</span>'
+    return f'<span style="opacity:0.65">{as_markup(text)}</span>'

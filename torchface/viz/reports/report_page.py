@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.rendering.compositing import save_rendered_image
-from torchface.shown_text import visible
+from torchface.shown_text import as_markup
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222 }
@@ -60,33 +59,31 @@ def write_page(folder: str | Path, title: str, sections: Sequence[Section]) -> P
 
 def _write(folder: Path, title: str, sections: Sequence[Section]) -> Path:
     parts = [
-        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{_escaped(title)}</title>\n'
-        f"<style>{_STYLE}</style>\n<h1>{_escaped(title)}</h1>\n"
+        f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{as_markup(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n<h1>{as_markup(title)}</h1>\n"
     ]
     for section in sections:
-        parts.append(f"<h2>{_escaped(section.title)}</h2>\n")
+        parts.append(f"<h2>{as_markup(section.title)}</h2>\n")
         if section.text:
-            parts.append(f"<p>{_escaped(section.text)}</p>\n")
+            parts.append(f"<p>{as_markup(section.text)}</p>\n")
         parts.append(section.markup)
         parts.extend(_table(table) for table in section.tables)
         for name, figure in section.figures:
             save_rendered_image(figure, folder / name)
             size = f'width="{figure.shape[2]}" height="{figure.shape[1]}"'
-            parts.append(f'<img src="{_escaped(name)}" alt="{_escaped(section.title)}" {size}>\n')
+            parts.append(f'<img src="{as_markup(name)}" alt="{as_markup(section.title)}" {size}>\n')
     page = folder / "index.html"
     write_file(page, "".join(parts).encode())
     return page
 
 
-def _escaped(text: str) -> str:
-    return html.escape(visible(text))
-
-
 def _table(table: Table) -> str:
     def row(cells: Sequence[str], tag: str) -> str:
         tags = [f'{tag} class="long"' if len(cell) > _LONG else tag for cell in cells]
-        return "<tr>" + "".join(f"<{a}>{_escaped(cell)}</{tag}>" for a, cell in zip(tags, cells, strict=True)) + "</tr>"
+        return (
+            "<tr>" + "".join(f"<{a}>{as_markup(cell)}</{tag}>" for a, cell in zip(tags, cells, strict=True)) + "</tr>"
+        )
 
     body = "\n".join(row(cells, "td") for cells in table.rows)
     text = f"<table>\n<thead>{row(table.heading, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n"
-    return f"<details><summary>{_escaped(table.summary)}</summary>\n{text}</details>\n" if table.summary else text
+    return f"<details><summary>{as_markup(table.summary)}</summary>\n{text}</details>\n" if table.summary else text
