@@ -19,6 +19,7 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import LandmarkTracker, LandmarkTrees, find_faces, find_landmarks, landmark_jitter
 from torchface.landmarks.images.face_box import overlaps
+from torchface.landmarks.images.finders.tree_finder import TreeFinder
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.tracking import track_landmarks
@@ -85,7 +86,7 @@ def test_a_filmed_face(trees: LandmarkTrees, data: Path) -> None:
     print("\nstarts  frames tracked  jitter, pixels  without the jaw  ms of processor time a frame")
     for starts in (2, 4, 8, 16, 32):
         begun = time.process_time()
-        track = track_landmarks(frames, LandmarkTracker(trees, starts=ConsensusSettings(starts=starts)))
+        track = track_landmarks(frames, LandmarkTracker(TreeFinder(trees, ConsensusSettings(starts=starts))))
         spent = 1000 * (time.process_time() - begun) / len(frames)
         seen = int(torch.isfinite(track.values).flatten(1).all(1).sum())
         jitter[starts] = float(landmark_jitter(track.values))

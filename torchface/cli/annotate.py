@@ -43,10 +43,10 @@ def annotate(
         port: The first port to try.
         quiet: Show no progress.
     """
-    from torchface import zoo
     from torchface.files.content_keys import content_key
     from torchface.files.job_lock import job_lock
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
+    from torchface.workflows.named_finders import load_finder
 
     if browser:
         from torchface.viz.browser.browser_page import HOST, import_viser
@@ -58,20 +58,14 @@ def annotate(
         with progress_bars(quiet) as progress:
 
             def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
-                from torchface.errors import NameMismatchError
-                from torchface.landmarks import LandmarkTrees
                 from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
 
-                model = zoo.get_model(landmarks)
-                if not isinstance(model, LandmarkTrees):
-                    raise NameMismatchError(
-                        f"--landmarks {landmarks}: found a {type(model).__name__}, expected a model of landmark trees"
-                    )
-                found = track_landmarks(video, LandmarkTracker(model, face=face), progress)
+                found = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
                 return found.values, found.confidence
 
             progress("reading")
-            key = content_key("annotate", landmarks=zoo.find(landmarks), face=face)
+            finder = load_finder(landmarks)
+            key = content_key("annotate", landmarks=finder.source, face=face)
             annotation = prepare_annotation(video, out, track, count, key)
         if not browser:
             for path in write_proposals(annotation):

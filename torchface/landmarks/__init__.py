@@ -9,6 +9,8 @@ from torchface.landmarks.images.face_box import (
     find_face,
     find_faces,
 )
+from torchface.landmarks.images.finders.tree_finder import TreeFinder
+from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkFinder
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.tracking import (
     LandmarkTracker,
@@ -41,7 +43,9 @@ __all__ = [
     "DetectorSettings",
     "FaceBoxes",
     "FaceFrame",
+    "FoundLandmarks",
     "HaarDetector",
+    "LandmarkFinder",
     "LandmarkPairs",
     "LandmarkTracker",
     "LandmarkTrees",
@@ -50,6 +54,7 @@ __all__ = [
     "ScanLandmarks",
     "TraceSettings",
     "TrackedFace",
+    "TreeFinder",
     "TreeSettings",
     "UVLandmarkDetector",
     "UVLandmarks",

@@ -35,7 +35,7 @@ from torchface.synthetic.head.complexion import complexion_colors, draw_complexi
 from torchface.synthetic.head.identity import anatomy
 from torchface.workflows.fit.fit_checks import one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
-from torchface.workflows.fit.found_landmarks import FoundLandmarks
+from torchface.workflows.fit.found_landmarks import PhotographLandmarks
 from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.fit.photograph_rig import fit_photographs
 
@@ -144,12 +144,12 @@ def test_unsure_landmarks_are_left_out(studio: Path) -> None:
     confidence[60:] = 0.05
     face = TrackedFace(points, torch.tensor([10.0, 10, 60, 60]), confidence)
     boxes = torch.tensor([[200.0, 5, 80, 80], [10, 10, 60, 60]])
-    found = FoundLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
+    found = PhotographLandmarks(Path("a.png"), "face_landmarks", face, 1, boxes, (300, 100))
     assert found.confident.isnan().any(1).nonzero()[:, 0].tolist() == [3, *range(60, 68)]
     assert "lowest at the mouth with 0.50; 9 left out" in found.lines()[0]
     assert found.lines()[1] == "  number 1 of 2 faces; others with --face 0: at (200, 5)"
     unsure = TrackedFace(points, face.box, torch.full((68,), 0.1))
-    kept = FoundLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).confident
+    kept = PhotographLandmarks(Path("a.png"), "face_landmarks", unsure, 0, boxes[:1], (300, 100)).confident
     assert kept.isnan().any(1).nonzero()[:, 0].tolist() == [3]
 
 

@@ -37,10 +37,17 @@ class FaceBoxes:
     Args:
         boxes: x, y, width, height, (F,4) float32 pixels; squares as ``ibug.box_around`` draws them.
         scores: how sure the detector is, (F,) in [0,1].
+        tilts: how far each face is turned in the image, (F,) radians, clockwise as it is seen; zeros if absent, as of
+            a detector that finds upright faces alone.
     """
 
     boxes: Tensor
     scores: Tensor
+    tilts: Tensor = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.tilts is None:
+            object.__setattr__(self, "tilts", torch.zeros(len(self.boxes)))
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -150,7 +157,7 @@ class YuNetDetector:
 
     def __call__(self, image: Tensor) -> FaceBoxes:
         pixels = image if image.ndim == 3 else image.expand(3, *image.shape[-2:])
-        _check_image(pixels)
+        check_image(pixels)
         colors = np.ascontiguousarray(pixels.flip(0).permute(1, 2, 0).cpu().numpy())
         height, width = colors.shape[:2]
         scale = min(1.0, self.longest / max(height, width))
@@ -185,16 +192,21 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
     Raises:
         ShapeError: no such image.
     """
-    _check_image(image)
+    check_image(image)
     return (detector or HaarDetector(profiles="always"))(image)
 
 
 def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> Tensor:
-    """The box of one face: x, y, width, height, (4,) pixels.
+    """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`."""
+    return find_some_faces(image, number, detector).boxes[number]
+
+
+def find_some_faces(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> FaceBoxes:
+    """All faces in an image, the largest first, one of this number among them.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
-        number: which one, from 0, the largest first.
+        number: of the face that must be there, from 0.
         detector: the shipped cascades if absent.
 
     Raises:
@@ -208,7 +220,7 @@ def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = No
             f"image of {image.shape[-1]} x {image.shape[-2]}: found {found}, expected "
             + ("one at least" if number == 0 else f"more than {number}")
         )
-    return faces.boxes[number]
+    return faces
 
 
 def overlaps(first: Tensor, second: Tensor) -> Tensor:
@@ -222,19 +234,20 @@ def overlaps(first: Tensor, second: Tensor) -> Tensor:
 
 def grey_pixels(image: Tensor) -> np.ndarray:
     """An image's grey values, uint8 (H,W), as OpenCV weighs colours."""
-    _check_image(image)
+    check_image(image)
     if image.ndim == 2:
         return image.cpu().numpy()
     return cv2.cvtColor(np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy()), cv2.COLOR_RGB2GRAY)
 
 
-def sorted_boxes(boxes: Tensor, scores: Tensor) -> FaceBoxes:
-    """Boxes (F,4) and scores (F,), the largest face first."""
+def sorted_boxes(boxes: Tensor, scores: Tensor, tilts: Tensor | None = None) -> FaceBoxes:
+    """Boxes (F,4), scores (F,) and tilts (F,), the largest face first."""
     order = (boxes[:, 2] * boxes[:, 3]).argsort(descending=True, stable=True)
-    return FaceBoxes(boxes[order], scores[order])
+    return FaceBoxes(boxes[order], scores[order], None if tilts is None else tilts[order])  # type: ignore[arg-type]
 
 
-def _check_image(image: Tensor) -> None:
+def check_image(image: Tensor) -> None:
+    """Raises a ``ShapeError`` where an image is not uint8 (H,W) or (3,H,W)."""
     if image.dtype != torch.uint8 or not (image.ndim == 2 or (image.ndim == 3 and len(image) == 3)) or 0 in image.shape:
         raise ShapeError(f"image: found {image.dtype} {tuple(image.shape)}, expected uint8 (H,W) or (3,H,W)")
 

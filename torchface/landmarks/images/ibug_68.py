@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,7 @@ from torchface.errors import ShapeError
 _RUNS = ((0, 16), (17, 26), (27, 27), (28, 28), (29, 29), (30, 30), (31, 35))
 _PAIRS = ((36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46))
 _LIPS = ((48, 54), (55, 59), (60, 64), (65, 67))
+_RIGHT_EYE, _LEFT_EYE, _MOUTH = slice(36, 42), slice(42, 48), slice(48, 68)
 _SIDE = 1.6
 _ABOVE, _ASIDE = 0.037, 0.0
 
@@ -27,7 +30,27 @@ INNER = slice(17, 68)
 """Brows, nose, eyes and mouth: all but the jaw's contour."""
 
 
-def box_around(landmarks: Tensor) -> Tensor:
+def tilt_around(landmarks: Tensor) -> Tensor:
+    """How far a face is turned in the image plane: from where eyes and mouth lie to each other.
+
+    Args:
+        landmarks: iBUG's 68, (...,68,2), pixels.
+
+    Returns:
+        (...,) radians, clockwise as the image is seen, 0 for an upright face; NaN where landmarks are missing.
+
+    Raises:
+        ShapeError: not (...,68,2).
+    """
+    if landmarks.shape[-2:] != (68, 2):
+        raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
+    right, left, mouth = (landmarks[..., rows, :].mean(-2) for rows in (_RIGHT_EYE, _LEFT_EYE, _MOUTH))
+    across, down = left - right, mouth - (left + right) / 2
+    # Both axes of the face, the second turned on the first: a head that turns aside shortens the first alone.
+    return torch.atan2(across[..., 1] - down[..., 0], across[..., 0] + down[..., 1])
+
+
+def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
     r"""The box that a face detector of OpenCV's kind would draw round landmarks.
 
     A square of :math:`1.6\sqrt{(w^2 + h^2)/2}`, w and h the extent of brows, nose, eyes and mouth; their mean lies in
@@ -35,6 +58,8 @@ def box_around(landmarks: Tensor) -> Tensor:
 
     Args:
         landmarks: iBUG's 68, (...,68,2), pixels; NaN rows are left out.
+        tilt: of the face, radians, clockwise as the image is seen: the box has the middle and the size that it would
+            have were the face upright.
 
     Returns:
         x, y, width, height, (...,4) pixels; NaN where brows, nose, eyes and mouth are all missing.
@@ -46,12 +71,17 @@ def box_around(landmarks: Tensor) -> Tensor:
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")
     inner = landmarks[..., INNER, :]
     seen = torch.isfinite(inner).all(-1, keepdim=True)
+    upright = inner.new_tensor([[math.cos(tilt), math.sin(tilt)], [-math.sin(tilt), math.cos(tilt)]])
+    if tilt:
+        inner = inner @ upright.T
     low = torch.where(seen, inner, torch.inf).amin(-2)
     high = torch.where(seen, inner, -torch.inf).amax(-2)
     middle = torch.where(seen, inner, 0).sum(-2) / seen.sum(-2)
     side = _SIDE * ((high - low).square().sum(-1, keepdim=True) / 2).sqrt()
-    corner = middle - side * middle.new_tensor([0.5 - _ASIDE, 0.5 + _ABOVE])
-    box = torch.cat([corner, side, side], dim=-1)
+    centre = middle + side * middle.new_tensor([_ASIDE, -_ABOVE])
+    if tilt:
+        centre = centre @ upright
+    box = torch.cat([centre - side / 2, side, side], dim=-1)
     return torch.where(torch.isfinite(box).all(-1, keepdim=True), box, torch.nan)
 
 

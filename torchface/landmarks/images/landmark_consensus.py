@@ -13,11 +13,13 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.ibug_68 import MIRROR_68
+from torchface.landmarks.images.landmark_finder import confidence_of
 from torchface.landmarks.images.landmark_trees import LandmarkTrees, initial_shapes, similarity_to
 
-_AROUND = 0.6  # of the box's side that is shown to the trees on every side
+REACH = 1.1
+"""How far the image that trees are shown reaches from the middle of a box, in its sides."""
+
 _OUTLYING = 0.02  # of the box's side: starts that end so far from the others count half
-_HALF = 0.02
 _MAX_SIDE = 4096
 
 
@@ -64,8 +66,8 @@ class Consensus(NamedTuple):
 
     @property
     def confidence(self) -> Tensor:
-        """:math:`1 / (1 + (s/s_0)^2)`, (L,) in [0,1]: one half where starts disagree by 0.02 of the box's side."""
-        return 1 / (1 + (self.dispersion / _HALF).square())
+        """(L,) in [0,1]: one half where starts disagree by 0.02 of the box's side."""
+        return confidence_of(self.dispersion)
 
 
 def consensus(
@@ -123,7 +125,7 @@ def tilt_of(trees: LandmarkTrees, landmarks: Tensor) -> float:
 def _cut(grey: np.ndarray, box: Tensor, side: float, wanted: int) -> tuple[np.ndarray, Tensor, Tensor]:
     """The image round a box at the wanted size, pixels of it a pixel (2,), and the corner it was cut at (2,)."""
     middle = (box[:2] + box[2:] / 2).tolist()
-    reach = (0.5 + _AROUND) * side
+    reach = REACH * side
     x, y = math.floor(middle[0] - reach), math.floor(middle[1] - reach)
     count = math.ceil(2 * reach) + 1
     height, width = grey.shape

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sized
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,40 +14,43 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.face_box import FaceDetector, HaarDetector, find_face, find_faces, grey_pixels, overlaps
-from torchface.landmarks.images.ibug_68 import box_around
-from torchface.landmarks.images.landmark_consensus import Consensus, ConsensusSettings, consensus, tilt_of
+from torchface.landmarks.images.face_box import (
+    FaceDetector,
+    HaarDetector,
+    check_image,
+    find_faces,
+    find_some_faces,
+    grey_pixels,
+    overlaps,
+)
+from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
+from torchface.landmarks.images.ibug_68 import box_around, tilt_around
+from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, LandmarkFinder, find_in_box
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.progress import Progress, silent
 from torchface.take import Track
 
-COUNT = 68
 LANDMARK_NAMES = tuple(str(number) for number in range(COUNT))
 """The channels of a track of landmarks: iBUG's numbers from 0."""
-
-_PHOTOGRAPH = ConsensusSettings(starts=48)
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
     """When a face counts as lost, and where it is looked for.
 
-    Starts on a face end near each other, starts on anything else do not: with the shipped trees the mean dispersion was
-    0.008 to 0.036 of the box's side on 19 photographed faces, 0.004 to 0.020 on drawn ones, and 0.057 to 0.10 on
-    pieces of images without a face (5th to 95th percentile; the most on a photographed face was 0.045, the least
-    without one 0.054).
-
     Args:
-        sure: mean dispersion up to which a face is one without asking the detector, of the box's side.
-        doubtful: mean dispersion up to which it is one where the detector sees a face too.
+        sure: presence from which a face is one without asking the detector.
+        doubtful: presence from which it is one where the detector sees a face too.
+        vague: mean confidence under which a face that the detector misses ``checks`` times in a row is lost.
         check: frames after which the detector is asked anyway.
-        checks: how often in a row it must see none, with a dispersion above half of ``sure``, for the face to be lost.
+        checks: how often in a row it must see none.
         patience: frames for which a lost face is waited for at its place before another is taken.
         smallest: side of a box, pixels, under which a face is lost.
     """
 
-    sure: float = 0.045
-    doubtful: float = 0.065
+    sure: float = 0.9
+    doubtful: float = 0.1
+    vague: float = 0.44
     check: int = 15
     checks: int = 3
     patience: int = 10
@@ -60,13 +64,18 @@ class TrackedFace:
     Args:
         landmarks: iBUG's 68, (68,2) float32 pixels; NaN where the face is lost.
         box: x, y, width, height round it as a detector draws it, (4,) pixels; NaN where it is lost.
-        confidence: (68,) in [0,1]; one half where the trees' starts disagree by 0.02 of the box's side, 0
+        confidence: (68,) in [0,1]; one half where a landmark may be off by 0.02 of the box's side, 0 where the face is
+            lost.
+        visibility: (68,) in [0,1]: how likely nothing stands before the landmark; 1 where the finder does not say, 0
             where the face is lost.
+        presence: in [0,1]: how likely it is a face; 0 where it is lost.
     """
 
     landmarks: Tensor
     box: Tensor
     confidence: Tensor
+    visibility: Tensor = field(default_factory=lambda: torch.ones(COUNT))
+    presence: float = 1.0
 
     @property
     def found(self) -> bool:
@@ -76,53 +85,50 @@ class TrackedFace:
     @classmethod
     def lost(cls) -> TrackedFace:
         """No face."""
-        return cls(torch.full((COUNT, 2), torch.nan), torch.full((4,), torch.nan), torch.zeros(COUNT))
+        nothing = torch.zeros(COUNT)
+        return cls(torch.full((COUNT, 2), torch.nan), torch.full((4,), torch.nan), nothing, nothing, 0.0)
 
 
 class _Seen(NamedTuple):
-    """What the trees found, and the box (4,) that they were given."""
+    """What was found, and the box (4,) that it was looked for in."""
 
-    found: Consensus
+    found: FoundLandmarks
     box: Tensor
 
 
 class LandmarkTracker:
     """Follows one face, a frame at a time; a frame's landmarks depend on it and on those before it alone.
 
-    The face is looked for in the box round the landmarks of the frame before, from several starts; their robust mean
-    is steadier than any of them. Trees that place a face's landmarks a little too high would climb with every frame:
-    so the box lies to the landmarks as it did when the face was found. Where the starts disagree the detector looks
-    for the face, near where it was first.
+    The face is looked for in the box round the landmarks of the frame before, turned as they are. A finder that places
+    landmarks a little too high would climb with every frame: so the box lies to the landmarks as it did when the face
+    was found. Where the finder doubts that the box shows a face the detector looks for it, near where it was first.
 
     Args:
-        trees: find 68 landmarks in a box.
-        appearance: of the actor; refines what the trees find.
+        finder: finds 68 landmarks in a box; landmark trees do so from several starts.
+        appearance: of the actor; refines what the finder finds.
         detector: finds boxes; the shipped cascades if absent.
         face: which one, from 0, the largest first, where the first frame that shows one shows several. It stays with
             that face while others come and go.
-        starts: from where the trees start.
         settings: when a face counts as lost.
 
     Raises:
-        ValueRangeError: the trees find other landmarks than the 68, or ``face`` is negative.
+        ValueRangeError: trees find other landmarks than the 68, or ``face`` is negative.
     """
 
     def __init__(
         self,
-        trees: LandmarkTrees,
+        finder: LandmarkFinder | LandmarkTrees,
         appearance: AppearanceModel | None = None,
         detector: FaceDetector | None = None,
         face: int = 0,
-        starts: ConsensusSettings | None = None,
         settings: TrackingSettings | None = None,
     ) -> None:
-        if trees.mean.shape != (COUNT, 2):
-            raise ValueRangeError(f"trees: found a model of {len(trees.mean)} landmarks, expected the {COUNT} of iBUG")
         if face < 0:
             raise ValueRangeError(f"face: found {face}, expected a number from 0")
-        self.trees, self.appearance, self.face = trees, appearance, face
+        self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
+        self.appearance, self.face = appearance, face
         self.detector = detector or HaarDetector(smallest=0.1, step=1.15)
-        self.starts, self.settings = starts or ConsensusSettings(), settings or TrackingSettings()
+        self.settings = settings or TrackingSettings()
         self.reset()
 
     def reset(self) -> None:
@@ -151,88 +157,88 @@ class LandmarkTracker:
             frame: uint8 (H,W), or (3,H,W) red first.
 
         Raises:
-            ShapeError: no such frame.
+            ShapeError: no such frame, or a finder that gives other landmarks than the 68.
+            ValueRangeError: a finder that gives landmarks that are not finite.
         """
-        grey = torch.from_numpy(grey_pixels(frame))
-        seen = self._follow(grey) if self._last.found and self._anchor is not None else None
+        check_image(frame)
+        seen = self._follow(frame) if self._last.found and self._anchor is not None else None
         if seen is None:
-            seen = self._search(grey)
+            seen = self._search(frame)
         if seen is None and self._last.found and self._anchor is None:  # resumed, and no face to the detector
-            seen = self._follow(grey)
+            seen = self._follow(frame)
         if seen is None:
             self._missed += 1
             self._last, self._anchor = TrackedFace.lost(), None
             return self._last
         self._missed = 0
         self._frames += 1
-        landmarks = seen.found.landmarks.float()
-        if self.appearance is not None:
-            landmarks = appearance_landmarks(self.appearance, grey, landmarks)
-        self._last = TrackedFace(landmarks, box_around(landmarks), seen.found.confidence.float())
+        self._last = _refined_face(seen.found, frame, self.appearance)
         self._place = self._last.box
         if self._anchor is None:
-            self._anchor = _relation(self._last.box, seen.box)
+            tilt = tilt_around(self._last.landmarks)
+            self._anchor = _relation(_upright_box(self._last.landmarks), seen.box, tilt)
         return self._last
 
-    @torch.no_grad()
-    def _follow(self, grey: Tensor) -> _Seen | None:
+    def _follow(self, frame: Tensor) -> _Seen | None:
         """The face from where it was a frame ago; None where it is not there."""
-        box = self._anchored(self._last.box)
-        if not self._plausible(box, grey):
+        before, tilt = _upright_box(self._last.landmarks), tilt_around(self._last.landmarks)
+        box = self._anchored(before, tilt)
+        if not self._plausible(box, frame):
             return None
-        seen = consensus(self.trees, grey, box, tilt_of(self.trees, self._last.landmarks), self.starts)
-        moved = box_around(seen.landmarks)
-        if not self._plausible(moved, grey) or not 0.6 < float(moved[2] / self._last.box[2]) < 1.6:
+        seen = find_in_box(self.finder, frame, box, float(tilt))
+        moved = _upright_box(seen.landmarks)
+        if not self._plausible(moved, frame) or not 0.6 < float(moved[2] / before[2]) < 1.6:
             return None
-        if float(overlaps(self._last.box[None], moved[None])) < 0.75:  # it moved far: once more from where it is now
-            box = self._anchored(moved)
-            seen = consensus(self.trees, grey, box, tilt_of(self.trees, seen.landmarks), self.starts)
-        dispersion, settings = float(seen.dispersion.mean()), self.settings
-        if dispersion <= settings.sure and (self._frames + 1) % settings.check:
+        if float(overlaps(before[None], moved[None])) < 0.75:  # it moved far: once more from where it is now
+            tilt = tilt_around(seen.landmarks)
+            box = self._anchored(moved, tilt)
+            seen = find_in_box(self.finder, frame, box, float(tilt))
+        settings = self.settings
+        if seen.presence >= settings.sure and (self._frames + 1) % settings.check:
             return _Seen(seen, box)
-        if self._confirmed(grey, box_around(seen.landmarks)):
+        if self._confirmed(frame, box_around(seen.landmarks)):
             self._unseen = 0
-            return _Seen(seen, box) if dispersion <= settings.doubtful else None
+            return _Seen(seen, box) if seen.presence >= settings.doubtful else None
         self._unseen += 1
-        if dispersion > settings.sure or (self._unseen >= settings.checks and dispersion > settings.sure / 2):
+        vague = float(seen.confidence.mean()) < settings.vague
+        if seen.presence < settings.sure or (self._unseen >= settings.checks and vague):
             return None
         return _Seen(seen, box)  # turned faces are none to the detector
 
-    def _confirmed(self, grey: Tensor, box: Tensor) -> bool:
+    def _confirmed(self, frame: Tensor, box: Tensor) -> bool:
         """Whether the detector sees a face where the landmarks are; it is shown no more than their surroundings."""
-        if not self._plausible(box, grey):
+        if not self._plausible(box, frame):
             return False
         x, y, side = (float(value) for value in (box[0], box[1], box[2]))
         left, top = max(0, int(x - side / 2)), max(0, int(y - side / 2))
-        piece = grey[top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1]
+        piece = frame[..., top : int(y + 1.5 * side) + 1, left : int(x + 1.5 * side) + 1]
         detector = HaarDetector(smallest=0.33, step=1.1) if isinstance(self.detector, HaarDetector) else self.detector
         faces = find_faces(piece, detector)
         corner = box.new_tensor([left, top, 0, 0])
         return len(faces) > 0 and bool((overlaps(faces.boxes + corner, box[None]) > 0.4).any())
 
-    @torch.no_grad()
-    def _search(self, grey: Tensor) -> _Seen | None:
+    def _search(self, frame: Tensor) -> _Seen | None:
         """The face wherever it is now; None where it is nowhere."""
-        faces = find_faces(grey, self.detector)
-        box = self._choose(faces.boxes)
-        if box is None:
+        faces = find_faces(frame, self.detector)
+        number = self._choose(faces.boxes)
+        if number is None:
             return None
         self._anchor = None
-        seen = _refined(self.trees, grey, box, self.starts)
-        if not self._plausible(box_around(seen.found.landmarks), grey):
+        seen = _settled(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
+        if not self._plausible(box_around(seen.found.landmarks), frame):
             return None
         self._unseen = 0
-        return seen if float(seen.found.dispersion.mean()) <= self.settings.doubtful else None
+        return seen if seen.found.presence >= self.settings.doubtful else None
 
-    def _anchored(self, box: Tensor) -> Tensor:
-        """Where the trees look for a face with this box (4,) round its landmarks."""
+    def _anchored(self, box: Tensor, tilt: Tensor) -> Tensor:
+        """Where a face with this box (4,) and tilt is looked for."""
         if self._anchor is None:
             return box
         side = box[2] * self._anchor[2]
-        middle = box[:2] + box[2:] / 2 + box[2] * self._anchor[:2]
+        middle = box[:2] + box[2:] / 2 + box[2] * (_turn(tilt) @ self._anchor[:2])
         return torch.cat([middle - side / 2, side.expand(2)])
 
-    def _choose(self, boxes: Tensor) -> Tensor | None:
+    def _choose(self, boxes: Tensor) -> int | None:
         """Which of the faces (F,4), the largest first, is the one that was tracked; the one asked for at the start."""
         if self._place is not None and len(boxes):
             middle = boxes[:, :2] + boxes[:, 2:] / 2
@@ -241,19 +247,28 @@ class LandmarkTracker:
             distance = torch.where((ratio > 0.6) & (ratio < 1.6), distance, torch.inf)
             nearest = int(distance.argmin())
             if float(distance[nearest]) < 0.75:
-                return boxes[nearest]
+                return nearest
             if self._missed < self.settings.patience:
                 return None
-        return boxes[self.face] if self.face < len(boxes) else None
+        return self.face if self.face < len(boxes) else None
 
-    def _plausible(self, box: Tensor, grey: Tensor) -> bool:
+    def _plausible(self, box: Tensor, frame: Tensor) -> bool:
         """Whether a box is a size that a face can have, and its middle in the image."""
         if not bool(torch.isfinite(box).all()):
             return False
         x, y = (box[:2] + box[2:] / 2).tolist()
-        height, width = grey.shape
+        height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
         return inside and self.settings.smallest <= float(box[2]) <= 1.5 * max(height, width)
+
+
+@contextmanager
+def naming_the_frame(number: int) -> Iterator[None]:
+    """Has errors of a step say which frame they are of, counted from 0."""
+    try:
+        yield
+    except (ShapeError, ValueRangeError) as error:
+        raise type(error)(f"frame {number}: {error}") from error
 
 
 def track_landmarks(
@@ -280,9 +295,10 @@ def track_landmarks(
         video = open_video(video)
     frames = video.frames() if isinstance(video, VideoFile) else video
     total = video.count if isinstance(video, VideoFile) else len(video) if isinstance(video, Sized) else 0
-    found = []
+    found: list[TrackedFace] = []
     for frame in frames:  # a frame's box is the one before's
-        found.append(tracker.step(frame))
+        with naming_the_frame(len(found)):
+            found.append(tracker.step(frame))
         progress("tracking landmarks", len(found), max(total, len(found)) if total else 0)
     if not found:
         return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
@@ -291,10 +307,9 @@ def track_landmarks(
     )
 
 
-@torch.no_grad()
 def find_landmarks(
     image: Tensor,
-    trees: LandmarkTrees,
+    finder: LandmarkFinder | LandmarkTrees,
     face: int = 0,
     detector: FaceDetector | None = None,
     appearance: AppearanceModel | None = None,
@@ -303,42 +318,60 @@ def find_landmarks(
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
-        trees: find 68 landmarks in a box.
+        finder: finds 68 landmarks in a box; landmark trees do so from 48 starts.
         face: which one, from 0, the largest first.
         detector: finds boxes; the shipped cascades if absent.
-        appearance: of this person; refines what the trees find.
+        appearance: of this person; refines what the finder finds.
 
     Raises:
         NoFaceError: there are not so many faces.
-        ShapeError: no such image.
-        ValueRangeError: the trees find other landmarks than the 68.
+        ShapeError: no such image, or a finder that gives other landmarks than the 68.
+        ValueRangeError: trees that find other landmarks than the 68, or a finder that gives some that are not finite.
     """
-    if trees.mean.shape != (COUNT, 2):
-        raise ValueRangeError(f"trees: found a model of {len(trees.mean)} landmarks, expected the {COUNT} of iBUG")
-    grey = torch.from_numpy(grey_pixels(image))
-    seen = _refined(trees, grey, find_face(image, face, detector), _PHOTOGRAPH).found
-    landmarks = seen.landmarks.float()
+    finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
+    faces = find_some_faces(image, face, detector)
+    seen = _settled(finder, image, faces.boxes[face], float(faces.tilts[face]))
+    return _refined_face(seen.found, image, appearance)
+
+
+def _refined_face(found: FoundLandmarks, image: Tensor, appearance: AppearanceModel | None) -> TrackedFace:
+    """What was found, refined as the person looks."""
+    landmarks = found.landmarks.float()
     if appearance is not None:
-        landmarks = appearance_landmarks(appearance, grey, landmarks)
-    return TrackedFace(landmarks, box_around(landmarks), seen.confidence.float())
+        landmarks = appearance_landmarks(appearance, torch.from_numpy(grey_pixels(image)), landmarks)
+    return TrackedFace(
+        landmarks, box_around(landmarks), found.confidence.float(), found.visibility.float(), found.presence
+    )
 
 
-def _refined(trees: LandmarkTrees, grey: Tensor, box: Tensor, starts: ConsensusSettings) -> _Seen:
+def _settled(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float) -> _Seen:
     """Landmarks from a detector's box, then from the box round what was found: detectors' boxes fit loosely.
 
-    Once, not until it stands still: where trees err, they err more from a box that follows them.
+    Once, not until it stands still: where a finder errs, it errs more from a box that follows it.
     """
-    first = consensus(trees, grey, box, 0.0, starts)
-    again = box_around(first.landmarks)
-    if not bool(torch.isfinite(again).all()) or float(overlaps(box[None], again[None])) < 0.25:
+    first = find_in_box(finder, image, box, tilt)
+    again = _upright_box(first.landmarks)
+    if float(overlaps(box[None], again[None])) < 0.25 or not float(again[2]) >= 1:
         return _Seen(first, box)
-    return _Seen(consensus(trees, grey, again, tilt_of(trees, first.landmarks), starts), again)
+    return _Seen(find_in_box(finder, image, again, float(tilt_around(first.landmarks))), again)
 
 
-def _relation(box: Tensor, other: Tensor) -> Tensor:
-    """Where another box (4,) lies: its middle from the box's (2,) in sides of that, and its size by that's; (3,)."""
+def _upright_box(landmarks: Tensor) -> Tensor:
+    """The box (4,) round landmarks (68,2) as if the face were turned upright."""
+    return box_around(landmarks, float(tilt_around(landmarks)))
+
+
+def _relation(box: Tensor, other: Tensor, tilt: Tensor) -> Tensor:
+    """Where another box (4,) lies, as a face with this tilt sees it: its middle from the box's (2,) in sides of that,
+    and its size by that's; (3,)."""
     offset = (other[:2] + other[2:] / 2 - box[:2] - box[2:] / 2) / box[2]
-    return torch.cat([offset.clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
+    return torch.cat([(_turn(tilt).T @ offset).clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
+
+
+def _turn(tilt: Tensor) -> Tensor:
+    """The rotation (2,2) of a face with a tilt, clockwise as the image is seen."""
+    cos, sin = tilt.cos(), tilt.sin()
+    return torch.stack([cos, -sin, sin, cos]).view(2, 2)
 
 
 @torch.no_grad()

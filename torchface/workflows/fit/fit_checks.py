@@ -12,7 +12,7 @@ from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.one_person import same_person
-from torchface.workflows.fit.found_landmarks import FoundLandmarks, find_in_photographs
+from torchface.workflows.fit.found_landmarks import PhotographLandmarks, find_in_photographs
 
 MISFIT = 0.045
 """Of the eyes' distance: given landmarks that lie further from the fit are remarked on."""
@@ -110,7 +110,7 @@ def landmark_lines(
     return lines
 
 
-def _found_there(photograph: Path, image: Tensor, marks: Tensor, finder: str | Path) -> FoundLandmarks | None:
+def _found_there(photograph: Path, image: Tensor, marks: Tensor, finder: str | Path) -> PhotographLandmarks | None:
     """Found landmarks of the face that has given ones."""
     seen = marks[torch.isfinite(marks).all(-1)]
     middle, size = seen.mean(0), (seen.amax(0) - seen.amin(0)).amax()

@@ -9,12 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface import zoo
-from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.landmarks import LandmarkTrees, NoFaceError, TrackedFace, find_faces, find_landmarks
-
-DEFAULT_LANDMARKS = "face_landmarks"
-"""The model of the zoo that finds landmarks where none is named."""
+from torchface.landmarks import NoFaceError, TrackedFace, find_faces, find_landmarks
+from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 UNSURE = 0.2
 """Landmarks of lower confidence are left out of a fit."""
@@ -26,7 +22,7 @@ _PARTS = {"jaw": slice(0, 17), "brows": slice(17, 27), "nose": slice(27, 36), "e
 
 
 @dataclass(frozen=True, eq=False)
-class FoundLandmarks:
+class PhotographLandmarks:
     """What was found in one photograph.
 
     Args:
@@ -79,29 +75,12 @@ class FoundLandmarks:
         return lines
 
 
-def load_landmark_model(name_or_path: str | Path) -> LandmarkTrees:
-    """Trees that find the 68 landmarks, by name or folder; see ``zoo.get_model``.
-
-    Raises:
-        NameMismatchError: there is none of this name, or it is of another kind.
-        ValueRangeError: it finds other landmarks.
-    """
-    found = zoo.get_model(name_or_path)
-    if not isinstance(found, LandmarkTrees):
-        raise NameMismatchError(
-            f"landmark model: found {name_or_path}, a {type(found).__name__}, expected a LandmarkTrees"
-        )
-    if len(found.mean) != 68:
-        raise ValueRangeError(f"{name_or_path}: found a model of {len(found.mean)} landmarks, expected the 68 of iBUG")
-    return found
-
-
 def find_in_photographs(
     photographs: Sequence[Path],
     images: Sequence[Tensor],
     model: str | Path = DEFAULT_LANDMARKS,
     face: int | None = None,
-) -> list[FoundLandmarks]:
+) -> list[PhotographLandmarks]:
     """Finds one face in each photograph.
 
     Args:
@@ -114,16 +93,17 @@ def find_in_photographs(
         NoFaceError: a photograph shows no face, or not so many.
         NameMismatchError: the model is of another kind.
     """
-    trees = load_landmark_model(model)
+    finder = load_finder(model, photographs=True, option="landmark model").finder
     found = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
         faces = find_faces(pixels)
         try:
-            seen = find_landmarks(pixels, trees, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
+            seen = find_landmarks(pixels, finder, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
         except NoFaceError as error:
             raise NoFaceError(
                 f"{path}: {str(error).partition(': ')[2]}; give another photograph, or landmarks with --landmarks"
             ) from error
-        found.append(FoundLandmarks(path, str(model), seen, face or 0, faces.boxes, (pixels.shape[2], pixels.shape[1])))
+        size = (pixels.shape[2], pixels.shape[1])
+        found.append(PhotographLandmarks(path, str(model), seen, face or 0, faces.boxes, size))
     return found

@@ -24,7 +24,7 @@ from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
-from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, FoundLandmarks, find_in_photographs
+from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, PhotographLandmarks, find_in_photographs
 from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import check_out
@@ -48,7 +48,7 @@ class FittedHead:
     fit: ImageFit
     overlays: tuple[Path, ...]
     transfer_summary: str
-    found: tuple[FoundLandmarks, ...] = ()
+    found: tuple[PhotographLandmarks, ...] = ()
     remarks: tuple[str, ...] = ()
 
     def lines(self, photographs: Sequence[Path]) -> list[str]:
@@ -128,7 +128,7 @@ def fit_photographs(
     heads, rig = matching(load_head_model(model), template, part)
     progress(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
-    found: list[FoundLandmarks] = []
+    found: list[PhotographLandmarks] = []
     if landmarks or not photographs:
         marks = torch.stack(landmarks_of(photographs, landmarks, face))
         for photograph in photographs:

@@ -91,7 +91,7 @@ class LiveSolver:
 
     def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
         self.names = rig.names
-        self._tracker = LandmarkTracker(models.trees, models.appearance, face=face)
+        self._tracker = LandmarkTracker(models.finder, models.appearance, face=face)
         self._calibration, self._filter = calibration, LandmarkFilter()
         self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
         self._solver = solver_for(rig, models, calibration)

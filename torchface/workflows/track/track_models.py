@@ -13,11 +13,10 @@ from torchface import zoo
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.content_keys import content_key
-from torchface.landmarks import AppearanceModel, LandmarkTrees
+from torchface.landmarks import AppearanceModel
+from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.rig import BlendshapeRig
-
-DEFAULT_LANDMARKS = "face_landmarks"
-"""The model of the zoo that finds landmarks where none is named."""
+from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 _Model = TypeVar("_Model", bound=nn.Module)
 Fitted = TypeVar("Fitted")
@@ -28,7 +27,7 @@ class TrackModels:
     """What tracks and solves.
 
     Args:
-        trees: find landmarks in any face.
+        finder: finds landmarks in any face.
         appearance: refines them on the actor's own.
         prior: which weights faces have.
         dynamics: how weights go on.
@@ -37,7 +36,7 @@ class TrackModels:
         solving: changes when what solves does.
     """
 
-    trees: LandmarkTrees
+    finder: LandmarkFinder
     appearance: AppearanceModel | None = None
     prior: ShapePrior | None = None
     dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None
@@ -64,21 +63,19 @@ def load_track_models(
     Raises:
         NameMismatchError: there is none of a name, one is of another kind, or a prior has learned less than half of
             the rig's shapes.
-        ValueRangeError: the trees find other landmarks than the 68, or the dynamics prior is of a frame rate more than
+        ValueRangeError: trees find other landmarks than the 68, or the dynamics prior is of a frame rate more than
             eight times as high or as low.
         FileFormatError: a model is damaged.
     """
-    trees = _read("--landmarks", landmarks, LandmarkTrees)
-    if len(trees.mean) != 68:
-        raise ValueRangeError(f"{landmarks}: found a model of {len(trees.mean)} landmarks, expected the 68 of iBUG")
+    seeing = load_finder(landmarks)
     priors = load_priors(rig, prior, dynamics, fps)
     return TrackModels(
-        trees,
+        seeing.finder,
         None if appearance is None else _read("--appearance", appearance, AppearanceModel),
         priors.shapes,
         priors.dynamics,
         priors.unlearned,
-        content_key("seeing", trees=_folder(landmarks), appearance=_folder(appearance)),
+        content_key("seeing", finder=seeing.source, appearance=_folder(appearance)),
         content_key("solving", prior=_folder(prior), dynamics=_folder(dynamics), fps=fps),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -15,12 +15,13 @@ from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key, file_digest
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import make_folder
+from torchface.landmarks.images.tracking import TrackedFace
 
 FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/2"
+_METHOD = "tracked frames/3"
 _LANDMARKS = 68
 _MAX_PIECE_BYTES = 2**28
 
@@ -33,31 +34,48 @@ class TrackedFrames:
         landmarks: (T,68,2), pixels of the video; NaN where the face is lost.
         confidence: (T,68) in [0,1].
         boxes: of the face, x, y, width, height, (T,4), pixels.
+        visibility: (T,68) in [0,1]; 1 throughout if absent, as of a finder that does not say.
+        presence: how likely it is a face, (T,) in [0,1]; 1 throughout if absent.
     """
 
     landmarks: Tensor
     confidence: Tensor
     boxes: Tensor
+    visibility: Tensor = None  # type: ignore[assignment]
+    presence: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = len(self.landmarks)
-        found = (tuple(self.landmarks.shape), tuple(self.confidence.shape), tuple(self.boxes.shape))
-        if found != ((count, _LANDMARKS, 2), (count, _LANDMARKS), (count, 4)):
-            raise ShapeError(f"tracked frames: found {found}, expected (T,68,2), (T,68) and (T,4)")
+        if self.visibility is None:
+            object.__setattr__(self, "visibility", torch.ones(count, _LANDMARKS))
+        if self.presence is None:
+            object.__setattr__(self, "presence", torch.ones(count))
+        expected = ((count, _LANDMARKS, 2), (count, _LANDMARKS), (count, 4), (count, _LANDMARKS), (count,))
+        found = tuple(tuple(getattr(self, one.name).shape) for one in fields(self))
+        if found != expected:
+            raise ShapeError(f"tracked frames: found {found}, expected (T,68,2), (T,68), (T,4), (T,68) and (T,)")
 
     def __len__(self) -> int:
         return len(self.landmarks)
+
+    @staticmethod
+    def of_faces(faces: Sequence[TrackedFace]) -> TrackedFrames:
+        """The frames in which a tracker saw these, one at least."""
+        return TrackedFrames(
+            torch.stack([one.landmarks for one in faces]),
+            torch.stack([one.confidence for one in faces]),
+            torch.stack([one.box for one in faces]),
+            torch.stack([one.visibility for one in faces]),
+            torch.tensor([one.presence for one in faces]),
+        )
 
     @staticmethod
     def joined(pieces: Sequence[TrackedFrames]) -> TrackedFrames:
         """Pieces one after the other; none gives no frames."""
         if not pieces:
             return TrackedFrames(torch.zeros(0, _LANDMARKS, 2), torch.zeros(0, _LANDMARKS), torch.zeros(0, 4))
-        return TrackedFrames(
-            torch.cat([piece.landmarks for piece in pieces]),
-            torch.cat([piece.confidence for piece in pieces]),
-            torch.cat([piece.boxes for piece in pieces]),
-        )
+        names = [one.name for one in fields(TrackedFrames)]
+        return TrackedFrames(*(torch.cat([getattr(piece, name) for piece in pieces]) for name in names))
 
 
 class TrackState:
@@ -94,7 +112,7 @@ class TrackState:
             FileFormatError: the folder cannot be written to.
         """
         make_folder(self.folder)
-        kept = TrackedFrames(*(tensor.float() for tensor in (piece.landmarks, piece.confidence, piece.boxes)))
+        kept = TrackedFrames(*(getattr(piece, one.name).float() for one in fields(piece)))
         write_checkpoint(self._path(len(self._pieces)), vars(kept), self._piece_key())
         self._pieces.append(kept)
 

@@ -26,7 +26,7 @@ from torchface.io.camera_files import load_calibration
 from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.face_box import find_faces
-from torchface.landmarks.images.tracking import LandmarkTracker
+from torchface.landmarks.images.tracking import LandmarkTracker, naming_the_frame
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
@@ -221,7 +221,7 @@ def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalib
 
 def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:
     """Landmarks of all frames into the state; how many faces the first frame shows."""
-    tracker = LandmarkTracker(models.trees, models.appearance, face=face)
+    tracker = LandmarkTracker(models.finder, models.appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
     frames = clip.frames()
@@ -238,14 +238,11 @@ def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, p
             tracker.resume(last.landmarks[-1], last.confidence[-1])
         found = []
         for frame in piece:  # a frame's box is the one before's
-            found.append(tracker.step(frame))
+            with naming_the_frame(at):
+                found.append(tracker.step(frame))
             at += 1
             progress("tracking landmarks", at, max(clip.count, at))
-        last = TrackedFrames(
-            torch.stack([one.landmarks for one in found]),
-            torch.stack([one.confidence for one in found]),
-            torch.stack([one.box for one in found]),
-        )
+        last = TrackedFrames.of_faces(found)
         state.append(last)
     return faces
 

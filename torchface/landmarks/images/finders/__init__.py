@@ -1,0 +1,1 @@
+"""Who finds landmarks in a box: regression trees, networks, other packages."""

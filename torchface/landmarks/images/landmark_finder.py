@@ -1,0 +1,84 @@
+"""What finds the landmarks of a face in a box: one protocol, whoever finds them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+
+COUNT = 68
+"""iBUG's landmarks, that every finder gives."""
+
+_HALF = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FoundLandmarks:
+    """Landmarks of one face in one image.
+
+    Args:
+        landmarks: iBUG's 68, (68,2) float32 pixels of the whole image.
+        confidence: (68,) in [0,1]; see :func:`confidence_of`.
+        visibility: (68,) in [0,1]: how likely nothing stands before the landmark.
+        presence: in [0,1]: how likely the box shows a face at all.
+    """
+
+    landmarks: Tensor
+    confidence: Tensor
+    visibility: Tensor
+    presence: float
+
+
+class LandmarkFinder(Protocol):
+    """Finds the 68 landmarks of the face in a box.
+
+    The image is uint8, (H,W) or (3,H,W) red first; the box x, y, width, height, (4,) pixels, as
+    :func:`~torchface.landmarks.images.ibug_68.box_around` draws it; the tilt of the face is in radians, clockwise as
+    the image is seen.
+    """
+
+    def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks: ...
+
+
+def confidence_of(deviation: Tensor) -> Tensor:
+    r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the face's box: one half at 0.02."""
+    return 1 / (1 + (deviation / _HALF).square())
+
+
+def finder_name(finder: LandmarkFinder) -> str:
+    """What a finder is called in messages: its ``name``, or its class."""
+    return str(getattr(finder, "name", type(finder).__name__))
+
+
+def find_in_box(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+    """What a finder finds, checked: it may be anybody's.
+
+    Raises:
+        ShapeError: it gave another count of landmarks, or other shapes; the message names the finder.
+        ValueRangeError: it gave landmarks that are not finite, or likelihoods outside of [0,1].
+    """
+    found = finder(image, box, tilt)
+    shapes = tuple(tuple(one.shape) for one in (found.landmarks, found.confidence, found.visibility))
+    if shapes != ((COUNT, 2), (COUNT,), (COUNT,)):
+        raise ShapeError(
+            f"{finder_name(finder)}: found landmarks, confidence and visibility of {shapes[0]}, {shapes[1]} and "
+            f"{shapes[2]}, expected ({COUNT},2), ({COUNT},) and ({COUNT},)"
+        )
+    if not bool(torch.isfinite(found.landmarks).all()):
+        lost = int((~torch.isfinite(found.landmarks)).any(1).sum())
+        raise ValueRangeError(f"{finder_name(finder)}: found {lost} landmarks that are not finite, expected none")
+    for name in ("confidence", "visibility"):
+        values = getattr(found, name)
+        if not bool(((values >= 0) & (values <= 1)).all()):
+            raise ValueRangeError(
+                f"{finder_name(finder)}: found {name} from {float(values.min()):g} to {float(values.max()):g}, "
+                "expected 0 to 1"
+            )
+    if not (math.isfinite(found.presence) and 0 <= found.presence <= 1):
+        raise ValueRangeError(f"{finder_name(finder)}: found presence {found.presence:g}, expected 0 to 1")
+    return found

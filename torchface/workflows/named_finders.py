@@ -1,0 +1,49 @@
+"""What finds landmarks, by the name that a user gives it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchface import zoo
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.landmarks import LandmarkTrees
+from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
+from torchface.landmarks.images.landmark_consensus import ConsensusSettings
+from torchface.landmarks.images.landmark_finder import LandmarkFinder
+
+DEFAULT_LANDMARKS = "face_landmarks"
+"""The model of the zoo that finds landmarks where none is named."""
+
+
+@dataclass(frozen=True)
+class NamedFinder:
+    """What finds landmarks, and the file or folder that it comes from, for keys of what depends on it."""
+
+    finder: LandmarkFinder
+    source: Path | str
+
+
+def load_finder(
+    name_or_path: str | Path = DEFAULT_LANDMARKS, photographs: bool = False, option: str = "--landmarks"
+) -> NamedFinder:
+    """A finder of landmarks by name or folder of the zoo, see ``zoo.get_model``.
+
+    Args:
+        name_or_path: of it.
+        photographs: take the time that a single picture is worth.
+        option: of the command that gives the name, for messages.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+        ValueRangeError: it finds other landmarks than iBUG's 68.
+        FileFormatError: it is damaged.
+    """
+    model = zoo.get_model(name_or_path)
+    if not isinstance(model, LandmarkTrees):
+        raise NameMismatchError(f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees")
+    starts = PHOTOGRAPH if photographs else ConsensusSettings()
+    try:
+        return NamedFinder(TreeFinder(model, starts, str(name_or_path)), zoo.find(name_or_path))
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{name_or_path}: {error}") from error
