@@ -8,12 +8,17 @@ from pathlib import Path
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkTrees
+from torchface.landmarks.images.finders.mediapipe_finder import MediaPipeFinder
+from torchface.landmarks.images.finders.onnx_finder import onnx_finder
 from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 
 DEFAULT_LANDMARKS = "face_landmarks"
 """The model of the zoo that finds landmarks where none is named."""
+
+MEDIAPIPE = "mediapipe"
+"""The name that asks for MediaPipe's face mesh."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +32,24 @@ class NamedFinder:
 def load_finder(
     name_or_path: str | Path = DEFAULT_LANDMARKS, photographs: bool = False, option: str = "--landmarks"
 ) -> NamedFinder:
-    """A finder of landmarks by name or folder of the zoo, see ``zoo.get_model``.
+    """A finder of landmarks.
 
     Args:
-        name_or_path: of it.
+        name_or_path: a model of the zoo by name or folder, see ``zoo.get_model``; an ``.onnx`` file, see
+            :func:`~torchface.landmarks.images.finders.onnx_finder.onnx_finder`; or ``mediapipe``.
         photographs: take the time that a single picture is worth.
         option: of the command that gives the name, for messages.
 
     Raises:
         NameMismatchError: there is none of this name, or it is of another kind.
         ValueRangeError: it finds other landmarks than iBUG's 68.
-        FileFormatError: it is damaged.
+        FileFormatError: it is damaged, or a graph of other inputs and outputs.
+        MissingExtraError: MediaPipe is asked for and not installed.
     """
+    if str(name_or_path) == MEDIAPIPE:
+        return NamedFinder(MediaPipeFinder(), MEDIAPIPE)
+    if Path(name_or_path).suffix.lower() == ".onnx":
+        return NamedFinder(onnx_finder(name_or_path), Path(name_or_path))
     model = zoo.get_model(name_or_path)
     if not isinstance(model, LandmarkTrees):
         raise NameMismatchError(f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees")

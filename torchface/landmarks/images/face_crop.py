@@ -1,0 +1,93 @@
+"""The upright square that a network is shown of a face, and the way between its pixels and the image's."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.landmarks.images.face_box import check_image
+
+CROP_MARGIN = 1.25
+"""A crop's side in sides of the face's box, where nothing else is said."""
+
+_MAX_SIDE = 1e5
+
+
+def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MARGIN) -> Tensor:
+    r"""What takes an image's pixels to a crop's: :math:`\tfrac{n}{m w} R_{-\theta} (x - c) + \tfrac{n-1}{2}`.
+
+    Args:
+        box: x, y, width, height of the face, (4,) pixels; one that is no square counts as the square of the same middle
+            and area.
+        tilt: :math:`\theta`, radians, clockwise as the image is seen; the crop shows the face upright.
+        size: n, pixels a side of the crop.
+        margin: m, the crop's side in sides of the box.
+
+    Returns:
+        (2,3) float64, pixel centres at integers in both.
+
+    Raises:
+        ShapeError: no such box.
+        ValueRangeError: the box is NaN, empty, or absurdly large, or the tilt is not finite.
+    """
+    if box.shape != (4,):
+        raise ShapeError(f"box: found {tuple(box.shape)}, expected (4,)")
+    side = math.sqrt(max(float(box[2] * box[3]), 0.0)) if bool(torch.isfinite(box).all()) else 0.0
+    if not (1 <= side <= _MAX_SIDE and math.isfinite(tilt)):
+        raise ValueRangeError(
+            f"box: found {box.tolist()}, tilt {tilt:g}; expected a face of 1 to {_MAX_SIDE:g} pixels, and an angle"
+        )
+    middle = (box[:2] + box[2:] / 2).double()
+    scale = size / (margin * side)
+    cos, sin = scale * math.cos(tilt), scale * math.sin(tilt)
+    turn = torch.tensor([[cos, sin], [-sin, cos]], dtype=torch.float64)
+    return torch.cat([turn, ((size - 1) / 2 - turn @ middle)[:, None]], 1)
+
+
+def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
+    """The square of an image that a transform shows; beyond the border the border's pixels go on.
+
+    Where the face is larger than the crop it is made smaller by averaging first, so that no pixels are skipped.
+
+    Args:
+        image: uint8 (H,W), or (3,H,W) red first.
+        transform: (2,3), see :func:`crop_transform`.
+        size: pixels a side.
+
+    Returns:
+        uint8 (3,S,S), red first; a grey image gives three alike.
+
+    Raises:
+        ShapeError: no such image.
+    """
+    check_image(image)
+    height, width = image.shape[-2:]
+    last = size - 0.5
+    corners = from_crop(torch.tensor([[-0.5, -0.5], [last, -0.5], [-0.5, last], [last, last]]), transform)
+    left, top = (corners.amin(0) - 2).floor().clamp(min=0).long().tolist()
+    right, bottom = ((corners.amax(0) + 2).ceil().long() + 1).tolist()
+    left, top = min(left, width - 1), min(top, height - 1)
+    right, bottom = min(max(right, left + 1), width), min(max(bottom, top + 1), height)
+    piece = image[..., top:bottom, left:right].cpu()
+    pixels = cv2.merge([plane.numpy() for plane in (piece if image.ndim == 3 else (piece, piece, piece))])
+    scale = float(transform[:, :2].det().abs().sqrt())
+    ratio = (1.0, 1.0)
+    if scale < 1:
+        small = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+        ratio = (small[0] / pixels.shape[1], small[1] / pixels.shape[0])
+        pixels = cv2.resize(pixels, small, interpolation=cv2.INTER_AREA)
+    # From the pixels of the piece, that may be a smaller copy, to the image's, and from there to the crop's.
+    back = np.array([[1 / ratio[0], 0, left - 0.5 + 0.5 / ratio[0]], [0, 1 / ratio[1], top - 0.5 + 0.5 / ratio[1]]])
+    way = transform.double().numpy() @ np.concatenate([back, [[0.0, 0.0, 1.0]]])
+    crop = cv2.warpAffine(pixels, way, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(crop).permute(2, 0, 1)
+
+
+def from_crop(points: Tensor, transform: Tensor) -> Tensor:
+    """Points (...,2) of a crop as points of the image, float32."""
+    return ((points.double() - transform[:, 2]) @ torch.linalg.inv(transform[:, :2]).T).float()
