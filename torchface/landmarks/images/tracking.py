@@ -293,7 +293,7 @@ def track_landmarks(
     progress = progress or silent
     if isinstance(video, str | Path):
         video = open_video(video)
-    frames = video.frames() if isinstance(video, VideoFile) else video
+    frames = video.color_frames() if isinstance(video, VideoFile) else video
     total = video.count if isinstance(video, VideoFile) else len(video) if isinstance(video, Sized) else 0
     found: list[TrackedFace] = []
     for frame in frames:  # a frame's box is the one before's

@@ -224,7 +224,7 @@ def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, p
     tracker = LandmarkTracker(models.finder, models.appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
-    frames = clip.frames()
+    frames = clip.color_frames()
     for first in frames:
         if at == 0:
             faces = len(find_faces(first))

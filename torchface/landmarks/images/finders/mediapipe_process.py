@@ -1,8 +1,8 @@
 """Runs in the Python that has MediaPipe: crops of faces in through a pipe, points of the face mesh out.
 
 It knows nothing of torchface, so that its Python need not have it. A message in is two little-endian numbers of 32
-bits, height and width, and so many rows of pixels, red first. A message out is their count, 478 or 0 where no face was found,
-and x and y of each in shares of the width and the height, as float32. The end of what comes in ends it.
+bits, height and width, and so many rows of pixels, red first. A message out is a count of points, 478 or 0 where no
+face was found, and x and y of each in shares of width and height, as float32. The end of what comes in ends it.
 """
 
 from __future__ import annotations
