@@ -55,6 +55,10 @@ class LandmarkOffsets:
                 f"most {_LARGEST:g} mm and a share of the eyes' distance, above 0 and below 1"
             )
 
+    def rounded(self) -> LandmarkOffsets:
+        """To a tenth of a micrometre, as files hold them."""
+        return replace(self, millimetres=self.millimetres.double().round(decimals=4), noise=round(self.noise, 6))
+
     def save(self, path: str | Path) -> None:
         """Writes them as JSON."""
         write_json(
@@ -62,10 +66,10 @@ class LandmarkOffsets:
             {
                 "format": _FORMAT,
                 "unit": "millimetres",
-                "noise": self.noise,
+                "noise": self.rounded().noise,
                 "rig": self.rig,
                 "finder": self.finder,
-                "offsets": [[round(x, 4) for x in row] for row in self.millimetres.tolist()],
+                "offsets": self.rounded().millimetres.tolist(),
             },
         )
 

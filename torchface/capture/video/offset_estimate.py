@@ -68,8 +68,8 @@ def estimate_offsets(
         + \beta \sum_i \frac{\bar w_i}{1 + \bar w^-_i / \varepsilon}
 
     with :math:`P_t` what no pose explains. The penalty falls for weights that are large already
-    (:math:`\bar w^-`), so that it takes little from a smile of the whole take, while small weights of shapes that hardly
-    move a landmark go to the offsets. How large offsets are, s, comes from the part of the mean residual that no
+    (:math:`\bar w^-`), so that it takes little from a smile of the whole take, while small weights of shapes that
+    hardly move a landmark go to the offsets. How large offsets are, s, comes from the part of the mean residual that no
     expression explains: where rig and finder agree, there are next to none. Then the frames are solved anew.
 
     Args:
@@ -116,7 +116,7 @@ def _estimated(solver: VideoSolver, landmarks: Tensor, trust: Tensor, rig: str, 
         if begun == 0:
             scale = mean.scale
         offsets, expression = _split(mean, offsets, expression, scale * deviations, solver.prior)
-    return offsets
+    return offsets.rounded()
 
 
 def _split(

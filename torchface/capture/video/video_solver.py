@@ -10,11 +10,11 @@ from torch import Tensor
 from torchface.capture.energy import Quadratic
 from torchface.capture.video.face_points import LANDMARKS
 from torchface.capture.video.fixed_point_gradient import attach_gradients
-from torchface.capture.video.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
 from torchface.capture.video.state_estimate import Expectation, StateEstimate
+from torchface.capture.video.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
