@@ -21,6 +21,7 @@ from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_n
 from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.network import LandmarkNetwork
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
@@ -32,6 +33,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "dynamics_prior": DynamicsPrior,
     "expression_regression": ExpressionRegression,
     "head": HeadModel,
+    "landmark_network": LandmarkNetwork,
     "landmark_trees": LandmarkTrees,
     "marker_solver": MarkerSolver,
     "morphable": MorphableModel,

@@ -21,7 +21,7 @@ from torchface.synthetic.head.uv_layout import unwrapping
 SKIN = (0.86, 0.665, 0.565)
 LIPS = (0.70, 0.40, 0.37)
 HAIR = (0.20, 0.145, 0.115)
-_MARKS = ("lips", "mouth", "depth", "socket", "lash", "eyeball", "nostril", "ear")
+_MARKS = 8
 
 
 @lru_cache(maxsize=2)
@@ -31,7 +31,7 @@ def skin_texture(size: int = 1024) -> Tensor:
     Args:
         size: pixels a side.
     """
-    covered, values = texel_values(size, torch.cat([mean_vertices().float(), _vertex_marks()], dim=1))
+    covered, values = texel_values(size, torch.cat([mean_vertices().float(), vertex_marks()], dim=1))
     color = _paint(values[:, :3], values[:, 3:])
     image = torch.zeros(size * size, 3)
     image[covered] = color
@@ -55,10 +55,13 @@ def texel_values(size: int, table: Tensor) -> tuple[Tensor, Tensor]:
     return covered, (table[corners] * barycentric[..., None]).sum(1)
 
 
-def _vertex_marks() -> Tensor:
-    """Vertex attributes beside the positions, (V,8), in the order of ``_MARKS``."""
+def vertex_marks() -> Tensor:
+    """Vertex attributes beside the positions, (V,8).
+
+    They are lips, mouth, depth in it, eye socket, lashes, eyeball, nostril and ear.
+    """
     t, regions = topology(), head_annotations().regions
-    marks = torch.zeros(t.count, len(_MARKS))
+    marks = torch.zeros(t.count, _MARKS)
     lips = torch.tensor([0.0] * (MOUTH_BORDER - 1) + [0.0, 0.55, 1.0, 1.0, 1.0, 1.0] + [1.0] * 7)
     deep = (torch.arange(len(t.rings["mouth"])) - MOUTH_CONTACT).clamp(min=0) / 7
     above, _ = lid_order()
@@ -80,7 +83,7 @@ def _vertex_marks() -> Tensor:
     return marks
 
 
-def _noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
+def noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
     """Smooth random values (N,) in about [-1,1] that change over a length; the same at the same point everywhere."""
     generator = torch.Generator().manual_seed(seed)
     lattice = torch.rand(1, 1, 32, 32, 32, generator=generator) * 2 - 1
@@ -90,56 +93,65 @@ def _noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
     return torch.nn.functional.grid_sample(lattice, grid, padding_mode="border", align_corners=True)[0, 0, 0, 0]
 
 
-def _blob(points: Tensor, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Tensor:
+def blob(points: Tensor, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Tensor:
+    """A Gaussian (N,) round a point of the left side of the face and its mirror image, falling to 1/e at ``width``."""
     folded = torch.cat([points[:, :1].abs(), points[:, 1:]], dim=1)
     return torch.exp(-(((folded - torch.tensor(centre)) / torch.tensor(width)) ** 2).sum(1))
 
 
-def _mix(color: Tensor, other: tuple[float, float, float], share: Tensor) -> Tensor:
+def mix(color: Tensor, other: tuple[float, ...], share: Tensor) -> Tensor:
+    """Colours (N,3) with a share (N,) of another in them."""
     return color + (torch.tensor(other) - color) * share.clamp(0, 1)[:, None]
 
 
 def _paint(p: Tensor, marks: Tensor) -> Tensor:
     lips, mouth, depth, socket, lash, eyeball, nostril, ear = marks.unbind(1)
     color = torch.tensor(SKIN).expand(len(p), 3).clone()
-    broad, fine, pores = _noise(p, 16.0, 1), _noise(p, 4.5, 2), _noise(p, 0.9, 3)
-    red = 0.55 * _blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * _blob(p, (3, -36, 108), (15, 10, 14))
-    red += 0.3 * _blob(p, (0, -100, 88), (22, 12, 20)) + 0.35 * ear + 0.18 * broad.clamp(min=0) + 0.08 * fine
-    color = _mix(color, (0.76, 0.43, 0.37), 0.62 * red)
-    dark = 0.5 * _blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.45 * _blob(p, (22, 6, 80), (10, 7, 14))
-    color = _mix(color, (0.53, 0.36, 0.33), 0.75 * dark)
-    color = _mix(color, (0.87, 0.70, 0.59), 0.35 * _blob(p, (0, 45, 92), (34, 18, 40)))
+    broad, fine, pores = noise(p, 16.0, 1), noise(p, 4.5, 2), noise(p, 0.9, 3)
+    red = 0.55 * blob(p, (40, -30, 62), (22, 18, 30)) + 0.4 * blob(p, (3, -36, 108), (15, 10, 14))
+    red += 0.3 * blob(p, (0, -100, 88), (22, 12, 20)) + 0.35 * ear + 0.18 * broad.clamp(min=0) + 0.08 * fine
+    color = mix(color, (0.76, 0.43, 0.37), 0.62 * red)
+    dark = 0.5 * blob(p, (29, -11, 76), (14, 5.5, 14)) + 0.45 * blob(p, (22, 6, 80), (10, 7, 14))
+    color = mix(color, (0.53, 0.36, 0.33), 0.75 * dark)
+    color = mix(color, (0.87, 0.70, 0.59), 0.35 * blob(p, (0, 45, 92), (34, 18, 40)))
     color = color * (1 + 0.035 * broad + 0.03 * fine + 0.028 * pores)[:, None]
-    freckled = _blob(p, (22, -18, 82), (28, 14, 30)) + 0.35 * _blob(p, (20, 40, 90), (50, 26, 40))
-    spots = ramp(_noise(p, 1.2, 4) + 0.35 * _noise(p, 5.0, 5), 0.66, 1.0)
-    color = _mix(color, (0.55, 0.34, 0.24), 0.32 * spots * freckled)
-    color = _mix(color, HAIR, _cropped_hair(p, fine, pores) * (1 - ear))
-    color = _mix(color, HAIR, _brows(p))
-    lip_tone = torch.tensor(LIPS) * (1 + 0.10 * _noise(p * torch.tensor([4.0, 0.7, 0.7]), 2.2, 6))[:, None]
+    freckled = blob(p, (22, -18, 82), (28, 14, 30)) + 0.35 * blob(p, (20, 40, 90), (50, 26, 40))
+    spots = ramp(noise(p, 1.2, 4) + 0.35 * noise(p, 5.0, 5), 0.66, 1.0)
+    color = mix(color, (0.55, 0.34, 0.24), 0.32 * spots * freckled)
+    color = mix(color, HAIR, _cropped_hair(p, fine, pores) * (1 - ear))
+    color = mix(color, HAIR, _brows(p))
+    lip_tone = torch.tensor(LIPS) * (1 + 0.10 * noise(p * torch.tensor([4.0, 0.7, 0.7]), 2.2, 6))[:, None]
     color = color + (lip_tone - color) * (0.9 * ramp(lips, 0.25, 0.85))[:, None]
-    color = _mix(color, (0.40, 0.15, 0.14), ramp(mouth, 0.3, 1.0) * 0.9)
-    color = _mix(color, (0.13, 0.04, 0.04), depth**0.7 * ramp(mouth, 0.5, 1.0))
-    color = _mix(color, (0.74, 0.46, 0.41), ramp(socket, 0.2, 0.8))
-    color = _mix(color, (0.12, 0.08, 0.07), 0.9 * lash * (1 - socket))
-    color = _mix(color, (0.22, 0.10, 0.08), 0.92 * nostril)
+    color = mix(color, (0.40, 0.15, 0.14), ramp(mouth, 0.3, 1.0) * 0.9)
+    color = mix(color, (0.13, 0.04, 0.04), depth**0.7 * ramp(mouth, 0.5, 1.0))
+    color = mix(color, (0.74, 0.46, 0.41), ramp(socket, 0.2, 0.8))
+    color = mix(color, (0.12, 0.08, 0.07), 0.9 * lash * (1 - socket))
+    color = mix(color, (0.22, 0.10, 0.08), 0.92 * nostril)
     is_ball = eyeball > 0.5
     color[is_ball] = _eye(p[is_ball])
     return color.clamp(0, 1)
+
+
+def brow_line(x: Tensor) -> tuple[Tensor, Tensor]:
+    """The height of the brows' middle line and half their thickness, (N,) each, at distances x (N,) from the face's
+    middle, millimetres."""
+    along = ((x - 9.0) / 41.0).detach().cpu().numpy()
+    knots, arch = np.array([0, 0.3, 0.62, 0.82, 1.0]), np.array([18.2, 20.6, 23.0, 21.6, 17.4])
+    middle = torch.from_numpy(np.interp(along, knots, arch)).float()
+    return middle, torch.from_numpy(np.interp(along, knots, np.array([3.4, 3.7, 3.0, 2.2, 0.9]))).float()
 
 
 def _brows(p: Tensor) -> Tensor:
     """Share of brow hair: a tapering arch of strokes that lean outward."""
     x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
     along = (x - 9.0) / 41.0
-    knots, arch = np.array([0, 0.3, 0.62, 0.82, 1.0]), np.array([18.2, 20.6, 23.0, 21.6, 17.4])
-    middle = torch.from_numpy(np.interp(along.numpy(), knots, arch)).float()
-    half = torch.from_numpy(np.interp(along.numpy(), knots, np.array([3.4, 3.7, 3.0, 2.2, 0.9]))).float()
+    middle, half = brow_line(x)
     inside = 1 - ramp((y - middle).abs() / half, 0.55, 1.15)
     ends = ramp(along, -0.05, 0.08) * (1 - ramp(along, 0.9, 1.04))
     # Strokes: noise drawn out along a direction that rotates from upright to outward.
     lean = 0.9 - 0.6 * along.clamp(0, 1)
     stroke = torch.stack([(x - y * (1 - lean)) * 2.6, (y + x * (1 - lean)) * 0.45, z * 0.3], dim=1)
-    hair = 0.68 + 0.42 * _noise(stroke, 0.9, 7) + 0.12 * _noise(stroke, 2.4, 9)
+    hair = 0.68 + 0.42 * noise(stroke, 0.9, 7) + 0.12 * noise(stroke, 2.4, 9)
     return (inside * ends * hair * (z > 40)).clamp(0, 0.92)
 
 
@@ -159,12 +171,12 @@ def _eye(p: Tensor) -> Tensor:
     polar = torch.acos(torch.nn.functional.normalize(offset, dim=1)[:, 2].clamp(-1, 1))
     angle = torch.atan2(offset[:, 1], offset[:, 0])
     color = torch.tensor((0.86, 0.83, 0.80)).expand(len(p), 3).clone()
-    color = _mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
+    color = mix(color, (0.78, 0.52, 0.48), 0.75 * ramp(polar, 0.75, 1.5))
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
-    iris = torch.tensor((0.33, 0.24, 0.14)) * (1 + 0.45 * _noise(spokes, 1.0, 8))[:, None]
-    iris = _mix(iris, (0.46, 0.34, 0.17), 1 - ramp(polar, 0.17, 0.34))
-    iris = _mix(iris, (0.09, 0.06, 0.05), ramp(polar, 0.35, 0.45))
+    iris = torch.tensor((0.33, 0.24, 0.14)) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
+    iris = mix(iris, (0.46, 0.34, 0.17), 1 - ramp(polar, 0.17, 0.34))
+    iris = mix(iris, (0.09, 0.06, 0.05), ramp(polar, 0.35, 0.45))
     color = color + (iris - color) * (1 - ramp(polar, 0.425, 0.475))[:, None]
-    color = _mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
+    color = mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
     glint = torch.nn.functional.normalize(offset, dim=1) - torch.tensor([-0.13, 0.20, 0.97])
-    return _mix(color, (1.0, 1.0, 1.0), 0.9 * (1 - ramp(glint.norm(dim=1), 0.04, 0.09)))
+    return mix(color, (1.0, 1.0, 1.0), 0.9 * (1 - ramp(glint.norm(dim=1), 0.04, 0.09)))

@@ -62,14 +62,14 @@ def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generat
     """
     rest, moved = rest.double(), moved.double()
     share = hair_share(hairdo.hairline)
-    lumps = _lumps(rest, generator)
-    lift = hairdo.thickness * share * (1.0 + 0.4 * lumps).clamp(min=0.1)
+    uneven = lumps(rest, generator)
+    lift = hairdo.thickness * share * (1.0 + 0.4 * uneven).clamp(min=0.1)
     head = moved + lift[:, None] * vertex_normals(moved, faces)
     pieces = [(head, faces, 0)]
     if hairdo.curtain > 0:
-        pieces.append((*_curtain(rest, hairdo, generator), 1))
-    pieces += [(*teeth, 2) for teeth in _teeth(rest, moved)]
-    pieces.append((*_shoulders(rest), 3))
+        pieces.append((*curtain(rest, hairdo, generator), 1))
+    pieces += [(*row, 2) for row in teeth(rest, moved)]
+    pieces.append((*shoulders(rest), 3))
     sizes = [len(piece[0]) for piece in pieces]
     first = [sum(sizes[:i]) for i in range(len(sizes))]
     return Portrait(
@@ -88,15 +88,18 @@ def widened(vertices: Tensor, share: float) -> Tensor:
 
 def hair_share(hairline: float) -> Tensor:
     """0 on the face, 1 on the scalp, (V,), for a hairline moved up by so many millimetres."""
-    p = mean_vertices()
+    regions = head_annotations().regions
+    return hair_share_at(mean_vertices(), regions["ear_left"] | regions["ear_right"], hairline)
+
+
+def hair_share_at(p: Tensor, ear: Tensor, hairline: float) -> Tensor:
+    """See ``hair_share``; at points (N,3) of the mean head, of which some are an ear's, (N,) bool."""
     x, y, z = p[:, 0].abs(), p[:, 1], p[:, 2]
     line = np.interp(
         z.numpy(), [-200, -70, -30, -14, 8, 20, 34, 48, 62, 90], [-85, -80, -50, -18, -2, 10, 36, 52, 57, 63]
     )
     front = ramp(z, 30, 70)  # at the sides the hair keeps to the ears, however high or low it is in front
     edge = torch.from_numpy(line) + 0.03 * (x - 40).clamp(min=0) + hairline * front
-    regions = head_annotations().regions
-    ear = regions["ear_left"] | regions["ear_right"]
     return ramp(y - edge, -5.0, 7.0) * ~ear
 
 
@@ -106,7 +109,7 @@ def _marks() -> Tensor:
     return marks
 
 
-def _lumps(points: Tensor, generator: torch.Generator, waves: int = 12) -> Tensor:
+def lumps(points: Tensor, generator: torch.Generator, waves: int = 12) -> Tensor:
     """A smooth random field of about unit size, (N,), of 20 to 70 mm."""
     heading = torch.nn.functional.normalize(torch.randn(waves, 3, generator=generator).double(), dim=-1)
     draw = torch.rand(waves, 2, generator=generator).double()
@@ -120,7 +123,7 @@ def _grid_faces(rows: int, columns: int) -> Tensor:
     return torch.cat([torch.stack([a, b, c], -1).view(-1, 3), torch.stack([a, c, d], -1).view(-1, 3)])
 
 
-def _curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Hair that hangs from the temples round the back of the head."""
     rows, columns = 24, 60
     opening = math.radians(hairdo.opening)
@@ -136,11 +139,11 @@ def _curtain(rest: Tensor, hairdo: Hairdo, generator: torch.Generator) -> tuple[
     z = (front - far) / 2 + radius_z * bulge * angle.cos() - 6
     points = torch.stack([x, y.expand_as(x), z], -1).view(-1, 3)
     outward = points * points.new_tensor([1.0, 0.0, 1.0])
-    points = points + 5.0 * _lumps(points, generator)[:, None] * torch.nn.functional.normalize(outward, dim=-1)
+    points = points + 5.0 * lumps(points, generator)[:, None] * torch.nn.functional.normalize(outward, dim=-1)
     return points, _grid_faces(rows, columns)
 
 
-def _teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
+def teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
     """The upper row, which stays with the skull, and the lower, which goes with the chin."""
     marks = _marks()
     rest_points, moved_points = rest[marks], moved[marks]
@@ -157,26 +160,34 @@ def _teeth(rest: Tensor, moved: Tensor) -> list[tuple[Tensor, Tensor]]:
     return rows
 
 
-def _shoulders(rest: Tensor) -> tuple[Tensor, Tensor]:
-    """A bust's upper side below the neck."""
+def shoulders(rest: Tensor, marks: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """A bust's upper side below the neck of a head (V,3) with 68 landmark vertices, the performer's if absent."""
     rows, columns = 14, 40
     turn = torch.linspace(0, 2 * math.pi, columns).double()
     up = torch.linspace(0.05, math.pi / 2, rows).double()[:, None]
-    chin = float(rest[_marks()[8], 1])
+    chin = float(rest[(_marks() if marks is None else marks)[8], 1])
     height = (chin - 175 + 125 * up.cos()).expand(rows, columns)
     points = torch.stack([215 * up.sin() * turn.sin(), height, -25 + 110 * up.sin() * turn.cos()], -1)
     return points.view(-1, 3), _grid_faces(rows, columns)
 
 
 @lru_cache(maxsize=1)
-def _contour_lines() -> tuple[Tensor, ...]:
+def _performer_contours() -> tuple[Tensor, ...]:
+    regions = head_annotations().regions
+    hidden = ("mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right", "ear_left", "ear_right")
+    return contour_lines(mean_vertices(), _marks(), ~torch.stack([regions[name] for name in hidden]).any(0))
+
+
+def contour_lines(p: Tensor, marks: Tensor, skin: Tensor) -> tuple[Tensor, ...]:
     """For each of the jaw's 17 landmarks the vertices from it toward the face's middle, the landmark first.
 
     They lie in the plane through the landmark that holds the viewing axis and the line to the face's middle.
+
+    Args:
+        p: the vertices of a head, in place of the performer's, (V,3).
+        marks: its 68 landmark vertices.
+        skin: which vertices are its outer skin, (V,) bool.
     """
-    p, marks, regions = mean_vertices(), _marks(), head_annotations().regions
-    hidden = ("mouth_interior", "nostrils", "eye_sockets", "eyeball_left", "eyeball_right", "ear_left", "ear_right")
-    skin = ~torch.stack([regions[name] for name in hidden]).any(0)
     lines = []
     for row in range(17):
         end = p[marks[row]]
@@ -212,8 +223,19 @@ def annotated_landmarks(pixels: Tensor) -> Tensor:
     seen = pixels[marks].clone()
     rows, weights = _brow_edge()
     seen[17:27] = (pixels[rows] * weights[..., None].to(pixels)).sum(1)
-    middle = seen[27:36].mean(0)
-    for row, line in enumerate(_contour_lines()):  # lines differ in length
+    return with_visible_jaw(seen, pixels, _performer_contours())
+
+
+def with_visible_jaw(seen: Tensor, pixels: Tensor, lines: tuple[Tensor, ...]) -> Tensor:
+    """Landmarks (68,2) with the jaw's where the face ends: where cheeks hide its line, the cheeks' outline is.
+
+    Args:
+        seen: the 68, pixels.
+        pixels: where a camera sees the head's vertices, (V,2).
+        lines: see ``contour_lines``.
+    """
+    seen, middle = seen.clone(), seen[27:36].mean(0)
+    for row, line in enumerate(lines):  # lines differ in length
         way = torch.nn.functional.normalize(seen[row] - middle, dim=0)
         seen[row] = pixels[line[((pixels[line] - middle) @ way).argmax()]]
     return seen

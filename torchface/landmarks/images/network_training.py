@@ -1,0 +1,249 @@
+"""How the landmark network learns from cut-out pictures with exact landmarks."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
+from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.picture_augmentation import AugmentationSettings, Crops, augmented
+from torchface.progress import Progress, silent
+
+_METHOD = "landmark network/1"
+_CHECK = 200  # steps from checkpoint to checkpoint
+# Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
+_PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
+                       [19, 37], [24, 44]])  # fmt: skip
+_HEAT = 1.0  # standard deviation of the heat map asked for, cells
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """How a landmark network is trained.
+
+    Args:
+        steps: of gradient descent.
+        batch: crops a step.
+        rate: largest learning rate, reached after a twentieth of the steps; it ends at zero as a cosine.
+        decay: of the weights.
+        average: share of the running mean of weights that stays in each step.
+        pair: weight of distances between landmarks, such as between lids.
+        heat: weight of the heat maps' form, which fades over the first half.
+        workers: processes that draw crops.
+        seed: draws crops and the first weights.
+        augmentation: how widely crops are drawn.
+    """
+
+    steps: int = 8000
+    batch: int = 64
+    rate: float = 2e-3
+    decay: float = 1e-4
+    average: float = 0.998
+    pair: float = 1.0
+    heat: float = 0.5
+    workers: int = 1
+    seed: int = 0
+    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+
+    def __post_init__(self) -> None:
+        if not (self.steps >= 1 and self.batch >= 2 and 0 < self.rate < 1 and 0 <= self.average < 1):
+            raise ValueRangeError(
+                f"network settings: found {self.steps} steps, batch {self.batch}, rate {self.rate}, average "
+                f"{self.average}; expected at least 1, at least 2, (0,1), [0,1)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Batches(IterableDataset):
+    """Crops of step ``first`` and on; what a step draws depends on its number alone."""
+
+    rgba: Tensor
+    landmarks: Tensor
+    visible: Tensor
+    size: int
+    margin: float
+    first: int
+    settings: NetworkSettings
+
+    def __iter__(self) -> Iterator[Crops]:
+        torch.set_num_threads(1)
+        worker = get_worker_info()
+        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for step in range(self.first + offset, self.settings.steps, stride):
+            generator = torch.Generator().manual_seed(1_000_003 * self.settings.seed + step)
+            rows = torch.randint(len(self.rgba), (self.settings.batch,), generator=generator)
+            yield augmented(
+                self.rgba[rows], self.landmarks[rows], self.visible[rows], self.size, self.margin, generator,
+                self.settings.augmentation,
+            )  # fmt: skip
+
+
+def fit_network(
+    rgba: Tensor,
+    landmarks: Tensor,
+    visible: Tensor,
+    network: LandmarkNetwork | None = None,
+    settings: NetworkSettings | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+    device: str | torch.device = "cpu",
+) -> LandmarkNetwork:
+    r"""Trains a landmark network on pictures.
+
+    .. math:: \sum_l v_l \Bigl( r_l + 3 \ln(1 + r_l / 0.7) + \tfrac{r_l}{\sigma_l} + 2 \ln \sigma_l \Bigr)
+        + \text{distances of pairs} + \text{form of heat maps} + \text{cross entropy of } v \text{ and presence}
+
+    with :math:`r_l` the distance from the truth in pixels of the crop: linear far away, steep near the truth, so that
+    neither what is hidden nor what is already good decides alone. :math:`\sigma` learns from the likelihood without
+    pulling on the places.
+
+    Args:
+        rgba: cut-out faces, uint8 (M,4,H,W); see ``synthetic.stages.face_pictures``.
+        landmarks: iBUG's 68, (M,68,2) pixels.
+        visible: which of them nothing hides, (M,68) bool.
+        network: goes on from its weights; a new one if absent.
+        settings: how.
+        progress: called with each step and how far it is.
+        checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
+            pictures may have come by then.
+        device: where the network computes.
+
+    Returns:
+        The running mean of the weights, in evaluation mode, on the CPU.
+
+    Raises:
+        ShapeError: other shapes.
+
+    Source: Feng et al. 2018 (a loss that is steep near zero); Kumar et al. 2020 (likelihood with visibility).
+    """
+    settings, progress = settings or NetworkSettings(), progress or silent
+    if rgba.ndim != 4 or rgba.shape[1] != 4 or rgba.dtype != torch.uint8 or not len(rgba):
+        raise ShapeError(f"rgba: found {rgba.dtype} {tuple(rgba.shape)}, expected uint8 (M,4,H,W) with a picture")
+    if landmarks.shape != (len(rgba), 68, 2) or visible.shape != (len(rgba), 68):
+        raise ShapeError(
+            f"landmarks: found {tuple(landmarks.shape)} and {tuple(visible.shape)}, expected ({len(rgba)},68,2) and "
+            f"({len(rgba)},68)"
+        )
+    if network is None:
+        torch.manual_seed(settings.seed)
+        network = LandmarkNetwork()
+    network = network.to(device).to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
+    mean = {name: value.detach().clone() for name, value in network.state_dict().items()}
+    optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
+    key = content_key(_METHOD, settings=settings, config=network.config)
+    first = _resume(checkpoint, key, network, mean, optimiser)
+    batches = _Batches(rgba, landmarks, visible, network.size, network.margin, first, settings)
+    loader = DataLoader(
+        batches, batch_size=None, num_workers=settings.workers, prefetch_factor=4 if settings.workers else None
+    )
+    begin, shown = time.monotonic(), 0.0
+    for step, crops in enumerate(loader, first):
+        for group in optimiser.param_groups:
+            group["lr"] = settings.rate * _schedule(step / settings.steps)
+        loss, error = _loss(network, crops, settings, step / settings.steps, device)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimiser.step()
+        keep = min(settings.average, (1 + step) / (10 + step))
+        with torch.no_grad():
+            for name, value in network.state_dict().items():
+                if value.is_floating_point():
+                    mean[name].lerp_(value, 1 - keep)
+                else:
+                    mean[name].copy_(value)
+        shown = error if not shown else 0.98 * shown + 0.02 * error
+        progress(f"training the network, {shown:.2f} pixels off", step + 1, settings.steps)
+        if checkpoint is not None and (step + 1) % _CHECK == 0:
+            _keep(checkpoint, key, step + 1, network, mean, optimiser, time.monotonic() - begin)
+    network.load_state_dict(mean)
+    return network.to("cpu").to(memory_format=torch.contiguous_format).eval()  # type: ignore[call-overload]
+
+
+def _schedule(share: float) -> float:
+    return min(share / 0.05, 1.0) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+def _loss(
+    network: LandmarkNetwork, crops: Crops, settings: NetworkSettings, share: float, device: str | torch.device
+) -> tuple[Tensor, float]:
+    """The loss of a batch, and the mean distance of what can be seen, pixels."""
+    images, truth = crops.images.to(device, memory_format=torch.channels_last), crops.landmarks.to(device)
+    visible, present = crops.visible.to(device), crops.present.to(device)
+    heat, features, logit = network.maps(images)
+    found: NetworkLandmarks = network.read(heat, features, logit)
+    within = ((truth > 1) & (truth < network.size - 2)).all(-1).float()
+    weight = within * (0.4 + 0.6 * visible) * present[:, None]
+    total = weight.sum().clamp(min=1)
+    distance = ((found.landmarks - truth).square().sum(-1) + 1e-6).sqrt()
+    near = distance + 3 * torch.log1p(distance / 0.7)
+    told = distance.detach() / found.deviation + 2 * found.deviation.log()
+    first, second = _PAIRS.to(device).unbind(1)
+    apart = (found.landmarks[:, first] - found.landmarks[:, second]) - (truth[:, first] - truth[:, second])
+    pair_weight = weight[:, first] * weight[:, second]
+    size = (apart.square().sum(-1) + 1e-6).sqrt()
+    pairs = ((size + 2 * torch.log1p(size / 0.5)) * pair_weight).sum() / pair_weight.sum().clamp(min=1)
+    fading = settings.heat * max(0.0, 1 - 2 * share) + 0.05
+    form = (_heat_form(network, heat, truth) * weight).sum() / total
+    seen = torch.nn.functional.binary_cross_entropy(found.visibility.clamp(1e-5, 1 - 1e-5), visible, reduction="none")
+    seen = (seen * within * present[:, None]).sum() / total
+    there = torch.nn.functional.binary_cross_entropy_with_logits(logit, present)
+    places = ((near + 0.5 * told) * weight).sum() / total
+    loss = places + settings.pair * pairs + fading * form + seen + there
+    clear = within * visible * present[:, None]
+    return loss, float((distance.detach() * clear).sum() / clear.sum().clamp(min=1))
+
+
+def _heat_form(network: LandmarkNetwork, heat: Tensor, truth: Tensor) -> Tensor:
+    """Cross entropy (B,68) of heat maps with a Gaussian about the truth."""
+    cell = float(network.size // heat.shape[-1])
+    squared = (network.places(heat) / cell - (truth / cell)[:, :, None]).square().sum(-1)
+    wanted = torch.softmax(-squared / (2 * _HEAT**2), dim=-1)
+    return -(wanted * heat.flatten(2).log_softmax(-1)).sum(-1)
+
+
+def _keep(
+    path: Path,
+    key: str,
+    step: int,
+    network: LandmarkNetwork,
+    mean: dict[str, Tensor],
+    optimiser: torch.optim.Optimizer,
+    seconds: float,
+) -> None:
+    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
+    tensors |= {f"mean.{name}": value for name, value in mean.items()}
+    for number, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in state.items()}
+    tensors["step"] = torch.tensor(step)
+    tensors["seconds"] = torch.tensor(seconds)
+    write_checkpoint(path, tensors, key)
+
+
+def _resume(
+    path: Path | None, key: str, network: LandmarkNetwork, mean: dict[str, Tensor], optimiser: torch.optim.Optimizer
+) -> int:
+    """Takes up a checkpoint, if there is one of the same settings; the step to go on with."""
+    found = None if path is None else read_checkpoint(path, key)
+    if found is None:
+        return 0
+    network.load_state_dict({name: found[f"network.{name}"] for name in network.state_dict()})
+    for name, value in mean.items():
+        value.copy_(found[f"mean.{name}"])
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in found.items():
+        if name.startswith("optimiser."):
+            _, number, field_name = name.split(".")
+            state.setdefault(int(number), {})[field_name] = value
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    return int(found["step"])

@@ -1,0 +1,1 @@
+"""Colour pictures of synthetic people with exact landmarks, for networks to learn from."""
