@@ -36,7 +36,8 @@ def annotate(
     Args:
         video: A video of the actor, extreme faces among what it shows.
         out: The folder for images and .pts files.
-        landmarks: The model that finds landmarks to start from, of the zoo by name or its folder.
+        landmarks: What finds landmarks to start from: a model of the zoo by name or folder, an .onnx file, or
+            `mediapipe`; or a .csv that holds those of the whole video.
         count: How many frames.
         face: Which face, from 0, the largest first, where there are several.
         browser: Open the page; --no-browser writes the proposed landmarks at once, to be corrected elsewhere.
@@ -47,6 +48,7 @@ def annotate(
     from torchface.files.job_lock import job_lock
     from torchface.workflows.annotate_video import prepare_annotation, write_proposals
     from torchface.workflows.named_finders import load_finder
+    from torchface.workflows.track.given_frames import given_frames, is_table
 
     if browser:
         from torchface.viz.browser.browser_page import HOST, import_viser
@@ -60,12 +62,16 @@ def annotate(
             def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
                 from torchface.landmarks.images.tracking import LandmarkTracker, track_landmarks
 
+                if finder is None:
+                    given = given_frames(Path(landmarks), video)
+                    return given.landmarks, given.confidence
                 found = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
                 return found.values, found.confidence
 
             progress("reading")
-            finder = load_finder(landmarks)
-            key = content_key("annotate", landmarks=finder.source, face=face)
+            finder = None if is_table(landmarks) else load_finder(landmarks)
+            source = Path(landmarks) if finder is None else finder.source
+            key = content_key("annotate", landmarks=source, face=face)
             annotation = prepare_annotation(video, out, track, count, key)
         if not browser:
             for path in write_proposals(annotation):

@@ -14,7 +14,7 @@ def fit(
     photographs: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTO...")],
     model: str,
     out: Path,
-    landmarks: tuple[Path, ...] = (),
+    landmarks: tuple[str, ...] = (),
     landmark_model: str = "face_landmarks",
     template: Path | None = None,
     part: str | None = None,
@@ -39,8 +39,10 @@ def fit(
     Args:
         photographs: Image files.
         landmarks: 68 landmarks in iBUG's order for each photograph: a .pts or .ljson file each, in the same order, or
-            one .xml of dlib's (imglab) that names the photographs, in their pixels once upright; found if absent.
-        landmark_model: What finds them, a model of the zoo by name, or its folder.
+            one .xml of dlib's (imglab) that names the photographs, or one .csv of a row a photograph, in their pixels
+            once upright. Or what finds them: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
+            Found by --landmark-model if absent.
+        landmark_model: What finds them, or is compared with those that files give.
         model: A head model of the zoo by name, or its folder.
         out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
         template: The rig whose shapes the head is given, with the model's topology; if absent the one that travels with
@@ -60,14 +62,18 @@ def fit(
     """
     from torchface.files.job_lock import file_lock
     from torchface.modeling import FitSettings
+    from torchface.workflows.fit.given_landmarks import is_landmark_file
     from torchface.workflows.fit.photograph_rig import fit_photographs
     from torchface.workflows.rig_names import naming_lines
 
+    given = tuple(Path(one) for one in landmarks)
+    if len(landmarks) == 1 and not is_landmark_file(given[0]):
+        given, landmark_model = (), landmarks[0]
     settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
     with file_lock(out), progress_bars(quiet) as progress:
         made = fit_photographs(
             photographs,
-            landmarks,
+            given,
             model,
             out,
             template,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,8 @@ def track(
     whole_take: bool = False,
     part: str | None = None,
     overlay: bool = True,
+    fps: float | None = None,
+    size: str | None = None,
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
@@ -44,7 +47,8 @@ def track(
         video: A file: .avi, .mkv, .webm, .mp4 or .mov, of one size and an even frame rate.
         rig: The actor's own rig, with 68 annotated landmarks: .glb, or ICT-FaceKit's FaceXModel folder.
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
-        landmarks: Model that finds the 68 landmarks, by name or folder; see `python -m train.landmarks`.
+        landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or
+            a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
         prior: What weights faces have, for names of shapes that the rig has too; see `python -m train.priors`.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
@@ -54,6 +58,8 @@ def track(
         whole_take: Smooth the head's pose over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
         overlay: Draw the face over the video, as overlay.mp4.
+        fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
+        size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
         live: A camera's number, such as 0, or a video file that is played in its own time.
         stream: Where --live sends to; Unreal listens on port 11111.
         seconds: After which --live ends; until Ctrl-C if absent.
@@ -62,19 +68,34 @@ def track(
     from torchface.errors import ValueRangeError
     from torchface.workflows.track.track_video import TrackSettings
 
-    if (video is None) == (live is None):
+    given = landmarks.lower().endswith(".csv")
+    if (video is None) == (live is None) and not (given and live is None):
         found = "neither" if video is None else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
-    settings = TrackSettings(landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay)
+    settings = TrackSettings(
+        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay, fps, _sides(size)
+    )
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)
         return
-    if out is None or video is None:
+    if out is None:
         raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
     _file(video, rig, out, settings, quiet)
 
 
-def _file(video: Path, rig: Path, out: Path, settings: object, quiet: bool) -> None:
+def _sides(size: str | None) -> tuple[int, int] | None:
+    """Width and height of a text such as 1280x720."""
+    from torchface.errors import ValueRangeError
+
+    if size is None:
+        return None
+    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", size.strip().lower())
+    if match is None:
+        raise ValueRangeError(f"--size: found {size[:40]!r}, expected WIDTHxHEIGHT in pixels, such as 1280x720")
+    return int(match[1]), int(match[2])
+
+
+def _file(video: Path | None, rig: Path, out: Path, settings: object, quiet: bool) -> None:
     from torchface.files.job_lock import job_lock
     from torchface.workflows.track.track_page import write_track_page
     from torchface.workflows.track.track_video import TrackSettings, track_video

@@ -46,6 +46,8 @@ def load_finder(
         FileFormatError: it is damaged, or a graph of other inputs and outputs.
         MissingExtraError: MediaPipe is asked for and not installed.
     """
+    if Path(name_or_path).suffix.lower() == ".csv":
+        raise NameMismatchError(f"{option}: found {name_or_path}, a table of landmarks, expected what finds them")
     if str(name_or_path) == MEDIAPIPE:
         return NamedFinder(MediaPipeFinder(), MEDIAPIPE)
     if Path(name_or_path).suffix.lower() == ".onnx":

@@ -85,12 +85,18 @@ class TableReader:
         if missing:
             raise FileFormatError(f"{self.path}: found no column {quoted(missing)}, expected it in the header")
 
-    def read(self, texts: Iterable[str] = (), is_blank: Callable[[list[str]], bool] = lambda cells: False) -> Table:
+    def read(
+        self,
+        texts: Iterable[str] = (),
+        is_blank: Callable[[list[str]], bool] = lambda cells: False,
+        only: Iterable[str] | None = None,
+    ) -> Table:
         """All rows.
 
         Args:
             texts: columns that are kept as they stand; every other holds numbers.
             is_blank: whether a row may be short of cells; the missing ones count as empty.
+            only: columns of numbers that are read, where others may hold anything; all if absent.
 
         Raises:
             FileFormatError: a row has too few or too many cells, or a number is none, or is infinite.
@@ -99,7 +105,8 @@ class TableReader:
         kept: dict[str, list[str]] = {name: [] for name in texts}
         shared: dict[str, str] = {}
         text_columns = [i for i, name in enumerate(self.header) if name in kept]
-        number_columns = [i for i, name in enumerate(self.header) if name not in kept]
+        numeric = set(self.header if only is None else only) - set(kept)
+        number_columns = [i for i, name in enumerate(self.header) if name in numeric]
         names = tuple(self.header[i] for i in number_columns)
         numbers, rows = array("d"), 0
         while (cells := self._next()) is not None:

@@ -15,16 +15,19 @@ from torchface.io.images.image_files import load_image
 from torchface.io.images.image_headers import read_header
 from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.landmarks import find_faces
+from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
+from torchface.landmarks.images.landmark_finder import COUNT
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 
 
 def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int | None = None) -> list[Tensor]:
-    """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them.
+    """The landmarks (68,2) of each photograph: a file each, or one of dlib's XML that names them, or a table.
 
     Args:
         photographs: image files.
-        files: of landmarks.
+        files: of landmarks; a table has a row a photograph.
         face: which of several in an XML, from 0, numbered as where no file is given: as they are detected, the largest
             first; after them those that are not detected.
 
@@ -37,6 +40,8 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
         raise NameMismatchError("fit: found no photograph, expected one at least")
     if len(files) == 1 and files[0].suffix.lower() == ".xml":
         return [_face_in(files[0], path, face) for path in photographs]
+    if len(files) == 1 and files[0].suffix.lower() == ".csv":
+        return _rows_of(files[0], photographs)
     if len(files) != len(photographs):
         raise NameMismatchError(
             f"landmarks: found {len(files)} files for {len(photographs)} photographs, expected one each, or one .xml"
@@ -45,6 +50,26 @@ def landmarks_of(photographs: Sequence[Path], files: Sequence[Path], face: int |
         _face_in(file, photograph, face) if file.suffix.lower() == ".xml" else _pixels(file)
         for file, photograph in zip(files, photographs, strict=True)
     ]
+
+
+def is_landmark_file(path: Path) -> bool:
+    """Whether a path is one of landmarks, rather than the name of what finds them."""
+    return path.suffix.lower() in (".pts", ".ljson", ".json", ".xml", ".csv")
+
+
+def _rows_of(table: Path, photographs: Sequence[Path]) -> list[Tensor]:
+    """A row of a table for each photograph."""
+    found = load_landmark_table(table)
+    if len(found.points) != len(photographs):
+        raise NameMismatchError(
+            f"{table}: found landmarks of {len(found.points)} photographs, expected the {len(photographs)} given"
+        )
+    rows = []
+    for i, photograph in enumerate(photographs):  # a photograph at a time: they differ in size
+        height, width = load_image(photograph).shape[-2:]
+        points = found.pixels(width, height)[i].double()
+        rows.append(points if len(points) == COUNT else landmarks_of_mesh(points))
+    return rows
 
 
 def check_inside(photographs: Sequence[Path], landmarks: Tensor, sizes: Sequence[tuple[int, int]]) -> None:

@@ -91,6 +91,8 @@ class LiveSolver:
 
     def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
         self.names = rig.names
+        if models.finder is None:
+            raise ValueRangeError("--landmarks: found a table, expected what finds landmarks as the face moves")
         self._tracker = LandmarkTracker(models.finder, models.appearance, face=face)
         self._calibration, self._filter = calibration, LandmarkFilter()
         self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)

@@ -9,7 +9,7 @@ from safetensors.torch import load, save
 
 from torchface.capture.video import VideoSolution
 from torchface.errors import FileFormatError, TorchfaceError
-from torchface.files.whole_files import delete_file, read_file, write_file
+from torchface.files.whole_files import delete_file, make_folder, read_file, write_file
 from torchface.io import save_animation
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.weights.live_link_csv import save_live_link
@@ -35,7 +35,7 @@ def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
         name: getattr(solution, name).detach().float().contiguous()
         for name in ("weights", "rotation", "translation", "errors")
     }
-    path = state.folder / SOLUTION
+    path = make_folder(state.folder) / SOLUTION
     write_file(path, save({**tensors, "solved": solution.solved.contiguous()}))
     state.made(path, key)
 
@@ -99,6 +99,10 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     moved = tracked.solution.translation.detach().double()
     columns = {f"pose_T{axis}": moved[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"pose_{name.removeprefix('Head').lower()}": angles[name] for name in list(angles)[:3]}
+    for kind in ("confidence", "visibility"):
+        each = getattr(tracked.frames, kind)
+        columns |= {f"{kind}_{name}": each[:, i] for i, name in enumerate(LANDMARK_NAMES)}
+    columns["presence"] = tracked.frames.presence
     track = Track(LANDMARK_NAMES, tracked.frames.landmarks, tracked.frames.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}), products["landmarks"])
     save_animation(tracked.rig, take, products["animation"])

@@ -17,6 +17,7 @@ from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
+from torchface.workflows.track.given_frames import is_table
 
 _Model = TypeVar("_Model", bound=nn.Module)
 Fitted = TypeVar("Fitted")
@@ -27,7 +28,7 @@ class TrackModels:
     """What tracks and solves.
 
     Args:
-        finder: finds landmarks in any face.
+        finder: finds landmarks in any face; absent where they are given.
         appearance: refines them on the actor's own.
         prior: which weights faces have.
         dynamics: how weights go on.
@@ -36,7 +37,7 @@ class TrackModels:
         solving: changes when what solves does.
     """
 
-    finder: LandmarkFinder
+    finder: LandmarkFinder | None
     appearance: AppearanceModel | None = None
     prior: ShapePrior | None = None
     dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = None
@@ -57,7 +58,7 @@ def load_track_models(
 
     Args:
         rig: whose shapes' names the priors are brought to.
-        landmarks, appearance, prior, dynamics: the models.
+        landmarks, appearance, prior, dynamics: the models; for landmarks also a table of them.
         fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
 
     Raises:
@@ -67,15 +68,17 @@ def load_track_models(
             eight times as high or as low.
         FileFormatError: a model is damaged.
     """
-    seeing = load_finder(landmarks)
+    named = None if is_table(landmarks) else load_finder(landmarks)
     priors = load_priors(rig, prior, dynamics, fps)
     return TrackModels(
-        seeing.finder,
+        None if named is None else named.finder,
         None if appearance is None else _read("--appearance", appearance, AppearanceModel),
         priors.shapes,
         priors.dynamics,
         priors.unlearned,
-        content_key("seeing", finder=seeing.source, appearance=_folder(appearance)),
+        content_key(
+            "seeing", finder=Path(landmarks) if named is None else named.source, appearance=_folder(appearance)
+        ),
         content_key("solving", prior=_folder(prior), dynamics=_folder(dynamics), fps=fps),
     )
 

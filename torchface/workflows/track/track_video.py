@@ -25,11 +25,14 @@ from torchface.io import load_rig
 from torchface.io.camera_files import load_calibration
 from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import VideoFile, open_video
+from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.face_box import find_faces
+from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.landmarks.images.tracking import LandmarkTracker, naming_the_frame
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
+from torchface.workflows.track.given_frames import blank_clip, given_frames, is_table
 from torchface.workflows.track.track_files import (
     OVERLAY,
     SUMMARY,
@@ -57,13 +60,17 @@ class TrackSettings:
     """How a video is tracked.
 
     Args:
-        landmarks, appearance, prior, dynamics: models by name or folder.
+        landmarks: what finds them, see :func:`~torchface.workflows.named_finders.load_finder`; or a table that gives
+            them, see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
+        appearance, prior, dynamics: models by name or folder.
         camera: a calibration; a focal length is assumed without.
         face: which of several, from 0, the largest first.
         whole_take: poses from all frames, those after each too; weights as well where there is a dynamics prior.
         part: keep this region of the rig only.
         texture: an image to put on the face in the overlay, in the rig's texture coordinates.
         overlay: draw the overlay video.
+        fps: frames a second of a table of landmarks without a video; by its times if absent.
+        size: width and height of the pictures that such landmarks were found in; the camera's if absent.
     """
 
     landmarks: str | Path = DEFAULT_LANDMARKS
@@ -76,12 +83,20 @@ class TrackSettings:
     part: str | None = None
     texture: Path | None = None
     overlay: bool = True
+    fps: float | None = None
+    size: tuple[int, int] | None = None
 
 
 def track_video(
-    video: Path, rig: Path, out: Path, settings: TrackSettings = TrackSettings(), progress: Progress | None = None
+    video: Path | None,
+    rig: Path,
+    out: Path,
+    settings: TrackSettings = TrackSettings(),
+    progress: Progress | None = None,
 ) -> Tracked:
     """Tracks, solves and writes; see ``torchface track --help`` for the arguments.
+
+    Without a video the landmarks are those of a table, and no overlay is drawn.
 
     A run killed at any moment leaves complete files only. Started again, it goes on behind the landmarks that it had,
     and makes anew what depends on something that has changed.
@@ -97,8 +112,8 @@ def track_video(
         return _track_video(video, rig, out, settings, progress or silent)
 
 
-def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, progress: Progress) -> Tracked:
-    clip = open_video(video)
+def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettings, progress: Progress) -> Tracked:
+    clip = _clip(video, settings)
     clip.check()
     actor = load_actor(rig, settings.part)
     calibration = camera_of(clip, settings.camera)
@@ -112,11 +127,14 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     state = TrackState(out, see_key)
     reused = state.done
     seconds: dict[str, float] = {}
-    begin = time.perf_counter()
-    faces = _track(clip, models, settings.face, state, progress)
+    begin, faces = time.perf_counter(), 0
+    if models.finder is None:
+        frames = given_frames(Path(settings.landmarks), clip)
+    else:
+        faces = _track(clip, models.finder, models.appearance, settings.face, state, progress)
+        frames = state.frames()
     if state.done > reused:
         seconds["landmarks"] = time.perf_counter() - begin
-    frames = state.frames()
     check_length(len(frames), models, clip.path)
     if not torch.isfinite(frames.landmarks).any():
         state.clear()
@@ -150,7 +168,7 @@ def _track_video(video: Path, rig: Path, out: Path, settings: TrackSettings, pro
     )
     with all_or_none():
         products |= write_curves(tracked, out)
-    if settings.overlay:
+    if settings.overlay and video is not None:
         overlay_key = content_key(_METHOD, solution=solve_key, texture=settings.texture)
         products["overlay"] = out / OVERLAY
         if settings.texture is not None:
@@ -219,9 +237,31 @@ def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalib
     return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
 
 
-def _track(clip: VideoFile, models: TrackModels, face: int, state: TrackState, progress: Progress) -> int:
+def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:
+    """The video; or what stands for it, where a table gives the landmarks and there is none."""
+    if video is not None:
+        if settings.fps is not None or settings.size is not None:
+            raise ValueRangeError(f"{video}: found --fps or --size beside a video, expected them without one alone")
+        return open_video(video)
+    if not is_table(settings.landmarks):
+        raise ValueRangeError("track: found neither a video nor a table of landmarks, expected one at least")
+    if settings.texture is not None:
+        raise ValueRangeError(f"{settings.texture}: found no video, expected one whose light falls on the texture")
+    calibration = None if settings.camera is None else load_calibration(settings.camera)
+    size = settings.size or (None if calibration is None else (calibration.width, calibration.height))
+    return blank_clip(Path(settings.landmarks), settings.fps, size)
+
+
+def _track(
+    clip: VideoFile,
+    finder: LandmarkFinder,
+    appearance: AppearanceModel | None,
+    face: int,
+    state: TrackState,
+    progress: Progress,
+) -> int:
     """Landmarks of all frames into the state; how many faces the first frame shows."""
-    tracker = LandmarkTracker(models.finder, models.appearance, face=face)
+    tracker = LandmarkTracker(finder, appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
     frames = clip.color_frames()

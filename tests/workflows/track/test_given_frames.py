@@ -1,0 +1,86 @@
+"""A table of landmarks is solved without a video; one that cannot be the video's is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import load_rig, save_rig
+from torchface.cli import main
+from torchface.errors import NameMismatchError, ValueRangeError
+from torchface.geometry.cameras.calibration import assumed_calibration
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.io.landmarks.landmark_tables import load_landmark_table
+from torchface.io.landmarks.openface_csv import save_landmarks_csv
+from torchface.io.video import open_video, write_video
+from torchface.synthetic.head.performer import performer
+from torchface.take import Take, Track
+from torchface.workflows.named_finders import load_finder
+from torchface.workflows.track.given_frames import given_frames
+from torchface.workflows.track.track_video import TrackSettings, track_video
+
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
+COUNT, WIDTH, HEIGHT = 6, 320, 240
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Tensor]:
+    """A rig's file, a table of its landmarks as it opens the jaw, and how far."""
+    folder = tmp_path_factory.mktemp("take")
+    rig = performer()
+    save_rig(rig, folder / "rig.glb")
+    weights = torch.zeros(COUNT, len(rig.names))
+    weights[:, rig.names.index("jawOpen")] = torch.linspace(0, 0.8, COUNT)
+    camera = look_at(rig.vertices[rig.neutral.landmarks].double().mean(0), 0.0, 0.0, 600.0, WIDTH, HEIGHT)
+    focal = assumed_calibration(WIDTH, HEIGHT).intrinsics
+    rotation, moved = camera.rotation, camera.translation
+    points = rig(weights)[:, rig.neutral.landmarks].double() @ rotation.T + moved
+    pixels = points[..., :2] / points[..., 2:] * focal.diagonal()[:2] + focal[:2, 2]
+    names = tuple(str(i) for i in range(68))
+    save_landmarks_csv(Take(25.0, landmarks=Track(names, pixels.float())), folder / "take.csv")
+    return folder / "rig.glb", folder / "take.csv", weights[:, rig.names.index("jawOpen")]
+
+
+def test_a_table_is_solved_without_a_video(take: tuple[Path, Path, Tensor], tmp_path: Path) -> None:
+    rig, table, jaw = take
+    settings = TrackSettings(landmarks=table, size=(WIDTH, HEIGHT))
+    tracked = track_video(None, rig, tmp_path / "out", settings)
+    found = tracked.solution.weights[:, load_rig(rig).names.index("jawOpen")]
+    assert float((found - jaw).abs().max()) < 0.15
+    assert tracked.video.fps == 25.0
+    assert set(tracked.products) == {"weights", "live link", "landmarks", "animation"}  # no overlay
+    again = load_landmark_table(tmp_path / "out" / "landmarks.csv")
+    torch.testing.assert_close(again.points, load_landmark_table(table).points)
+    assert (again.presence == 1).all()
+
+
+def test_tables_that_do_not_fit_are_told(
+    take: tuple[Path, Path, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, table, _ = take
+    wall = torch.full((3, HEIGHT, WIDTH), 99, dtype=torch.uint8)
+    short = open_video(write_video([wall] * (COUNT - 2), tmp_path / "short.avi", 25.0))
+    with pytest.raises(
+        ValueRangeError, match=rf"take.csv: found landmarks of {COUNT} frames, expected the {short.count} of"
+    ):
+        given_frames(table, short)
+    small = open_video(write_video([wall[:, :80, :100]] * COUNT, tmp_path / "small.avi", 25.0))
+    small = small if small.count == COUNT else type(small)(small.path, 25.0, 100, 80, COUNT)
+    with pytest.raises(ValueRangeError, match=r"in the 100 x 80 pixels of small.avi: .* of another size"):
+        given_frames(table, small)
+    with pytest.raises(NameMismatchError, match="a table of landmarks, expected what finds them"):
+        load_finder(table)
+    for words, message in (
+        (["--landmarks", str(table)], "found no video, expected --size WIDTHxHEIGHT"),
+        (["--landmarks", str(table), "--size", "wide"], "--size: found 'wide', expected WIDTHxHEIGHT"),
+        (["--landmarks", str(table), "--size", "9x9", "--fps", "0.1"], "0.1 frames a second, expected 1 to 1000"),
+        ([str(tmp_path / "short.avi"), "--fps", "30"], "found --fps or --size beside a video"),
+        ([], "found neither of VIDEO and --live"),
+    ):
+        assert main(["track", *words, "--rig", str(rig), "--out", str(tmp_path / "out")]) != 0
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,25 @@
+"""A video of nothing, for takes whose pictures are not there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchface.io.video.video_file import VideoFile
+
+_GREY = 96
+
+
+@dataclass(frozen=True)
+class BlankVideo(VideoFile):
+    """Plain grey frames; the path names what they stand for, such as a table of landmarks."""
+
+    def check(self) -> None:
+        """There is nothing to refuse."""
+
+    def _decoded(self) -> Iterator[np.ndarray]:
+        frame = np.full((self.height, self.width, 3), _GREY, np.uint8)
+        for _ in range(self.count):
+            yield frame
