@@ -117,6 +117,21 @@ def test_it_is_the_exact_solve_and_its_memory(rig: BlendshapeRig, takes: list[Te
         )
 
 
+def test_without_a_dynamics_prior_it_walks_as_the_exact_solve_does(rig: BlendshapeRig, takes: list[Tensor]) -> None:
+    """Hidden shapes keep their weights, then rest, and so does a face that is lost."""
+    settings = VideoSettings(motion=0.3, interval=0.1, tolerance=1e-8)
+    solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), settings=settings)
+    _, landmarks = synthetic_landmarks(solver, 14)
+    landmarks[2:8, 48:] = torch.nan
+    landmarks[10:] = torch.nan
+    states, _ = solver.states(landmarks)
+    for frame, state in zip(played(VideoGraph(solver), landmarks), states, strict=True):
+        torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
+        assert state.hidden is not None
+        torch.testing.assert_close(frame["hidden"].double(), state.hidden[0], atol=1e-6, rtol=0)
+    assert float(states[-1].weights.max()) < float(states[9].weights.max())
+
+
 def test_the_file_is_the_graph(written: VideoReport) -> None:
     assert written.frames >= 100
     assert written.parity <= 1e-4

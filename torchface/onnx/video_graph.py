@@ -20,6 +20,7 @@ from torchface.capture.video.solver_components import (
     TRANSLATION_STEP,
 )
 from torchface.capture.video.video_solver import VideoSolver
+from torchface.capture.video.weight_walk import faded, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.onnx.gauss_newton_step import GaussNewtonStep
 from torchface.onnx.unrolled_operators import symmetric_inverse
@@ -34,7 +35,8 @@ class VideoGraph(nn.Module):
     ``GaussNewtonStep``; the steps end once none moves a weight further than the settings' tolerance, or at their limit.
     The first frame's pose is that of an affine camera, so that nothing else need be known.
 
-    Without a dynamics prior the state is ``weights``, ``rotation`` and ``translation``. With one it is ``rotation``,
+    Without a dynamics prior the state is ``weights``, ``rotation`` and ``translation``, and where the settings say how
+    weights wander ``hidden``: for how long each shape has not been seen, (N,), seconds. With one it is ``rotation``,
     ``translation``, and
 
     - ``window``: the latest frames' weights, (J,N), the newest last, NaN for those that have not been;
@@ -59,6 +61,8 @@ class VideoGraph(nn.Module):
     initial_information: Tensor
     initial_covariance: Tensor
     motion_variance: Tensor
+    tells: Tensor
+    walk_variance: Tensor
 
     def __init__(self, solver: VideoSolver) -> None:
         super().__init__()
@@ -67,6 +71,7 @@ class VideoGraph(nn.Module):
             raise ValueRangeError(f"video graph: found a pose_trust of {self.settings.pose_trust}, expected 0")
         self.names, count = solver.names, len(solver.names)
         self.dynamics: DynamicsPrior | AdaptedDynamicsPrior | None = copy.deepcopy(solver.dynamics)
+        self.walks = solver.walks
         self.window = 1 if self.dynamics is None else self.dynamics.window
         self.step = GaussNewtonStep(solver)
         deviations = [INITIAL_WEIGHT] * count + [INITIAL_ROTATION] * 3 + [INITIAL_TRANSLATION] * 3
@@ -74,6 +79,9 @@ class VideoGraph(nn.Module):
             "landmark_weights": solver.landmark_weights.double(),
             "to_rays": torch.linalg.inv(solver.intrinsics.double()).T.contiguous(),
             "initial_information": solver.initial_information.double().diag(),
+            # What each landmark alone tells of each shape, (68,N).
+            "tells": solver.shape_confidence(torch.eye(LANDMARKS, dtype=torch.float64, device=solver.rest.device)),
+            "walk_variance": solver.walk_variance.double(),
             "initial_covariance": torch.tensor(deviations, dtype=torch.float64).square().diag(),
             "motion_variance": torch.tensor([ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3, dtype=torch.float64),
         }.items():
@@ -83,7 +91,9 @@ class VideoGraph(nn.Module):
     def outputs(self) -> tuple[str, ...]:
         """Names of what ``forward`` returns."""
         own = ("weights", "rotation", "translation")
-        return own if self.dynamics is None else (*own, "window", "mean", "covariance")
+        if self.dynamics is None:
+            return (*own, "hidden") if self.walks else own
+        return (*own, "window", "mean", "covariance")
 
     @property
     def state(self) -> tuple[str, ...]:
@@ -94,7 +104,7 @@ class VideoGraph(nn.Module):
         """The state before the first frame: NaN."""
         count = len(self.names)
         shapes = {"weights": (count,), "rotation": (3, 3), "translation": (3,), "window": (self.window, count)}
-        shapes |= {"mean": (count + 6,), "covariance": (count + 6, count + 6)}
+        shapes |= {"hidden": (count,), "mean": (count + 6,), "covariance": (count + 6, count + 6)}
         return tuple(torch.full(shapes[name], torch.nan) for name in self.state)
 
     def forward(self, landmarks: Tensor, confidence: Tensor, *previous: Tensor) -> tuple[Tensor, ...]:
@@ -125,21 +135,30 @@ class VideoGraph(nn.Module):
         window = state["weights"][None] if self.dynamics is None else state["window"]
         weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
         head = HeadState(weights[None], rotation[None], translation[None])
-        mean, information = self._expected(head, window, first, state)
+        told = torch.where(enough, (~unseen).double() * confidence.double().clamp(0, 1), 0.0)[None] @ self.tells
+        interval = self.settings.interval
+        before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(told)
+        hidden = unseen_time(before, told, interval)
+        if self.walks:
+            mean, information = self._walked(head, told, hidden, first)
+        else:
+            mean, information = self._expected(head, window, first, state)
         points = self.step.points
         distance = points.eyes_distance(head.rotation, head.translation, self.step.intrinsics)
         noise = (self.settings.relative_noise * distance).clamp(min=self.settings.pixel_noise)
         precision = torch.where(enough, trust.sqrt() / noise, 0.0)[None]
         given = (found[None], precision, mean.weights, mean.rotation, mean.translation, information)
         solved, rows = self._solved(head, given, ~enough)
-        # A face that is not seen stays as it was.
-        head = _where(enough, solved, head)
+        # A face that is not seen stays as it was, or goes to rest.
+        head = _where(enough, solved, HeadState(mean.weights, head.rotation, head.translation) if self.walks else head)
         started = ~first | enough
         out = [
             torch.where(started, head.weights[0], 0.0),
             torch.where(started, head.rotation[0], torch.nan),
             head.translation[0],
         ]
+        if self.walks:
+            out.append(torch.where(started, hidden[0], torch.nan))
         if self.dynamics is not None:
             H, gradient = self.step.data_terms(head, rows, *given)
             covariance = symmetric_inverse(H)
@@ -185,6 +204,17 @@ class VideoGraph(nn.Module):
         rotation = _orthonormal(projection)
         depth = 2 / (size[0] + size[1])
         return rotation, depth * torch.nn.functional.pad(middle, (0, 1), value=1.0) - rotation @ centre
+
+    def _walked(self, head: HeadState, told: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
+        """The prediction for this frame from the last one's weights: the mean and its information (N+6,N+6)."""
+        interval = self.settings.interval
+        walked = walk_information(self.walk_variance, told, interval)[0]
+        information = torch.cat([walked, self.initial_information.diagonal()[-6:]]) * self.step.identity
+        weights = torch.where(first, 0.0, head.weights * faded(hidden, interval))
+        return (
+            HeadState(weights, head.rotation, head.translation),
+            torch.where(first, self.initial_information, information),
+        )
 
     def _expected(
         self, head: HeadState, window: Tensor, first: Tensor, state: dict[str, Tensor]

@@ -22,6 +22,7 @@ class VideoSolution:
         errors: root mean square distance of the seen landmarks to the rig's, (T,), pixels; NaN where none is seen.
         solved: frames with at least six landmarks, (T,) bool; the others keep the weights of the frame before,
             or in a whole take lie between those before and after.
+        confidence: how much of what could tell of each weight was seen, (T,N) in [0,1].
     """
 
     weights: Tensor
@@ -29,6 +30,7 @@ class VideoSolution:
     translation: Tensor
     errors: Tensor
     solved: Tensor
+    confidence: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +42,14 @@ class VideoState:
         estimate: from landmarks and dynamics until now; None before the first, and without a dynamics prior.
         window: weights of the latest frames, the newest last, (1,J,N) with J growing up to the dynamics prior's window.
         solved: whether the frame showed at least six landmarks.
+        hidden: for how long each shape has not been seen, (1,N), seconds; None before the first.
     """
 
     head: HeadState | None
     estimate: StateEstimate | None
     window: Tensor
     solved: bool = False
+    hidden: Tensor | None = None
 
     @property
     def weights(self) -> Tensor:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import copy
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.video.video_settings import VideoSettings
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
@@ -24,12 +27,16 @@ INITIAL_ROTATION, INITIAL_TRANSLATION = 0.5, 500.0
 INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
 """Standard deviations of a weight before anything is seen, and of its steps until the dynamics window is full."""
 
+# Lids close in a tenth of a second; nothing else in a face is as quick.
+_LIDS, _LID_MOTION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 6.0
+
 _POINTS = ("rest", "basis", "rows", "valid", "side")
 _PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
 _DYNAMICS: dict[str, type[DynamicsPrior] | type[AdaptedDynamicsPrior]] = {
     "dynamics_prior": DynamicsPrior,
     "adapted_dynamics_prior": AdaptedDynamicsPrior,
 }
+_LEAST_TOLD = 1e-6  # mm²; less is nothing
 _MAX_SHAPES, _MAX_POINTS = 2**12, 2**20
 
 
@@ -49,6 +56,7 @@ class VideoSolverParts(nn.Module):
     initial_information: Tensor
     l1_penalty: Tensor
     ridge: Tensor
+    walk_variance: Tensor
 
     def __init__(
         self,
@@ -105,6 +113,7 @@ class VideoSolverParts(nn.Module):
             "initial_information": [weight] * count + [INITIAL_ROTATION**-2] * 3 + [INITIAL_TRANSLATION**-2] * 3,
             "l1_penalty": [settings.sparsity] * count + [0.0] * 6,
             "ridge": [2 * settings.ridge] * count + [0.0] * 6,
+            "walk_variance": [(settings.motion * (_LID_MOTION if _LIDS.match(n) else 1.0)) ** 2 for n in names],
         }
         for name, numbers in constants.items():
             made = torch.tensor(numbers, dtype=torch.float64, device=device)
@@ -119,6 +128,28 @@ class VideoSolverParts(nn.Module):
     def points(self) -> FacePoints:
         """Of the rig, float64."""
         return FacePoints(self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double())
+
+    @property
+    def walks(self) -> bool:
+        """Whether weights are expected near those of the frame before, without a dynamics prior."""
+        return self.dynamics is None and self.settings.motion > 0
+
+    def shifted(self, offsets: LandmarkOffsets) -> Self:
+        """The same solver for landmarks that lie off the rig's by these offsets, with their noise."""
+        made = copy.copy(self)
+        made._buffers = dict(self._buffers)
+        points = shifted_points(self.points, self.names, offsets.millimetres)
+        made.rest, made.basis = points.rest, points.basis
+        made._settings = replace(self.settings, relative_noise=offsets.noise)
+        return made
+
+    def shape_confidence(self, trust: Tensor) -> Tensor:
+        """How much of what could tell of each shape is seen, (B,N) in [0,1], where landmarks count as (B,68).
+
+        What a landmark could tell of a shape is how far the shape moves it, squared.
+        """
+        tells = self.basis[:LANDMARKS].square().sum(1).to(trust) * self.landmark_weights.to(trust)[:, None]
+        return (trust.clamp(0, 1) @ tells) / tells.sum(0).clamp(min=_LEAST_TOLD)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -55,7 +55,9 @@ def solve_whole_take(
     rows = (frames - first).clamp(min=0)  # frames before the first face have its state
     weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
     weights = interpolated(weights, enough)
-    return VideoSolution(weights, turned, moved, solver.reprojection_errors(landmarks, weights, turned, moved), enough)
+    errors = solver.reprojection_errors(landmarks, weights, turned, moved)
+    told = solver.shape_confidence(solver.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
+    return VideoSolution(weights, turned, moved, errors, enough, told)
 
 
 def interpolated(weights: Tensor, solved: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSoluti
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
 from torchface.capture.video.state_estimate import Expectation, StateEstimate
+from torchface.capture.video.weight_walk import faded, frame_intervals, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
@@ -70,6 +71,7 @@ class VideoSolver(VideoSolverParts):
         rotation: Tensor | None = None,
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
+        seconds: Tensor | None = None,
     ) -> VideoSolution:
         """Weights and poses of consecutive frames, each from what was seen until then.
 
@@ -77,6 +79,7 @@ class VideoSolver(VideoSolverParts):
             landmarks: (T,68,2), pixels; NaN for not seen.
             rotation, translation: tracked poses, rig to camera, (T,3,3) and (T,3), NaN for lost; found here if absent.
             confidence: how far each landmark is trusted, (T,68) in [0,1].
+            seconds: when each frame is shown, (T,), rising; ``settings.interval`` apart if absent.
 
         Returns:
             What the face did, in the dtype of the landmarks; differentiable in all arguments, through all frames. A
@@ -86,13 +89,14 @@ class VideoSolver(VideoSolverParts):
             ShapeError: the shapes do not fit each other.
             ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
         """
-        states, enough = self.states(landmarks, rotation, translation, confidence)
+        states, enough = self.states(landmarks, rotation, translation, confidence, seconds)
         weights, rotations, translations = (
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
             for name in ("weights", "rotation", "translation")
         )
         errors = self.reprojection_errors(landmarks, weights, rotations, translations)
-        return VideoSolution(weights, rotations, translations, errors, enough)
+        told = self.shape_confidence(self.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
+        return VideoSolution(weights, rotations, translations, errors, enough, told)
 
     def states(
         self,
@@ -100,6 +104,7 @@ class VideoSolver(VideoSolverParts):
         rotation: Tensor | None = None,
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
+        seconds: Tensor | None = None,
     ) -> tuple[list[VideoState], Tensor]:
         """The states after each of T frames, and which frames showed a face, (T,) bool; arguments as ``forward``.
 
@@ -113,10 +118,11 @@ class VideoSolver(VideoSolverParts):
             )
         states, state = [], self.start()
         first = int(enough.nonzero()[0, 0])
+        intervals = frame_intervals(seconds, count, self.settings.interval)
         # A frame leans on the one before, so frames come one after the other.
         for t in range(first, count):
             given = (None if x is None else x[t] for x in (rotation, translation, confidence))
-            state = self.step(state, landmarks[t], *given)
+            state = self.step(state, landmarks[t], *given, intervals[t])
             states.append(state)
         return [states[0]] * first + states, enough
 
@@ -131,17 +137,20 @@ class VideoSolver(VideoSolverParts):
         rotation: Tensor | None = None,
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
+        interval: float | None = None,
     ) -> VideoState:
         """The next frame's state; its ``weights``, ``rotation`` and ``translation`` are the frame's.
 
         A frame with fewer than six landmarks keeps the weights of the frame before: rest is likeliest of all faces, but
-        not of one that smiled a moment ago.
+        not of one that smiled a moment ago. So do shapes whose landmarks are hidden, where ``settings.motion`` says how
+        weights wander; after a third of a second those go to rest, and all of a face that is lost.
 
         Args:
             state: of the frame before; ``start()`` for the first.
             landmarks: (68,2), pixels; NaN for not seen.
             rotation, translation: the tracked pose, (3,3) and (3,); the last one's if absent or NaN.
             confidence: (68,) in [0,1].
+            interval: seconds since the frame before; ``settings.interval`` if absent.
 
         Raises:
             ShapeError: an argument is not as above.
@@ -158,15 +167,20 @@ class VideoSolver(VideoSolverParts):
                 f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_MIN_LANDMARKS} to start"
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
-            rotation, translation = self._pose_of(state, found)
-        expected = self._expected(state, rotation, translation)
+            rotation, translation = self._pose_of(state, found, confidence, enough)
+        trust = self.landmark_trust(found, confidence) * enough
+        interval = self.settings.interval if interval is None else interval
+        told = self.shape_confidence(trust)
+        hidden = unseen_time(state.hidden, told, interval)
+        expected = self._expected(state, rotation, translation, told, hidden, interval)
         at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
         noise = self.noise(at.rotation, at.translation)
         precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, noise)
         terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
         if state.head is not None and not enough:
-            held = HeadState(state.head.weights, rotation, translation)
-            return self._handed_on(state, terms, expected, Solved(held, self._chosen(held)), enough)
+            weights = expected.mean.weights if self.walks else state.head.weights
+            held = HeadState(weights, rotation, translation)
+            return self._handed_on(state, terms, expected, Solved(held, self._chosen(held)), enough, hidden)
         # After a gap the tracked pose is nearer than where the head was left.
         near = (
             expected.mean
@@ -175,25 +189,44 @@ class VideoSolver(VideoSolverParts):
         )
         begin = expected.mean.weights if state.head is None else state.head.weights
         solved = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
-        return self._handed_on(state, terms, expected, solved, enough)
+        return self._handed_on(state, terms, expected, solved, enough, hidden)
 
     def _handed_on(
-        self, state: VideoState, terms: FrameTerms, expected: Expectation, solved: Solved, enough: bool
+        self,
+        state: VideoState,
+        terms: FrameTerms,
+        expected: Expectation,
+        solved: Solved,
+        enough: bool,
+        hidden: Tensor,
     ) -> VideoState:
         head = solved.head
         if self.dynamics is None:
-            return VideoState(head, None, state.window, enough)
+            return VideoState(head, None, state.window, enough, hidden)
         estimate = expected.updated(head, self.seen(terms, head, solved.rows))
         window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
-        return VideoState(head, estimate, window, enough)
+        return VideoState(head, estimate, window, enough, hidden)
 
-    def _expected(self, state: VideoState, rotation: Tensor, translation: Tensor) -> Expectation:
+    def _expected(
+        self,
+        state: VideoState,
+        rotation: Tensor,
+        translation: Tensor,
+        told: Tensor,
+        hidden: Tensor,
+        interval: float,
+    ) -> Expectation:
         """The prediction for the next frame from those before."""
-        estimate = state.estimate
-        if estimate is None or self.dynamics is None:
+        if state.estimate is not None and self.dynamics is not None:
+            return self.predicted(state, state.estimate).expectation()
+        information = self.initial_information.double()
+        if state.head is None or not self.walks:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
-            return Expectation(mean, self.initial_information.double().diag()[None])
-        return self.predicted(state, estimate).expectation()
+            return Expectation(mean, information.diag()[None])
+        walked = walk_information(self.walk_variance.double(), told, interval)
+        weights = state.head.weights * faded(hidden, interval)
+        information = torch.cat([walked, information[None, -6:]], dim=1)
+        return Expectation(HeadState(weights, rotation, translation), torch.diag_embed(information))
 
     def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:
         """The prediction for the next frame from a frame's estimate."""
@@ -298,11 +331,21 @@ class VideoSolver(VideoSolverParts):
         # The root's slope is infinite at 0.
         return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise[:, None]
 
-    def _pose_of(self, state: VideoState, landmarks: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the frame before, or by all landmarks."""
-        if state.head is not None:
+    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
+        """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
+        seen = torch.isfinite(landmarks).all(-1).double()
+        return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+
+    def _pose_of(
+        self, state: VideoState, landmarks: Tensor, confidence: Tensor | None, enough: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Of the frame before, or by all landmarks where that showed no face."""
+        if state.head is not None and (state.solved or not enough):
             return state.head.rotation, state.head.translation
-        pose = solve_pnp(self.rest[:LANDMARKS], landmarks, self.intrinsics, self.landmark_weights)
+        trust = self.landmark_weights.double() * self.landmark_trust(landmarks, confidence)
+        pose = solve_pnp(self.rest[:LANDMARKS], landmarks.detach(), self.intrinsics, trust)
+        if state.head is not None and not _finite(pose.rotation, pose.translation):
+            return state.head.rotation, state.head.translation
         return pose.rotation, pose.translation
 
     def _check(

@@ -343,4 +343,5 @@ def _solve(
     if whole_take:
         weights = interpolated(weights, enough)
     errors = solver.reprojection_errors(landmarks, weights, rotation, translation)
-    return VideoSolution(weights, rotation, translation, errors, enough)
+    told = solver.shape_confidence(solver.landmark_trust(landmarks, confidence)).to(landmarks)
+    return VideoSolution(weights, rotation, translation, errors, enough, told)

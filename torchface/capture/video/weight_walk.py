@@ -1,0 +1,60 @@
+"""How weights go on where no dynamics prior says so: a random walk, and rest for what stays hidden."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+
+HOLD, RELAXATION = 0.3, 0.3
+"""Seconds that a hidden shape keeps its weight, and those in which it then falls to 1/e: at rest within about one."""
+HIDDEN = 0.25
+"""Share of what could tell of a shape, under which it counts as hidden."""
+# Of the random walk's variance: a shape that nothing tells of is not led off by what others do.
+_LEAST_SHARE = 0.02
+
+
+def unseen_time(before: Tensor | None, told: Tensor, interval: float) -> Tensor:
+    """For how long shapes have been hidden, (B,N), seconds.
+
+    Args:
+        before: the same after the frame before, (B,N); None before the first.
+        told: how much of what could tell of each shape is seen, (B,N) in [0,1].
+        interval: seconds since the frame before.
+    """
+    since = torch.zeros_like(told) if before is None else before
+    return torch.where(told < HIDDEN, since + interval, 0.0)
+
+
+def faded(hidden: Tensor, interval: float) -> Tensor:
+    """What is left of weights, (B,N), of shapes that have been hidden for (B,N) seconds, since the frame before."""
+    return (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
+
+
+def walk_information(variance: Tensor, told: Tensor, interval: float) -> Tensor:
+    """How sure the last frame's weights tell of this one's, one over a variance, (B,N).
+
+    Args:
+        variance: of the random walk after a second, (N,).
+        told: how much of what could tell of each shape is seen, (B,N) in [0,1].
+        interval: seconds since the frame before.
+    """
+    return 1 / (variance * interval * told.clamp(min=_LEAST_SHARE))
+
+
+def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:
+    """Seconds from the frame before to each of T frames; the first frame has the usual interval.
+
+    Raises:
+        ShapeError: not one time a frame.
+        ValueRangeError: times that do not rise.
+    """
+    if seconds is None:
+        return [interval] * count
+    if seconds.shape != (count,):
+        raise ShapeError(f"seconds: found {tuple(seconds.shape)}, expected ({count},)")
+    steps = seconds.detach().double().diff()
+    if not bool((steps > 0).all()):
+        raise ValueRangeError(f"seconds: found a step of {float(steps.min()):g}, expected times that rise")
+    return [interval, *steps.tolist()]
