@@ -19,8 +19,9 @@ def track(
     out: Path | None = None,
     landmarks: str = "face_landmarks",
     appearance: str | None = None,
-    prior: str | None = None,
+    prior: str = "shape_prior",
     dynamics: str | None = None,
+    offsets: Path | None = None,
     camera: Path | None = None,
     texture: Path | None = None,
     face: int = 0,
@@ -36,10 +37,10 @@ def track(
 ) -> None:
     """Track a face in a video and solve it for the weights of the actor's rig; no markers are needed.
 
-    Landmarks, the camera and where the head is, then weights. Writes into OUT: weights.csv by the rig's names,
-    live_link.csv for Unreal (head rotation included), landmarks.csv, animation.glb, overlay.mp4, summary.json and the
-    report index.html. Killed and started again, it goes on where it was; what depends on nothing that has changed is
-    kept.
+    Landmarks, the camera, then weights and where the head is. Writes into OUT: weights.csv by the rig's names,
+    confidence.csv (how much of each shape was seen), live_link.csv for Unreal (head rotation included), landmarks.csv,
+    landmark_offsets.json, animation.glb, overlay.mp4, summary.json and the report index.html. Killed and started again,
+    it goes on where it was; what depends on nothing that has changed is kept.
 
     With --live it does so from a webcam as the face moves, and sends each frame as Live Link Face does.
 
@@ -50,12 +51,14 @@ def track(
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or
             a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
-        prior: What weights faces have, for names of shapes that the rig has too; see `python -m train.priors`.
+        prior: What weights faces have, for names of shapes that the rig has too, or none; see `python -m train.priors`.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
+        offsets: Fixed offsets between the rig's landmarks and those found, as an earlier take wrote them; those in OUT,
+            or estimated with the take, if absent.
         camera: The camera's calibration, as `torchface calibrate` writes it; a focal length is assumed without.
         texture: An image to put on the face in the overlay, in the rig's texture coordinates, under the video's light.
         face: Which of several faces to follow, from 0, the largest first.
-        whole_take: Smooth the head's pose over all frames, those after each too; with --dynamics the weights as well.
+        whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
         overlay: Draw the face over the video, as overlay.mp4.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
@@ -73,7 +76,19 @@ def track(
         found = "neither" if video is None else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
     settings = TrackSettings(
-        landmarks, appearance, prior, dynamics, camera, face, whole_take, part, texture, overlay, fps, _sides(size)
+        landmarks,
+        appearance,
+        prior,
+        dynamics,
+        camera,
+        face,
+        whole_take,
+        part,
+        texture,
+        overlay,
+        fps,
+        _sides(size),
+        offsets,
     )
     if live is not None:
         _live(live, rig, stream, out, settings, seconds, quiet)

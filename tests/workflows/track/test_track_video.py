@@ -185,11 +185,7 @@ def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed
     assert done.tracked.reused == 2 * PIECE
     tracker = LandmarkTracker(zoo.get_model("face_landmarks"))
     whole: list[torch.Tensor] = []
-    for number, frame in enumerate(open_video(filmed.video).frames()):
-        if number and number % PIECE == 0:  # as a run that is not killed does
-            tracker.resume(seen.landmarks, seen.confidence)  # noqa: F821
-        seen = tracker.step(frame)
-        whole.append(seen.landmarks)
+    whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
     assert torch.equal(done.tracked.frames.landmarks, torch.stack(whole))
 
 
@@ -199,12 +195,12 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
     again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
     assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert set(again.seconds) == {"pose"}
+    assert set(again.seconds) == {"steadying"}
     torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
     smooth = track_video(
         filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay=False, whole_take=True)
     )
-    assert set(smooth.seconds) == {"pose", "weights"}  # landmarks stay
+    assert set(smooth.seconds) == {"steadying", "weights"}  # landmarks stay
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
@@ -227,7 +223,7 @@ def test_damaged_files_are_told_and_made_anew(
     with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written"):
         again = track_video(filmed.video, filmed.rig, out, settings)
     assert again.reused == FRAMES
-    assert set(again.seconds) == {"pose", "overlay"}
+    assert set(again.seconds) == {"steadying", "overlay"}
     assert {path.relative_to(out) for path in out.rglob("*") if path.is_file()} == names
     for name in names - {Path("summary.json"), Path(FOLDER) / "track.json"}:  # these hold times and hashes of files
         if name.suffix == ".safetensors":  # whose header names things in any order

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, cast
@@ -149,6 +150,16 @@ class ShapePrior(nn.Module):
     def _check(self, weights: Tensor) -> None:
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
+
+    def widened(self, variance: Tensor) -> ShapePrior:
+        """The prior with a variance (N,) added to each weight: what it says less of, and goes with others less."""
+        densities = [
+            density.mapped(torch.eye(len(group)), variance[list(group)])  # type: ignore[operator]
+            for group, density in zip(self.groups, self.densities, strict=True)
+        ]
+        made = copy.copy(self)
+        made._modules = {**self._modules, "densities": nn.ModuleList(densities)}
+        return made
 
     def renamed(self, names: Sequence[str]) -> ShapePrior:
         """The prior for a rig's shapes, which may have other names: itself where they are the same.

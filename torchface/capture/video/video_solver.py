@@ -23,6 +23,7 @@ from torchface.optim.warm_active_set import solve_from_active_set
 
 _MIN_LANDMARKS = 6
 _SLIDING_STEPS = 3
+_NEAR = 0.5  # of the eyes' distance
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
 _NEWTON_STEPS = 50
 
@@ -336,11 +337,19 @@ class VideoSolver(VideoSolverParts):
         seen = torch.isfinite(landmarks).all(-1).double()
         return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
 
+    def _near(self, head: HeadState, landmarks: Tensor) -> bool:
+        """Whether most landmarks (1,68,2) are within half the eyes' distance of where a pose shows the rig at rest."""
+        K = self.intrinsics.double()
+        rest = self.rest[:LANDMARKS].double() @ head.rotation[0].detach().T + head.translation[0].detach()
+        image = rest @ K.T
+        off = (image[:, :2] / image[:, 2:] - landmarks[0].detach()).norm(dim=1).nanmedian()
+        return float(off) < _NEAR * float(self.points.eyes_distance(head.rotation, head.translation, K).detach())
+
     def _pose_of(
         self, state: VideoState, landmarks: Tensor, confidence: Tensor | None, enough: bool
     ) -> tuple[Tensor, Tensor]:
-        """Of the frame before, or by all landmarks where that showed no face."""
-        if state.head is not None and (state.solved or not enough):
+        """Of the frame before, or by all landmarks where that showed no face, or one far from here."""
+        if state.head is not None and (not enough or (state.solved and self._near(state.head, landmarks))):
             return state.head.rotation, state.head.translation
         trust = self.landmark_weights.double() * self.landmark_trust(landmarks, confidence)
         pose = solve_pnp(self.rest[:LANDMARKS], landmarks.detach(), self.intrinsics, trust)

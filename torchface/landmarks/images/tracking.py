@@ -138,8 +138,23 @@ class LandmarkTracker:
         self._anchor: Tensor | None = None
         self._missed = self._frames = self._unseen = 0
 
-    def resume(self, landmarks: Tensor, confidence: Tensor) -> None:
-        """Goes on after a frame with these landmarks (68,2) and confidence (68,): the face near there is meant."""
+    @property
+    def memory(self) -> Tensor:
+        """What the next frame needs beside the last one's landmarks and confidence, (10,) float64; NaN for unknown."""
+        place, anchor = (
+            torch.full((count,), torch.nan) if one is None else one.cpu()
+            for one, count in ((self._place, 4), (self._anchor, 3))
+        )
+        counts = torch.tensor([self._missed, self._frames, self._unseen], dtype=torch.float64)
+        return torch.cat([place.double(), anchor.double(), counts])
+
+    def resume(self, landmarks: Tensor, confidence: Tensor, memory: Tensor | None = None) -> None:
+        """Goes on after a frame with these landmarks (68,2) and confidence (68,): the face near there is meant.
+
+        Args:
+            landmarks, confidence: of that frame.
+            memory: the tracker's after that frame, (10,); with it all goes on as if it had never stopped.
+        """
         if landmarks.shape != (COUNT, 2) or confidence.shape != (COUNT,):
             raise ShapeError(
                 f"resume: found {tuple(landmarks.shape)} and {tuple(confidence.shape)}, "
@@ -149,6 +164,13 @@ class LandmarkTracker:
         if bool(torch.isfinite(landmarks).all()):
             self._last = TrackedFace(landmarks.float(), box_around(landmarks.float()), confidence.float())
             self._place = self._last.box
+        if memory is not None:
+            if memory.shape != (10,):
+                raise ShapeError(f"resume: found a memory of {tuple(memory.shape)}, expected (10,)")
+            place, anchor, counts = memory.float().split([4, 3, 3])
+            self._place = place if bool(torch.isfinite(place).all()) else None
+            self._anchor = anchor if bool(torch.isfinite(anchor).all()) else None
+            self._missed, self._frames, self._unseen = (int(count) for count in counts.nan_to_num(0.0))
 
     def step(self, frame: Tensor) -> TrackedFace:
         """The face in the next frame.

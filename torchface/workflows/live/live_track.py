@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video import VideoState
-from torchface.capture.video.head_pose import PoseTracker
+from torchface.capture.video.landmark_offsets import LandmarkOffsets
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
@@ -25,11 +25,12 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.live.live_frames import Camera, PlayedVideo
 from torchface.workflows.track.head_rotations import head_angles, rotation_columns
-from torchface.workflows.track.track_files import save_curves
+from torchface.workflows.track.track_files import OFFSETS, save_curves
 from torchface.workflows.track.track_models import TrackModels, load_track_models
-from torchface.workflows.track.track_video import TrackSettings, camera_of, load_actor, solver_for
+from torchface.workflows.track.track_video import TrackSettings, camera_of, load_actor, offsets_of, solver_for
 
 _MIN_LANDMARKS = 6
+_SHORTEST = 1e-3  # seconds between frames
 _EYE_ANGLES = 6
 _DEFAULT = TrackSettings()
 
@@ -87,30 +88,41 @@ class LiveSolver:
         models: what tracks and solves.
         calibration: of the camera.
         face: number of the face, the largest first.
+        offsets: between the rig's landmarks and those that the models find.
     """
 
-    def __init__(self, rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, face: int = 0) -> None:
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        models: TrackModels,
+        calibration: CameraCalibration,
+        face: int = 0,
+        offsets: LandmarkOffsets | None = None,
+    ) -> None:
         self.names = rig.names
         if models.finder is None:
             raise ValueRangeError("--landmarks: found a table, expected what finds landmarks as the face moves")
         self._tracker = LandmarkTracker(models.finder, models.appearance, face=face)
         self._calibration, self._filter = calibration, LandmarkFilter()
-        self._poses = PoseTracker(rig.vertices[rig.neutral.landmarks], calibration.intrinsics)
-        self._solver = solver_for(rig, models, calibration)
+        solver = solver_for(rig, models, calibration)
+        self._solver = solver if offsets is None else solver.shifted(offsets)
         self._state: VideoState | None = None
 
-    def step(self, frame: Tensor) -> LiveFrame:
-        """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0."""
+    def step(self, frame: Tensor, interval: float | None = None) -> LiveFrame:
+        """Solves the next frame, uint8 (H,W) or (3,H,W); before the first face all weights are 0.
+
+        Args:
+            frame: the picture.
+            interval: seconds since the frame before, where they are known.
+        """
         seen = self._tracker.step(frame)
         landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
-        pose = self._poses.step(landmarks, seen.confidence)
         enough = int(torch.isfinite(landmarks).all(1).sum()) >= _MIN_LANDMARKS
         if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
         before = self._state or self._solver.start()
-        self._state = self._solver.step(
-            before, landmarks, pose.rotation.to(landmarks), pose.translation.to(landmarks), seen.confidence
-        )
+        trust = seen.confidence * seen.visibility
+        self._state = self._solver.step(before, landmarks, confidence=trust, interval=interval)
         weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
         return LiveFrame(weights, rotation, seen.landmarks)
 
@@ -151,14 +163,18 @@ def track_live(
             actor, settings.landmarks, settings.appearance, settings.prior, settings.dynamics, source.video.fps
         )
         calibration = camera_of(source.video, settings.camera)
-        solver = LiveSolver(actor, models, calibration, settings.face)
+        known = settings.offsets or (None if out is None or not (out / OFFSETS).is_file() else out / OFFSETS)
+        offsets = None if known is None else offsets_of(known, actor, models)
+        solver = LiveSolver(actor, models, calibration, settings.face, offsets)
+        before: float | None = None
         rows: list[LiveFrame] = []
         latency: list[float] = []
         started = time.perf_counter()
         with LiveLinkSender(address, actor.names, source.video.fps) as sender:
             try:
                 for came, frame in source.frames():
-                    solved = solver.step(frame)
+                    solved = solver.step(frame, None if before is None else max(came - before, _SHORTEST))
+                    before = came
                     angles = head_angles(solved.rotation.double()).nan_to_num(0.0)
                     sender.send(solved.weights, torch.cat([angles, angles.new_zeros(_EYE_ANGLES)]))
                     now = time.perf_counter()

@@ -23,6 +23,7 @@ from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_state import TrackState
 
 SOLUTION, LIGHT, WEIGHTS, LIVE_LINK = "solution.safetensors", "light.safetensors", "weights.csv", "live_link.csv"
+CONFIDENCE, OFFSETS = "confidence.csv", "landmark_offsets.json"
 LANDMARKS, ANIMATION, OVERLAY, SUMMARY = "landmarks.csv", "animation.glb", "overlay.mp4", "summary.json"
 
 _FORMAT = "torchface.track-summary/1"
@@ -33,7 +34,7 @@ def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:
     """Keeps a solution for a later run."""
     tensors = {
         name: getattr(solution, name).detach().float().contiguous()
-        for name in ("weights", "rotation", "translation", "errors")
+        for name in ("weights", "rotation", "translation", "errors", "confidence")
     }
     path = make_folder(state.folder) / SOLUTION
     write_file(path, save({**tensors, "solved": solution.solved.contiguous()}))
@@ -90,12 +91,24 @@ def save_curves(take: Take, out: Path) -> dict[str, Path]:
 
 
 def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
-    """Writes the weights, the landmarks with the head's pose beside them, and the animation; gives the files by what
-    they are."""
+    """Writes the weights, how sure they are, the landmarks with the head's pose beside them, the offsets and the
+    animation; gives the files by what they are.
+
+    How sure each weight is stands in a file of its own, laid out as the weights are: a column beside them would be a
+    shape to whatever else reads them, and could not say which part of the face is hidden.
+    """
     fps, weights = tracked.video.fps, tracked.solution.weights.detach().float()
     angles = rotation_columns(tracked.solution.rotation)
     take = Take(fps, weights=Track(tracked.rig.names, weights[..., None]), extras={"columns": angles})
     products = {**save_curves(take, out), "landmarks": out / LANDMARKS, "animation": out / ANIMATION}
+    products["confidence"] = out / CONFIDENCE
+    sure = tracked.solution.confidence.detach().float() * tracked.seen[:, None]
+    save_weights_csv(Take(fps, weights=Track(tracked.rig.names, sure[..., None])), products["confidence"])
+    if tracked.offsets is None:
+        delete_file(out / OFFSETS)
+    else:
+        products["offsets"] = out / OFFSETS
+        tracked.offsets.save(out / OFFSETS)
     moved = tracked.solution.translation.detach().double()
     columns = {f"pose_T{axis}": moved[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"pose_{name.removeprefix('Head').lower()}": angles[name] for name in list(angles)[:3]}

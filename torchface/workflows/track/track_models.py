@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import torch
 from torch import nn
 
 from torchface import zoo
@@ -18,6 +20,15 @@ from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.rig import BlendshapeRig
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 from torchface.workflows.track.given_frames import is_table
+
+DEFAULT_PRIOR = "shape_prior"
+"""Of the zoo; what weights faces have, where no other prior is named."""
+NO_PRIOR = "none"
+"""In place of a shape prior: none."""
+
+# What people do with their eyes has little to do with what a prior's few takes did with theirs. So wide, it neither
+# shuts nor opens lids.
+_LIDS, _LID_DEVIATION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 0.5
 
 _Model = TypeVar("_Model", bound=nn.Module)
 Fitted = TypeVar("Fitted")
@@ -50,7 +61,7 @@ def load_track_models(
     rig: BlendshapeRig,
     landmarks: str | Path = DEFAULT_LANDMARKS,
     appearance: str | Path | None = None,
-    prior: str | Path | None = None,
+    prior: str | Path | None = DEFAULT_PRIOR,
     dynamics: str | Path | None = None,
     fps: float | None = None,
 ) -> TrackModels:
@@ -58,7 +69,8 @@ def load_track_models(
 
     Args:
         rig: whose shapes' names the priors are brought to.
-        landmarks, appearance, prior, dynamics: the models; for landmarks also a table of them.
+        landmarks, appearance, prior, dynamics: the models; for landmarks also a table of them; ``prior`` may be "none".
+            The prior by default is left out where it has learned less than half of the rig's shapes.
         fps: frames a second of the video, to which the dynamics prior is brought; its own if absent.
 
     Raises:
@@ -70,6 +82,7 @@ def load_track_models(
     """
     named = None if is_table(landmarks) else load_finder(landmarks)
     priors = load_priors(rig, prior, dynamics, fps)
+    learned = None if priors.shapes is None else _folder(prior)
     return TrackModels(
         None if named is None else named.finder,
         None if appearance is None else _read("--appearance", appearance, AppearanceModel),
@@ -79,7 +92,7 @@ def load_track_models(
         content_key(
             "seeing", finder=Path(landmarks) if named is None else named.source, appearance=_folder(appearance)
         ),
-        content_key("solving", prior=_folder(prior), dynamics=_folder(dynamics), fps=fps),
+        content_key("solving", prior=learned, dynamics=_folder(dynamics), fps=fps),
     )
 
 
@@ -96,14 +109,28 @@ def load_priors(
     rig: BlendshapeRig, prior: str | Path | None, dynamics: str | Path | None, fps: float | None = None
 ) -> FittedPriors:
     """Reads priors and brings them to a rig and a frame rate; see :func:`load_track_models`."""
+    prior = None if prior == NO_PRIOR else prior
+    if prior == DEFAULT_PRIOR and not _knows(zoo.get_model(DEFAULT_PRIOR), rig):
+        prior = None
     shapes = None if prior is None else _read("--prior", prior, ShapePrior)
     motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
     silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
     return FittedPriors(
-        None if shapes is None else _fitted(prior, lambda: shapes.renamed(rig.names)),
+        None if shapes is None else _fitted(prior, lambda: _with_free_lids(shapes.renamed(rig.names))),
         None if motion is None else _fitted(dynamics, lambda: adapt_dynamics(motion, rig.names, fps)),
         tuple(name for name in rig.names if name in silent),
     )
+
+
+def _knows(learned: nn.Module, rig: BlendshapeRig) -> bool:
+    """Whether a prior has learned at least half of a rig's shapes."""
+    return isinstance(learned, ShapePrior) and 2 * len(unlearned(learned.names, rig.names)) <= len(rig.names)
+
+
+def _with_free_lids(prior: ShapePrior) -> ShapePrior:
+    """A prior that neither shuts nor opens lids."""
+    deviations = [_LID_DEVIATION if _LIDS.match(name) else 0.0 for name in prior.names]
+    return prior.widened(torch.tensor(deviations).square())
 
 
 def _fitted(name: str | Path | None, fit: Callable[[], Fitted]) -> Fitted:

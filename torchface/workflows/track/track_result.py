@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video import VideoSolution
-from torchface.capture.video.head_pose import STABLE_LANDMARKS, HeadPoses
+from torchface.capture.video.head_pose import STABLE_LANDMARKS
+from torchface.capture.video.landmark_offsets import LandmarkOffsets
+from torchface.capture.video.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.landmarks.images.tracking import landmark_jitter
@@ -21,6 +23,7 @@ MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
+_LEAST_MOTION = 1e-2  # mm²
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,6 @@ class Tracked:
         rig: the actor's.
         frames: what the tracker saw.
         pinhole: its landmarks as a camera without distortion has them, filtered along time, (T,68,2), pixels.
-        poses: of the head, from the stable landmarks.
         solution: weights and refined poses.
         calibration: of the camera.
         faces: how many there are in the first frame.
@@ -41,13 +43,13 @@ class Tracked:
         products: the files, by what they are.
         unlearned: shapes that a prior says nothing of.
         light: of the video, where a texture was put on the face.
+        offsets: between the rig's landmarks and those found; None where the take is too short to tell.
     """
 
     video: VideoFile
     rig: BlendshapeRig
     frames: TrackedFrames
     pinhole: Tensor
-    poses: HeadPoses
     solution: VideoSolution
     calibration: CameraCalibration
     faces: int
@@ -56,6 +58,7 @@ class Tracked:
     products: dict[str, Path]
     unlearned: tuple[str, ...] = ()
     light: PointLight | None = None
+    offsets: LandmarkOffsets | None = None
 
     @property
     def seen(self) -> Tensor:
@@ -75,6 +78,17 @@ class Tracked:
     def bounds(self) -> Tensor:
         """The share of frames in which each weight is at 1, (N,)."""
         return (self.solution.weights >= 1 - _AT_BOUND).float().mean(0)
+
+    @property
+    def moves(self) -> Tensor:
+        """The shapes that move landmarks, (N,) bool."""
+        marks = self.rig.neutral.landmarks
+        return self.rig.deltas[:, marks].detach().square().sum((1, 2)) > _LEAST_MOTION
+
+    def hidden_share(self) -> Tensor:
+        """The share of frames with a face in which each weight's landmarks are hidden, (N,)."""
+        confidence = self.solution.confidence[self.seen.to(self.solution.confidence.device)]
+        return (confidence < HIDDEN).float().mean(0)
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -107,6 +121,16 @@ class Tracked:
                 "before and after; landmarks.csv says which (success 0)"
             )
         bounds = self.bounds()
+        dark = self.hidden_share()
+        rarely = [i for i in dark.argsort(descending=True).tolist() if dark[i] > _OFTEN and bool(self.moves[i])]
+        if rarely:
+            named = ", ".join(f"{self.rig.names[i]} {100 * float(dark[i]):.0f} %" for i in rarely[:_MAX_NAMED])
+            lines.append(
+                f"often hidden, so kept and then brought to rest: {named} of the frames (confidence.csv says when)"
+            )
+        if self.offsets is not None:
+            size = float(self.offsets.millimetres.norm(dim=1).mean())
+            lines.append(f"landmarks lie {size:.1f} mm off the rig's in the mean, which was taken out (--offsets)")
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])

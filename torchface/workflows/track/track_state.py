@@ -21,7 +21,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/3"
+_METHOD = "tracked frames/4"
 _LANDMARKS = 68
 _MAX_PIECE_BYTES = 2**28
 
@@ -94,6 +94,8 @@ class TrackState:
         self.folder = Path(out) / FOLDER
         self.key = key
         self._pieces: list[TrackedFrames] = []
+        self.memory = torch.zeros(0, dtype=torch.float64)
+        """The tracker's after the frames that are kept."""
         self._take_up()
 
     @property
@@ -105,15 +107,16 @@ class TrackState:
         """All that is kept."""
         return TrackedFrames.joined(self._pieces)
 
-    def append(self, piece: TrackedFrames) -> None:
-        """Keeps the next frames.
+    def append(self, piece: TrackedFrames, memory: Tensor | None = None) -> None:
+        """Keeps the next frames, and the tracker's memory after them.
 
         Raises:
             FileFormatError: the folder cannot be written to.
         """
         make_folder(self.folder)
         kept = TrackedFrames(*(getattr(piece, one.name).float() for one in fields(piece)))
-        write_checkpoint(self._path(len(self._pieces)), vars(kept), self._piece_key())
+        self.memory = torch.zeros(0, dtype=torch.float64) if memory is None else memory
+        write_checkpoint(self._path(len(self._pieces)), {**vars(kept), "memory": self.memory}, self._piece_key())
         self._pieces.append(kept)
 
     def is_current(self, product: Path, key: str) -> bool:
@@ -160,9 +163,14 @@ class TrackState:
             return None
         found = read_checkpoint(path, self._piece_key())
         try:
-            return None if found is None else TrackedFrames(**found)
-        except (ShapeError, TypeError):
+            if found is None:
+                return None
+            memory = found.pop("memory")
+            piece = TrackedFrames(**found)
+        except (ShapeError, TypeError, KeyError):
             return None
+        self.memory = memory
+        return piece
 
     def _piece_key(self) -> str:
         return content_key(_METHOD, run=self.key, begin=self.done)

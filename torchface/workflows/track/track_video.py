@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
-from torchface.capture.video.head_pose import HeadPoses, measure_poses, smooth_poses, track_pose
+from torchface.capture.video.landmark_offsets import LandmarkOffsets
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
+from torchface.capture.video.offset_estimate import estimate_offsets
 from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
-from torchface.errors import AlignmentError, ValueRangeError
+from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
@@ -34,6 +35,7 @@ from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.given_frames import blank_clip, given_frames, is_table
 from torchface.workflows.track.track_files import (
+    OFFSETS,
     OVERLAY,
     SUMMARY,
     keep_light,
@@ -43,7 +45,12 @@ from torchface.workflows.track.track_files import (
     summary,
     write_curves,
 )
-from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, load_track_models
+from torchface.workflows.track.track_models import (
+    DEFAULT_LANDMARKS,
+    DEFAULT_PRIOR,
+    TrackModels,
+    load_track_models,
+)
 from torchface.workflows.track.track_overlay import video_light, write_overlay
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 from torchface.workflows.track.track_state import TrackedFrames, TrackState
@@ -51,7 +58,7 @@ from torchface.workflows.track.track_state import TrackedFrames, TrackState
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
 
-_METHOD = "track/2"
+_METHOD = "track/3"
 """Of the keys; another number where the same inputs, or another ``PIECE``, come to give other results."""
 
 
@@ -62,20 +69,23 @@ class TrackSettings:
     Args:
         landmarks: what finds them, see :func:`~torchface.workflows.named_finders.load_finder`; or a table that gives
             them, see :func:`~torchface.io.landmarks.landmark_tables.load_landmark_table`.
-        appearance, prior, dynamics: models by name or folder.
+        appearance, prior, dynamics: models by name or folder; ``prior`` may be "none".
         camera: a calibration; a focal length is assumed without.
         face: which of several, from 0, the largest first.
-        whole_take: poses from all frames, those after each too; weights as well where there is a dynamics prior.
+        whole_take: landmarks smoothed by all frames, those after each too; weights as well where there is a dynamics
+            prior.
         part: keep this region of the rig only.
         texture: an image to put on the face in the overlay, in the rig's texture coordinates.
         overlay: draw the overlay video.
         fps: frames a second of a table of landmarks without a video; by its times if absent.
         size: width and height of the pictures that such landmarks were found in; the camera's if absent.
+        offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
+            or estimated with the take, if absent.
     """
 
     landmarks: str | Path = DEFAULT_LANDMARKS
     appearance: str | Path | None = None
-    prior: str | Path | None = None
+    prior: str | Path | None = DEFAULT_PRIOR
     dynamics: str | Path | None = None
     camera: Path | None = None
     face: int = 0
@@ -85,6 +95,7 @@ class TrackSettings:
     overlay: bool = True
     fps: float | None = None
     size: tuple[int, int] | None = None
+    offsets: Path | None = None
 
 
 def track_video(
@@ -104,8 +115,8 @@ def track_video(
     Raises:
         FileFormatError: the video cannot be decoded, changes its size or has a variable frame rate; or another file
             is broken.
-        ValueRangeError: there is no face in the video, never six stable landmarks, the rig has no 68 landmarks, or
-            the take is too short for the dynamics prior; or another run is writing into ``out``.
+        ValueRangeError: there is no face in the video, the rig has no 68 landmarks, the take is too short for the
+            dynamics prior, or the offsets are another rig's or finder's; or another run is writing into ``out``.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
     """
     with within_job(out):
@@ -142,9 +153,15 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
     begin = time.perf_counter()
     steadied = smooth_landmarks if settings.whole_take else filter_landmarks
     pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
-    poses = _poses(actor, pinhole, frames.confidence, calibration, settings.whole_take, clip.path)
-    seconds["pose"] = time.perf_counter() - begin
-    solver = solver_for(actor, models, calibration)
+    seconds["steadying"] = time.perf_counter() - begin
+    trust = frames.confidence * frames.visibility
+    solver = solver_for(actor, models, calibration, clip.fps)
+    begin = time.perf_counter()
+    offsets, known = _offsets(solver, actor, models, pinhole, trust, settings.offsets, out)
+    if not known:
+        seconds["offsets"] = time.perf_counter() - begin
+    if offsets is not None:
+        solver = solver.shifted(offsets)
     solve_key = content_key(
         _METHOD,
         landmarks=see_key,
@@ -155,16 +172,28 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         calibration=calibration,
         whole_take=settings.whole_take,
         solver=solver.settings,
+        offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
     )
     solution = kept_solution(state, solve_key, len(frames), len(actor.names))
     if solution is None:
         begin = time.perf_counter()
-        solution = _solve(solver, pinhole, poses, frames.confidence, settings.whole_take, progress)
+        solution = _solve(solver, pinhole, trust, settings.whole_take, progress)
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
     tracked = Tracked(
-        clip, actor, frames, pinhole, poses, solution, calibration, faces, reused, seconds, products, models.unlearned
+        clip,
+        actor,
+        frames,
+        pinhole,
+        solution,
+        calibration,
+        faces,
+        reused,
+        seconds,
+        products,
+        models.unlearned,
+        offsets=offsets,
     )
     with all_or_none():
         products |= write_curves(tracked, out)
@@ -231,9 +260,11 @@ def check_texture(rig: BlendshapeRig, texture: Path) -> None:
         raise ValueRangeError(f"{texture}: found a rig without texture coordinates, expected some to put it on")
 
 
-def solver_for(rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration) -> VideoSolver:
-    """The solver of a rig, for landmarks that the models find."""
-    settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None)
+def solver_for(
+    rig: BlendshapeRig, models: TrackModels, calibration: CameraCalibration, fps: float | None = None
+) -> VideoSolver:
+    """The solver of a rig, for landmarks that the models find, at a frame rate."""
+    settings = VideoSettings.of_found_landmarks(models.dynamics is not None, models.appearance is not None, fps)
     return VideoSolver(rig, None, calibration.intrinsics, models.prior, models.dynamics, settings)
 
 
@@ -264,6 +295,9 @@ def _track(
     tracker = LandmarkTracker(finder, appearance, face=face)
     kept, at, faces = state.done, 0, 0
     last = state.frames()
+    if len(last):
+        # A run that was killed goes on with all that it knew, and so gives the same landmarks.
+        tracker.resume(last.landmarks[-1], last.confidence[-1], state.memory)
     frames = clip.color_frames()
     for first in frames:
         if at == 0:
@@ -273,18 +307,56 @@ def _track(
             at += sum(1 for _ in piece)
             progress("tracking landmarks", at, max(clip.count, at))
             continue
-        if len(last):
-            # Each piece starts from the one before alone, so that a run that was killed gives the same landmarks.
-            tracker.resume(last.landmarks[-1], last.confidence[-1])
         found = []
         for frame in piece:  # a frame's box is the one before's
             with naming_the_frame(at):
                 found.append(tracker.step(frame))
             at += 1
             progress("tracking landmarks", at, max(clip.count, at))
-        last = TrackedFrames.of_faces(found)
-        state.append(last)
+        state.append(TrackedFrames.of_faces(found), tracker.memory)
     return faces
+
+
+def rig_digest(rig: BlendshapeRig) -> str:
+    """Changes when a rig does."""
+    return content_key("rig", neutral=rig.neutral, deltas=rig.deltas, names=rig.names)
+
+
+def _finder_digest(models: TrackModels) -> str:
+    """Changes when what finds landmarks does; a table does not say what found it."""
+    return "" if models.finder is None else models.seeing
+
+
+def offsets_of(path: Path, rig: BlendshapeRig, models: TrackModels) -> LandmarkOffsets:
+    """A file's offsets, which must be this rig's and this finder's.
+
+    Raises:
+        FileFormatError: it is no such file.
+        ValueRangeError: they are another rig's or finder's.
+    """
+    found = LandmarkOffsets.load(path)
+    found.require(rig_digest(rig), _finder_digest(models), path)
+    return found
+
+
+def _offsets(
+    solver: VideoSolver,
+    rig: BlendshapeRig,
+    models: TrackModels,
+    landmarks: Tensor,
+    trust: Tensor,
+    given: Path | None,
+    out: Path,
+) -> tuple[LandmarkOffsets | None, bool]:
+    """The offsets of a rig and a finder, and whether they were known: as given, of an earlier take, or of this one."""
+    if given is not None:
+        return offsets_of(given, rig, models), True
+    if (out / OFFSETS).is_file():
+        try:
+            return offsets_of(out / OFFSETS, rig, models), True
+        except (FileFormatError, ValueRangeError):
+            pass  # another rig's, or damaged: made anew
+    return estimate_offsets(solver, landmarks, trust, rig_digest(rig), _finder_digest(models)), False
 
 
 def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) -> PointLight:
@@ -299,40 +371,21 @@ def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) ->
     return found
 
 
-def _poses(
-    rig: BlendshapeRig,
-    landmarks: Tensor,
-    confidence: Tensor,
-    calibration: CameraCalibration,
-    whole_take: bool,
-    path: Path,
-) -> HeadPoses:
-    points, intrinsics = rig.vertices[rig.neutral.landmarks], calibration.intrinsics
-    try:
-        if whole_take:
-            return smooth_poses(measure_poses(points, landmarks, intrinsics, confidence))
-        return track_pose(points, landmarks, intrinsics, confidence)
-    except AlignmentError as error:
-        raise AlignmentError(f"{path}: {error}") from error
-
-
 def _solve(
     solver: VideoSolver,
     landmarks: Tensor,
-    poses: HeadPoses,
     confidence: Tensor,
     whole_take: bool,
     progress: Progress,
 ) -> VideoSolution:
-    rotation, translation = poses.rotation.to(landmarks), poses.translation.to(landmarks)
     if whole_take and solver.dynamics is not None:
         progress("solving for weights")
-        return solve_whole_take(solver, landmarks, rotation, translation, confidence)
+        return solve_whole_take(solver, landmarks, confidence=confidence)
     enough = torch.isfinite(landmarks).all(-1).sum(1) >= MIN_STABLE
     first = int(enough.nonzero()[0, 0])
     states, state = [], solver.start()
     for t in range(first, len(landmarks)):  # a frame leans on the one before
-        state = solver.step(state, landmarks[t], rotation[t], translation[t], confidence[t])
+        state = solver.step(state, landmarks[t], confidence=confidence[t])
         states.append(state)
         progress("solving for weights", t + 1, len(landmarks))
     states = [states[0]] * first + states
