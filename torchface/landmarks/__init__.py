@@ -11,6 +11,7 @@ from torchface.landmarks.images.face_box import (
 )
 from torchface.landmarks.images.finders.tree_finder import TreeFinder
 from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkFinder
+from torchface.landmarks.images.landmark_measures import Agreement, agreement, find_blinks, lid_openings, mouth_gap
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.network_training import NetworkSettings
@@ -36,6 +37,7 @@ from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES, uv_la
 
 __all__ = [
     "UV_LANDMARK_NAMES",
+    "Agreement",
     "AppearanceFit",
     "AppearanceModel",
     "AppearanceSettings",
@@ -65,16 +67,20 @@ __all__ = [
     "UVLandmarks",
     "UnwrappedHead",
     "YuNetDetector",
+    "agreement",
     "appearance_image",
     "contour_correspondences",
     "curvature_image",
+    "find_blinks",
     "find_face",
     "find_faces",
     "find_landmarks",
     "landmark_jitter",
+    "lid_openings",
     "line_image",
     "load_annotations",
     "load_detector",
+    "mouth_gap",
     "save_annotations",
     "save_detector",
     "scan_landmarks",
