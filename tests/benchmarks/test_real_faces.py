@@ -1,0 +1,50 @@
+"""The shipped landmark finders beside MediaPipe on real faces: photographs, clips, and faces spoilt in ten ways.
+
+Who made the landmarks that they are compared with is said in each row: people for five photographs, dlib's own
+predictor (rounded to pixels, no truth) for 18 faces, MediaPipe (another network, no truth) for the clips. MediaPipe
+runs where ``TORCHFACE_MEDIAPIPE_PYTHON`` or the running Python has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from real_faces import Outcome, inner_error, outcome
+
+from torchface import zoo
+from torchface.errors import MissingExtraError
+from torchface.workflows.named_finders import load_finder
+
+TREES, NETWORK, PEER = "face_landmarks", "landmark_network", "mediapipe"
+
+
+@pytest.fixture(scope="module")
+def outcomes(data: Path) -> dict[str, Outcome]:
+    """By finder; those that are not installed are left out."""
+    found = {}
+    for name in (TREES, NETWORK, PEER):
+        if name == NETWORK and name not in zoo.list_models():
+            continue
+        try:
+            found[name] = outcome(load_finder(name).finder, data)
+        except MissingExtraError as error:
+            print(f"\n{name}: no comparison was made: {error}")
+    return found
+
+
+@pytest.mark.real
+@pytest.mark.usefixtures("one_thread")
+def test_finders_beside_each_other(outcomes: dict[str, Outcome], print_machine: Callable[..., None]) -> None:
+    print_machine("onnxruntime", "opencv-contrib-python-headless")
+    for name, one in outcomes.items():
+        print(f"\n{name}")
+        for row, figures in one.rows():
+            print(f"  {row:52} {figures}")
+    trees = outcomes[TREES]
+    assert inner_error(trees.hand) < 0.075
+    assert trees.difference() < 0.12
+    assert all(counts.total() == 20 for counts in trees.verdicts.values())
+    if PEER in outcomes:  # what made the clips' reference finds it again, frame by frame
+        assert outcomes[PEER].difference() < 0.05
