@@ -45,7 +45,8 @@ class VideoSolver(VideoSolverParts):
     variance of that. The thesis divides by V alone, as if the last frames' weights were true. They have a
     covariance P, which a Kalman filter of the landmarks carries on; it tells directions in which the landmarks show
     little, such as depth, from those that they show well, and so averages over the more frames the less one tells.
-    Without a dynamics prior each frame is solved on its own.
+    Without a dynamics prior m is the last frame's weights and V the variance of a random walk, where
+    ``settings.motion`` says how far weights wander; otherwise each frame is solved on its own.
 
     A pose tracked from stable landmarks is noisy, and biased by what the face does, so it is where the search starts,
     no more, unless ``pose_trust`` is positive: D is the distance from it in what the frame's landmarks tell of a pose.
