@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.landmarks import LandmarkTrees
+from torchface.landmarks import LandmarkNetwork, LandmarkTrees
+from torchface.landmarks.images.finders.crop_finder import BothSides, CropFinder
 from torchface.landmarks.images.finders.mediapipe_finder import MediaPipeFinder
-from torchface.landmarks.images.finders.onnx_finder import onnx_finder
+from torchface.landmarks.images.finders.onnx_finder import graph_finder, onnx_finder
 from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
+from torchface.onnx.landmark_network_graph import landmark_network_model
 
 DEFAULT_LANDMARKS = "face_landmarks"
 """The model of the zoo that finds landmarks where none is named."""
@@ -53,10 +55,26 @@ def load_finder(
     if Path(name_or_path).suffix.lower() == ".onnx":
         return NamedFinder(onnx_finder(name_or_path), Path(name_or_path))
     model = zoo.get_model(name_or_path)
+    if isinstance(model, LandmarkNetwork):
+        return NamedFinder(network_finder(model, str(name_or_path), photographs), zoo.find(name_or_path))
     if not isinstance(model, LandmarkTrees):
-        raise NameMismatchError(f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees")
+        raise NameMismatchError(
+            f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkNetwork or LandmarkTrees"
+        )
     starts = PHOTOGRAPH if photographs else ConsensusSettings()
     try:
         return NamedFinder(TreeFinder(model, starts, str(name_or_path)), zoo.find(name_or_path))
     except ValueRangeError as error:
         raise ValueRangeError(f"{name_or_path}: {error}") from error
+
+
+def network_finder(network: LandmarkNetwork, name: str, photographs: bool = False) -> CropFinder:
+    """A finder that runs a landmark network in ONNX Runtime, in a third of PyTorch's time for single crops.
+
+    Args:
+        network: finds landmarks in crops.
+        name: what messages call it.
+        photographs: show it each crop's mirror image too.
+    """
+    finder = graph_finder(landmark_network_model(network).SerializeToString(), Path(name))
+    return replace(finder, network=BothSides(finder.network)) if photographs else finder

@@ -10,12 +10,15 @@ from torchface import zoo
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images import network_training
+from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
+from torchface.landmarks.images.finders.crop_finder import BothSides
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.network_training import fit_network
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
 from torchface.onnx import export_model
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
+from torchface.workflows.named_finders import load_finder
 
 SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}
 CALM = AugmentationSettings(turn=0.0, scale=0.0, shift=0.0, hidden=0.0, absent=0.0, grey=0.0)
@@ -137,3 +140,25 @@ def test_wrong_shapes_and_settings_are_refused(network: LandmarkNetwork, picture
         fit_network(pictures[0].float(), *pictures[1:])
     with pytest.raises(ValueRangeError, match="0 steps"):
         NetworkSettings(steps=0)
+
+
+def test_both_sides_of_a_crop_give_mirrored_landmarks(network: LandmarkNetwork) -> None:
+    crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        found, mirrored = BothSides(network)(crops), BothSides(network)(crops.flip(-1))
+    across = mirrored[0][:, list(MIRROR_68)] * torch.tensor([-1.0, 1.0]) + torch.tensor([63.0, 0.0])
+    torch.testing.assert_close(across, found[0])
+    torch.testing.assert_close(mirrored[1][:, list(MIRROR_68)], found[1])
+
+
+def test_a_finder_runs_the_network_of_a_folder(network: LandmarkNetwork, tmp_path) -> None:
+    zoo.save_model(network, tmp_path / "n", licence="MIT", data="none", metrics={}, recipe="", card="")
+    finder = load_finder(tmp_path / "n").finder
+    image = (255 * torch.rand(3, 90, 120, generator=torch.Generator().manual_seed(2))).round().byte()
+    box = torch.tensor([30.0, 20.0, 50.0, 50.0])
+    transform = crop_transform(box, 0.3, 64, network.margin)
+    with torch.no_grad():
+        expected = network(cut_crop(image, transform, 64)[None].float() / 255)
+    found = finder(image, box, 0.3)
+    torch.testing.assert_close(found.landmarks, from_crop(expected.landmarks[0], transform), atol=0.1, rtol=0)
+    torch.testing.assert_close(found.visibility, expected.visibility[0], atol=0.01, rtol=0)

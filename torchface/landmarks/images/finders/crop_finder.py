@@ -10,11 +10,33 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import CROP_MARGIN, crop_transform, cut_crop, from_crop
+from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, confidence_of
 
 CropNetwork = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 """Crops (B,3,S,S) float32 in [0,1], red first, to landmarks (B,68,2) and their deviations (B,68), pixels of the crop,
 visibility (B,68) and presence (B,), each in [0,1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class BothSides:
+    """A network that is shown each crop and its mirror image, and the mean of what it finds in the two.
+
+    Args:
+        network: see ``CropNetwork``.
+    """
+
+    network: CropNetwork
+
+    def __call__(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        rows, last = list(MIRROR_68), crops.shape[-1] - 1
+        seen, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
+        across = mirrored[0][:, rows] * mirrored[0].new_tensor([-1.0, 1.0]) + mirrored[0].new_tensor([last, 0.0])
+        landmarks = (seen[0] + across) / 2
+        # Where the two disagree the landmark is less sure than either says.
+        apart = (seen[0] - across).norm(dim=-1) / 2
+        deviation = ((seen[1] + mirrored[1][:, rows]) / 2).square().add(apart.square()).sqrt()
+        return landmarks, deviation, (seen[2] + mirrored[2][:, rows]) / 2, (seen[3] + mirrored[3]) / 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,10 +44,19 @@ def onnx_finder(path: str | Path) -> CropFinder:
     Raises:
         FileFormatError: it is no ONNX graph, or one of other inputs and outputs; the message says which it has.
     """
+    path = Path(path)
+    return graph_finder(read_file(path, _MAX_BYTES), path)
+
+
+def graph_finder(content: bytes, path: Path) -> CropFinder:
+    """The finder of a graph that was read or made already; see :func:`onnx_finder`.
+
+    Args:
+        content: of an ONNX file.
+        path: what messages call it.
+    """
     import onnxruntime
 
-    path = Path(path)
-    content = read_file(path, _MAX_BYTES)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
