@@ -67,6 +67,91 @@ def test_a_finder_of_ones_own_is_followed(face: Tensor) -> None:
     assert not tracker.step(frames[0]).found
 
 
+class Stage:
+    """People of plain colours in grey, who know where their landmarks are; the first of them stands in front."""
+
+    def __init__(self, face: Tensor, colours: list[tuple[int, int, int]]) -> None:
+        self.face, self.colours = face, colours
+        self.places: list[Tensor] = []
+
+    def frame(self, *places: tuple[float, float]) -> Tensor:
+        """A picture (3,200,400) with somebody at each place."""
+        self.places = [torch.tensor(place) for place in places]
+        picture = torch.full((3, 200, 400), 90, dtype=torch.uint8)
+        for place, colour in reversed(list(zip(self.places, self.colours, strict=True))):
+            x, y = place.int().tolist()
+            left, right = max(x - 29, 0), max(x + 29, 0)
+            picture[:, y - 29 : y + 29, left:right] = torch.tensor(colour).byte()[:, None, None]
+            picture[:, y - 5 : y + 5, left:right] //= 2
+        return picture
+
+    def seen(self) -> list[Tensor]:
+        """Those whom nobody hides."""
+        shown: list[Tensor] = []
+        for place in self.places:
+            if all(float((place - other).norm()) > 60 for other in shown):
+                shown.append(place)
+        return shown
+
+    def find(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+        middle = box[:2] + box[2:] / 2
+        near = min(self.seen(), key=lambda place: float((place - middle).norm()))
+        there = float((near - middle).norm() < 0.5 * box[2])
+        return FoundLandmarks(self.face + near, confidence_of(torch.full((68,), 0.01)), torch.ones(68), there)
+
+    def detect(self, image: Tensor) -> FaceBoxes:
+        boxes = torch.stack([box_around(self.face + place) for place in self.seen()])
+        return FaceBoxes(boxes, torch.ones(len(boxes)))
+
+
+def test_two_who_change_places_stay_apart(face: Tensor) -> None:
+    stage = Stage(face, [(200, 120, 90), (70, 90, 180)])
+    for followed in (0, 1):  # the one in front, and the one behind
+        tracker = LandmarkTracker(stage.find, detector=stage.detect, face=followed)
+        for t in range(31):
+            places = ((100 + 6.0 * t, 100.0), (300 - 6.0 * t, 100.0))
+            found = tracker.step(stage.frame(*places))
+            if found.found:  # never the other one
+                assert float((found.landmarks - face - torch.tensor(places[followed])).norm(dim=1).max()) < 1, t
+            hidden = followed == 1 and abs(places[0][0] - places[1][0]) <= 60
+            assert found.found != hidden, t
+
+
+def test_a_face_that_was_hidden_or_went_is_noticed_and_found_again(face: Tensor) -> None:
+    stage = Stage(face, [(200, 120, 90)])
+    tracker = LandmarkTracker(stage.find, detector=stage.detect)
+    assert tracker.step(stage.frame((100.0, 100.0))).found
+    stage.frame((500.0, 100.0))  # behind the edge
+    gone = torch.full((3, 200, 400), 90, dtype=torch.uint8)
+    assert not any(tracker.step(gone).found for _ in range(5))
+    back = [tracker.step(stage.frame((300.0, 100.0))).found for _ in range(10)]
+    assert back[-1]  # elsewhere, within ten frames
+    assert tracker.step(stage.frame((306.0, 100.0))).found
+
+
+def test_a_resumed_tracker_does_as_one_that_went_on(face: Tensor) -> None:
+    stage = Stage(face, [(200, 120, 90)])
+
+    def high(image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks:
+        found = stage.find(image, box, tilt)  # five hundredths of the box's side above where the box says the face is
+        middle = (box[:2] + box[2:] / 2) * torch.tensor([0.1, 0.1]) + 0.9 * found.landmarks.mean(0)
+        return replace(found, landmarks=face + middle - torch.tensor([0.0, 0.05]) * box[2])
+
+    frames = [stage.frame((100 + 3.0 * t, 100.0)) for t in range(8)]
+    one, other = (LandmarkTracker(high, detector=stage.detect) for _ in range(2))
+    last = None
+    for t, frame in enumerate(frames):
+        stage.frame((100 + 3.0 * t, 100.0))
+        kept = one.step(frame)
+        if t == 4:
+            memory = other.memory
+            assert last is not None
+            other = LandmarkTracker(high, detector=stage.detect)
+            other.resume(last.landmarks, last.confidence, memory)
+        last = other.step(frame)
+        assert torch.equal(kept.landmarks, last.landmarks)
+
+
 def test_a_finder_that_breaks_the_protocol_is_named(face: Tensor) -> None:
     frames = torch.zeros(2, 200, 200, dtype=torch.uint8)
     good = Knowing(face + 100)(frames[0], box_around(face + 100))

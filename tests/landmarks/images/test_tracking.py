@@ -165,6 +165,37 @@ def test_after_a_cut_the_face_is_found_elsewhere(trees: LandmarkTrees, film: tup
     assert errors(track.values[-1:], mapped(truth[:1], maps[1])).mean() < 0.04
 
 
+def test_a_turned_face_is_found_at_once(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
+    frames, truth = film
+    for quarters in (1, 2, 3):
+        turned, points = frames[:2].rot90(quarters, (-2, -1)), truth[:2]
+        for _ in range(quarters):
+            points = torch.stack([points[..., 1], SIZE - 1 - points[..., 0]], -1)
+        track = track_landmarks(turned, LandmarkTracker(trees))
+        assert errors(track.values, points).mean() < 0.04
+    assert (
+        errors(
+            find_landmarks(frames[0].rot90(1, (-2, -1)), trees).landmarks[None],
+            torch.stack([truth[:1, :, 1], SIZE - 1 - truth[:1, :, 0]], -1),
+        ).mean()
+        < 0.04
+    )
+
+
+def test_what_is_black_is_hidden(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
+    frames, truth = film
+    seen = LandmarkTracker(trees).step(frames[0])
+    assert (seen.visibility[17:] == 1).all()
+    half = frames[0].clone()
+    half[..., : int(truth[0, 27:31, 0].mean())] = 0
+    tracker = LandmarkTracker(trees)
+    tracker.step(frames[0])
+    found = tracker.step(half)
+    hidden = torch.tensor([36, 37, 41, 40, 48, 18, 19])
+    assert not found.found or bool((found.visibility[hidden] < 0.5).all())
+    assert not found.found or bool((found.confidence[hidden] < 0.3).all())
+
+
 def test_a_resumed_tracker_goes_on_near_where_it_was(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:
     frames, _ = film
     video, _ = side_by_side(frames[:6], (0.9, 1.2))

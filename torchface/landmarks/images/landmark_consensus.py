@@ -155,7 +155,9 @@ def _starts(mean: Tensor, middle: Tensor, settings: ConsensusSettings, tilt: flo
     square = torch.cat([middle - side / 2, middle.new_tensor([side, side])])[None]
     shape = initial_shapes(mean, square)[0]
     centre = shape.mean(0)
-    return centre + (shape - centre) @ rotation.transpose(1, 2) + (settings.translation * side * drawn[:, :2])[:, None]
+    turn = shape.new_tensor([[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]])
+    shape, centre = shape - centre, middle + turn @ (centre - middle)  # the face turns about the middle of its box
+    return centre + shape @ rotation.transpose(1, 2) + (settings.translation * side * drawn[:, :2])[:, None]
 
 
 def _mirrored(shapes: Tensor, last: int) -> Tensor:

@@ -15,6 +15,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.face_box import (
+    FaceBoxes,
     FaceDetector,
     HaarDetector,
     check_image,
@@ -23,12 +24,18 @@ from torchface.landmarks.images.face_box import (
     grey_pixels,
     overlaps,
 )
+from torchface.landmarks.images.face_signature import LOOK_SIZE, face_signature, updated_signature
 from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around
 from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, LandmarkFinder, find_in_box
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.turned_search import find_faces_of_any_turn, find_turned_faces
 from torchface.progress import Progress, silent
 from torchface.take import Track
+
+_NEAR, _STILL, _OTHER = 0.75, 0.5, 0.3
+_MOST_OTHERS = 4
+_LEARNED = 0.1  # of how a face looks now that is taken up by what is known of its look
 
 LANDMARK_NAMES = tuple(str(number) for number in range(COUNT))
 """The channels of a track of landmarks: iBUG's numbers from 0."""
@@ -46,15 +53,22 @@ class TrackingSettings:
         checks: how often in a row it must see none.
         patience: frames for which a lost face is waited for at its place before another is taken.
         smallest: side of a box, pixels, under which a face is lost.
+        turned: frames in a row without a face after which turned faces are looked for again; the first is such a frame.
+        alike: correlation of a face's look with how it looked before, under which it is another's where there are
+            several.
+        closer: how much more another face must look as this one did to be taken for it.
     """
 
     sure: float = 0.9
     doubtful: float = 0.1
     vague: float = 0.44
-    check: int = 15
+    check: int = 16
     checks: int = 3
     patience: int = 10
     smallest: float = 12.0
+    turned: int = 4
+    alike: float = 0.6
+    closer: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,26 +148,28 @@ class LandmarkTracker:
     def reset(self) -> None:
         """Forgets the face, as before the first frame."""
         self._last = TrackedFace.lost()
-        self._place: Tensor | None = None
+        self._place: Tensor | None = None  # the upright box (4,) of the face, and its tilt: (5,)
         self._anchor: Tensor | None = None
+        self._look: Tensor | None = None
+        self._crowded = False
         self._missed = self._frames = self._unseen = 0
 
     @property
     def memory(self) -> Tensor:
-        """What the next frame needs beside the last one's landmarks and confidence, (10,) float64; NaN for unknown."""
-        place, anchor = (
-            torch.full((count,), torch.nan) if one is None else one.cpu()
-            for one, count in ((self._place, 4), (self._anchor, 3))
-        )
-        counts = torch.tensor([self._missed, self._frames, self._unseen], dtype=torch.float64)
-        return torch.cat([place.double(), anchor.double(), counts])
+        """What the next frame needs beside the last landmarks and confidence, (1212,) float64; NaN for unknown."""
+        unknown = torch.full((LOOK_SIZE,), torch.nan)
+        place = unknown[:5] if self._place is None else self._place.cpu()
+        anchor = unknown[:3] if self._anchor is None else self._anchor.cpu()
+        look = unknown if self._look is None else self._look.cpu()
+        counts = torch.tensor([self._missed, self._frames, self._unseen, int(self._crowded)], dtype=torch.float64)
+        return torch.cat([place.double(), anchor.double(), look.double(), counts])
 
     def resume(self, landmarks: Tensor, confidence: Tensor, memory: Tensor | None = None) -> None:
         """Goes on after a frame with these landmarks (68,2) and confidence (68,): the face near there is meant.
 
         Args:
             landmarks, confidence: of that frame.
-            memory: the tracker's after that frame, (10,); with it all goes on as if it had never stopped.
+            memory: the tracker's after that frame, (1212,); with it all goes on as if it had never stopped.
         """
         if landmarks.shape != (COUNT, 2) or confidence.shape != (COUNT,):
             raise ShapeError(
@@ -163,14 +179,16 @@ class LandmarkTracker:
         self.reset()
         if bool(torch.isfinite(landmarks).all()):
             self._last = TrackedFace(landmarks.float(), box_around(landmarks.float()), confidence.float())
-            self._place = self._last.box
+            self._place = _placed(self._last.landmarks)
         if memory is not None:
-            if memory.shape != (10,):
-                raise ShapeError(f"resume: found a memory of {tuple(memory.shape)}, expected (10,)")
-            place, anchor, counts = memory.float().split([4, 3, 3])
-            self._place = place if bool(torch.isfinite(place).all()) else None
-            self._anchor = anchor if bool(torch.isfinite(anchor).all()) else None
-            self._missed, self._frames, self._unseen = (int(count) for count in counts.nan_to_num(0.0))
+            if memory.shape != (LOOK_SIZE + 12,):
+                raise ShapeError(f"resume: found a memory of {tuple(memory.shape)}, expected ({LOOK_SIZE + 12},)")
+            parts = memory.float().split([5, 3, LOOK_SIZE, 4])
+            self._place, self._anchor, self._look = (
+                one if bool(torch.isfinite(one).all()) else None for one in parts[:3]
+            )
+            counts = [int(count) for count in parts[3].nan_to_num(0.0)]
+            self._missed, self._frames, self._unseen, self._crowded = *counts[:3], counts[3] > 0
 
     def step(self, frame: Tensor) -> TrackedFace:
         """The face in the next frame.
@@ -183,7 +201,9 @@ class LandmarkTracker:
             ValueRangeError: a finder that gives landmarks that are not finite.
         """
         check_image(frame)
-        seen = self._follow(frame) if self._last.found and self._anchor is not None else None
+        self._frames += 1
+        followed = self._follow(frame) if self._last.found and self._anchor is not None else None
+        seen = None if followed is None else self._same_person(frame, followed)
         if seen is None:
             seen = self._search(frame)
         if seen is None and self._last.found and self._anchor is None:  # resumed, and no face to the detector
@@ -193,18 +213,53 @@ class LandmarkTracker:
             self._last, self._anchor = TrackedFace.lost(), None
             return self._last
         self._missed = 0
-        self._frames += 1
         self._last = _refined_face(seen.found, frame, self.appearance)
-        self._place = self._last.box
-        if self._anchor is None:
-            tilt = tilt_around(self._last.landmarks)
-            self._anchor = _relation(_upright_box(self._last.landmarks), seen.box, tilt)
+        self._place = _placed(self._last.landmarks)
+        if seen is not followed:
+            self._anchor = _relation(self._place[:4], seen.box, self._place[4])
+        look = face_signature(frame, self._last.landmarks)
+        if self._look is None or not self._crowded or float(self._look @ look) >= self.settings.alike:
+            self._look = updated_signature(self._look, look, _LEARNED)
         return self._last
+
+    def _likeness(self, frame: Tensor, seen: _Seen) -> float:
+        """How much a face looks like the one that is followed; 1 where nothing is known of that."""
+        return 1.0 if self._look is None else float(self._look @ face_signature(frame, seen.found.landmarks))
+
+    def _same_person(self, frame: Tensor, seen: _Seen) -> _Seen | None:
+        """What was followed, if it still looks as it did or nobody else is about; else another face near that does;
+        None where none does: it is hidden behind somebody."""
+        alike = self._likeness(frame, seen)
+        if alike >= self.settings.alike or not self._crowded:
+            return seen
+        best = self._most_alike(frame, find_faces(frame, self.detector))
+        return best if best is not None and self._likeness(frame, best) >= alike + self.settings.closer else None
+
+    def _most_alike(self, frame: Tensor, faces: FaceBoxes) -> _Seen | None:
+        """Of the faces about where the person was the one that looks most like it, if any looks like it at all."""
+        seen = [self._looked_at(frame, faces, number) for number in self._near(faces.boxes)]
+        alike = [(self._likeness(frame, one), one) for one in seen if one is not None]
+        best = max(alike, key=lambda pair: pair[0], default=(-1.0, None))
+        return best[1] if best[0] >= self.settings.alike else None
+
+    def _looked_at(self, frame: Tensor, faces: FaceBoxes, number: int) -> _Seen | None:
+        """Landmarks of one of the detector's faces, if it is one."""
+        seen = _settled(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
+        there = self._plausible(box_around(seen.found.landmarks), frame)
+        return seen if there and seen.found.presence >= self.settings.doubtful else None
+
+    def _note_others(self, frame: Tensor, faces: FaceBoxes, box: Tensor) -> None:
+        """Notes whether somebody else than the face in a box (4,) is about, who might be taken for it."""
+        if self._crowded or len(faces) < 2:
+            return
+        apart = (overlaps(faces.boxes, box[None])[:, 0] < _OTHER).nonzero()[:_MOST_OTHERS, 0].tolist()
+        others = [find_in_box(self.finder, frame, faces.boxes[i], float(faces.tilts[i])) for i in apart]
+        self._crowded = any(one.presence >= self.settings.sure for one in others)
 
     def _follow(self, frame: Tensor) -> _Seen | None:
         """The face from where it was a frame ago; None where it is not there."""
         before, tilt = _upright_box(self._last.landmarks), tilt_around(self._last.landmarks)
-        box = self._anchored(before, tilt)
+        box = self._sought(before, tilt)
         if not self._plausible(box, frame):
             return None
         seen = find_in_box(self.finder, frame, box, float(tilt))
@@ -213,10 +268,10 @@ class LandmarkTracker:
             return None
         if float(overlaps(before[None], moved[None])) < 0.75:  # it moved far: once more from where it is now
             tilt = tilt_around(seen.landmarks)
-            box = self._anchored(moved, tilt)
+            box = self._sought(moved, tilt)
             seen = find_in_box(self.finder, frame, box, float(tilt))
         settings = self.settings
-        if seen.presence >= settings.sure and (self._frames + 1) % settings.check:
+        if seen.presence >= settings.sure and self._frames % settings.check:
             return _Seen(seen, box)
         if self._confirmed(frame, box_around(seen.landmarks)):
             self._unseen = 0
@@ -237,42 +292,77 @@ class LandmarkTracker:
         detector = HaarDetector(smallest=0.33, step=1.1) if isinstance(self.detector, HaarDetector) else self.detector
         faces = find_faces(piece, detector)
         corner = box.new_tensor([left, top, 0, 0])
-        return len(faces) > 0 and bool((overlaps(faces.boxes + corner, box[None]) > 0.4).any())
+        faces = FaceBoxes(faces.boxes + corner, faces.scores, faces.tilts)
+        self._note_others(frame, faces, box)
+        return len(faces) > 0 and bool((overlaps(faces.boxes, box[None]) > 0.4).any())
 
     def _search(self, frame: Tensor) -> _Seen | None:
         """The face wherever it is now; None where it is nowhere."""
-        faces = find_faces(frame, self.detector)
-        number = self._choose(faces.boxes)
-        if number is None:
-            return None
-        self._anchor = None
-        seen = _settled(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
-        if not self._plausible(box_around(seen.found.landmarks), frame):
-            return None
-        self._unseen = 0
-        return seen if seen.found.presence >= self.settings.doubtful else None
+        seen = self._chosen(frame, find_faces(frame, self.detector))
+        if seen is None and self._place is not None and 0 < self._missed < self.settings.patience:
+            seen = self._still_there(frame, self._place)
+        if self._missed % self.settings.turned == 0 and not self._is_clear(seen):
+            turned = self._chosen(frame, find_turned_faces(frame, self.detector))
+            seen = turned if turned is not None and self._is_clearer(turned, seen) else seen
+        if seen is not None:
+            self._unseen = 0
+        return seen
 
-    def _anchored(self, box: Tensor, tilt: Tensor) -> Tensor:
+    def _is_clear(self, seen: _Seen | None) -> bool:
+        """Whether a face is one beyond doubt."""
+        sure = seen is not None and seen.found.presence >= self.settings.sure
+        return sure and seen is not None and float(seen.found.confidence.mean()) >= self.settings.vague
+
+    def _is_clearer(self, seen: _Seen, other: _Seen | None) -> bool:
+        """Whether a face that was found turned is one, rather than what was found upright."""
+        confidence = float(seen.found.confidence.mean())
+        better = other is None or confidence > float(other.found.confidence.mean())
+        return seen.found.presence >= self.settings.sure and better
+
+    def _chosen(self, frame: Tensor, faces: FaceBoxes) -> _Seen | None:
+        """The one of these faces that is meant, if it is one."""
+        near = self._near(faces.boxes)
+        if near and self._crowded:
+            return self._most_alike(frame, faces)
+        waits = self._place is not None and self._missed < self.settings.patience
+        if not near and (waits or self.face >= len(faces)):
+            return None
+        number = near[0] if near else self.face
+        seen = self._looked_at(frame, faces, number)
+        if seen is not None:
+            self._look = self._look if near else None  # a face elsewhere may be anybody's
+            self._note_others(frame, faces, faces.boxes[number])
+        return seen
+
+    def _still_there(self, frame: Tensor, place: Tensor) -> _Seen | None:
+        """The face where it was lost (5,), though the detector sees none: turned or half hidden."""
+        box = place[:4]
+        seen = _settled(self.finder, frame, box, float(place[4]))
+        moved = _upright_box(seen.found.landmarks)
+        if seen.found.presence < self.settings.sure or not self._plausible(moved, frame):
+            return None
+        near = float(overlaps(box[None], moved[None])) > _STILL
+        return seen if near and self._likeness(frame, seen) >= self.settings.alike else None
+
+    def _sought(self, box: Tensor, tilt: Tensor) -> Tensor:
         """Where a face with this box (4,) and tilt is looked for."""
-        if self._anchor is None:
+        anchor = self._anchor
+        if anchor is None:
             return box
-        side = box[2] * self._anchor[2]
-        middle = box[:2] + box[2:] / 2 + box[2] * (_turn(tilt) @ self._anchor[:2])
+        side = box[2] * anchor[2]
+        middle = box[:2] + box[2:] / 2 + box[2] * (_turn(tilt) @ anchor[:2])
         return torch.cat([middle - side / 2, side.expand(2)])
 
-    def _choose(self, boxes: Tensor) -> int | None:
-        """Which of the faces (F,4), the largest first, is the one that was tracked; the one asked for at the start."""
-        if self._place is not None and len(boxes):
-            middle = boxes[:, :2] + boxes[:, 2:] / 2
-            distance = (middle - self._place[:2] - self._place[2:] / 2).norm(dim=1) / self._place[2]
-            ratio = boxes[:, 2] / self._place[2]
-            distance = torch.where((ratio > 0.6) & (ratio < 1.6), distance, torch.inf)
-            nearest = int(distance.argmin())
-            if float(distance[nearest]) < 0.75:
-                return nearest
-            if self._missed < self.settings.patience:
-                return None
-        return self.face if self.face < len(boxes) else None
+    def _near(self, boxes: Tensor) -> list[int]:
+        """Which of the boxes (F,4) lie about where the face was last, and are about of its size, the nearest first."""
+        if self._place is None or not len(boxes):
+            return []
+        place = self._place
+        middle = boxes[:, :2] + boxes[:, 2:] / 2
+        distance = (middle - place[:2] - place[2:4] / 2).norm(dim=1) / place[2]
+        ratio = boxes[:, 2] / place[2]
+        near = (distance < _NEAR) & (ratio > 0.6) & (ratio < 1.6)
+        return [i for i in distance.argsort(stable=True).tolist() if near[i]]
 
     def _plausible(self, box: Tensor, frame: Tensor) -> bool:
         """Whether a box is a size that a face can have, and its middle in the image."""
@@ -351,7 +441,7 @@ def find_landmarks(
         ValueRangeError: trees that find other landmarks than the 68, or a finder that gives some that are not finite.
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
-    faces = find_some_faces(image, face, detector)
+    faces = find_some_faces(image, face, detector or find_faces_of_any_turn)
     seen = _settled(finder, image, faces.boxes[face], float(faces.tilts[face]))
     return _refined_face(seen.found, image, appearance)
 
@@ -376,6 +466,11 @@ def _settled(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float) ->
     if float(overlaps(box[None], again[None])) < 0.25 or not float(again[2]) >= 1:
         return _Seen(first, box)
     return _Seen(find_in_box(finder, image, again, float(tilt_around(first.landmarks))), again)
+
+
+def _placed(landmarks: Tensor) -> Tensor:
+    """Where a face is: its upright box and its tilt, (5,)."""
+    return torch.cat([_upright_box(landmarks), tilt_around(landmarks)[None]])
 
 
 def _upright_box(landmarks: Tensor) -> Tensor:

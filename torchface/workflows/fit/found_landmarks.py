@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.landmarks import NoFaceError, TrackedFace, find_faces, find_landmarks
+from torchface.landmarks import NoFaceError, TrackedFace, find_landmarks
+from torchface.landmarks.images.turned_search import find_faces_of_any_turn
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
 
 UNSURE = 0.2
@@ -97,7 +98,7 @@ def find_in_photographs(
     found = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size
         pixels = (image[:3].clamp(0, 1) * 255).round().to(torch.uint8)
-        faces = find_faces(pixels)
+        faces = find_faces_of_any_turn(pixels)
         try:
             seen = find_landmarks(pixels, finder, face or 0, lambda _, faces=faces: faces)  # type: ignore[misc]
         except NoFaceError as error:

@@ -21,7 +21,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/4"
+_METHOD = "tracked frames/5"
 _LANDMARKS = 68
 _MAX_PIECE_BYTES = 2**28
 
