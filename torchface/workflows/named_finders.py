@@ -59,7 +59,7 @@ def load_finder(
         return NamedFinder(network_finder(model, str(name_or_path), photographs), zoo.find(name_or_path))
     if not isinstance(model, LandmarkTrees):
         raise NameMismatchError(
-            f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkNetwork or LandmarkTrees"
+            f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees or LandmarkNetwork"
         )
     starts = PHOTOGRAPH if photographs else ConsensusSettings()
     try:
