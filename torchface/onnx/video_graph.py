@@ -20,7 +20,7 @@ from torchface.capture.video.solver_components import (
     TRANSLATION_STEP,
 )
 from torchface.capture.video.video_solver import VideoSolver
-from torchface.capture.video.weight_walk import faded, unseen_time, walk_information
+from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.onnx.gauss_newton_step import GaussNewtonStep
 from torchface.onnx.unrolled_operators import symmetric_inverse
@@ -135,7 +135,8 @@ class VideoGraph(nn.Module):
         window = state["weights"][None] if self.dynamics is None else state["window"]
         weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
         head = HeadState(weights[None], rotation[None], translation[None])
-        told = torch.where(enough, (~unseen).double() * confidence.double().clamp(0, 1), 0.0)[None] @ self.tells
+        counts = torch.where(enough, (~unseen).double() * confidence.double(), 0.0)[None]
+        told = relative_trust(counts) @ self.tells
         interval = self.settings.interval
         before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(told)
         hidden = unseen_time(before, told, interval)

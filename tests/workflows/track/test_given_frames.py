@@ -53,7 +53,7 @@ def test_a_table_is_solved_without_a_video(take: tuple[Path, Path, Tensor], tmp_
     found = tracked.solution.weights[:, load_rig(rig).names.index("jawOpen")]
     assert float((found - jaw).abs().max()) < 0.15
     assert tracked.video.fps == 25.0
-    assert set(tracked.products) == {"weights", "live link", "landmarks", "animation"}  # no overlay
+    assert set(tracked.products) == {"weights", "confidence", "live link", "landmarks", "animation"}  # no overlay
     again = load_landmark_table(tmp_path / "out" / "landmarks.csv")
     torch.testing.assert_close(again.points, load_landmark_table(table).points)
     assert (again.presence == 1).all()

@@ -15,6 +15,7 @@ from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, Recipr
 from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
 from torchface.capture.video.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.video.video_settings import VideoSettings
+from torchface.capture.video.weight_walk import relative_trust
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig
@@ -28,7 +29,7 @@ INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
 """Standard deviations of a weight before anything is seen, and of its steps until the dynamics window is full."""
 
 # Lids close in a tenth of a second; nothing else in a face is as quick.
-_LIDS, _LID_MOTION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 6.0
+_LIDS, _LID_MOTION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 2.0
 
 _POINTS = ("rest", "basis", "rows", "valid", "side")
 _PRIORS: dict[str, type[ShapePrior]] = {"shape_prior": ShapePrior, "reciprocal_prior": ReciprocalPrior}
@@ -144,12 +145,13 @@ class VideoSolverParts(nn.Module):
         return made
 
     def shape_confidence(self, trust: Tensor) -> Tensor:
-        """How much of what could tell of each shape is seen, (B,N) in [0,1], where landmarks count as (B,68).
+        """How much of what could tell of each shape is seen, (B,N) in [0,1], where landmarks count as (B,68) beside
+        their frame's surest.
 
         What a landmark could tell of a shape is how far the shape moves it, squared.
         """
         tells = self.basis[:LANDMARKS].square().sum(1).to(trust) * self.landmark_weights.to(trust)[:, None]
-        return (trust.clamp(0, 1) @ tells) / tells.sum(0).clamp(min=_LEAST_TOLD)
+        return (relative_trust(trust) @ tells) / tells.sum(0).clamp(min=_LEAST_TOLD)
 
     @property
     def config(self) -> dict[str, Any]:

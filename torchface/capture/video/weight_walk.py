@@ -13,6 +13,13 @@ HIDDEN = 0.25
 """Share of what could tell of a shape, under which it counts as hidden."""
 # Of the random walk's variance: a shape that nothing tells of is not led off by what others do.
 _LEAST_SHARE = 0.02
+_LEAST_TRUST = 0.05
+
+
+def relative_trust(trust: Tensor) -> Tensor:
+    """How much landmarks count, (B,68) in [0,1], beside their frame's surest: a blurred face hides nothing."""
+    trust = trust.clamp(0, 1)
+    return trust / trust.amax(1, keepdim=True).clamp(min=_LEAST_TRUST)
 
 
 def unseen_time(before: Tensor | None, told: Tensor, interval: float) -> Tensor:
@@ -40,7 +47,7 @@ def walk_information(variance: Tensor, told: Tensor, interval: float) -> Tensor:
         told: how much of what could tell of each shape is seen, (B,N) in [0,1].
         interval: seconds since the frame before.
     """
-    return 1 / (variance * interval * told.clamp(min=_LEAST_SHARE))
+    return 1 / (variance * interval * (told / HIDDEN).clamp(_LEAST_SHARE, 1.0))
 
 
 def frame_intervals(seconds: Tensor | None, count: int, interval: float) -> list[float]:

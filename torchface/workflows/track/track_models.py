@@ -29,6 +29,8 @@ NO_PRIOR = "none"
 # What people do with their eyes has little to do with what a prior's few takes did with theirs. So wide, it neither
 # shuts nor opens lids.
 _LIDS, _LID_DEVIATION = re.compile(r"eye_?(blink|wide|squint)", re.IGNORECASE), 0.5
+# People combine shapes in ways that the synthetic takes of the prior by default never showed.
+_DEFAULT_DEVIATION = 0.15
 
 _Model = TypeVar("_Model", bound=nn.Module)
 Fitted = TypeVar("Fitted")
@@ -112,11 +114,12 @@ def load_priors(
     prior = None if prior == NO_PRIOR else prior
     if prior == DEFAULT_PRIOR and not _knows(zoo.get_model(DEFAULT_PRIOR), rig):
         prior = None
+    spread = _DEFAULT_DEVIATION if prior == DEFAULT_PRIOR else 0.0
     shapes = None if prior is None else _read("--prior", prior, ShapePrior)
     motion = None if dynamics is None else _read("--dynamics", dynamics, DynamicsPrior)
     silent = {name for model in (shapes, motion) if model is not None for name in unlearned(model.names, rig.names)}
     return FittedPriors(
-        None if shapes is None else _fitted(prior, lambda: _with_free_lids(shapes.renamed(rig.names))),
+        None if shapes is None else _fitted(prior, lambda: _widened(shapes.renamed(rig.names), spread)),
         None if motion is None else _fitted(dynamics, lambda: adapt_dynamics(motion, rig.names, fps)),
         tuple(name for name in rig.names if name in silent),
     )
@@ -127,9 +130,9 @@ def _knows(learned: nn.Module, rig: BlendshapeRig) -> bool:
     return isinstance(learned, ShapePrior) and 2 * len(unlearned(learned.names, rig.names)) <= len(rig.names)
 
 
-def _with_free_lids(prior: ShapePrior) -> ShapePrior:
-    """A prior that neither shuts nor opens lids."""
-    deviations = [_LID_DEVIATION if _LIDS.match(name) else 0.0 for name in prior.names]
+def _widened(prior: ShapePrior, deviation: float) -> ShapePrior:
+    """A prior wider by a deviation of each weight, and so wide for lids that it neither shuts nor opens them."""
+    deviations = [_LID_DEVIATION if _LIDS.match(name) else deviation for name in prior.names]
     return prior.widened(torch.tensor(deviations).square())
 
 
