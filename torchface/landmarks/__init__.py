@@ -1,6 +1,8 @@
 """Landmarks on faces: in images, and on scans unwrapped into UV space."""
 
 from torchface.landmarks.images.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
+from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.box_training import BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.face_box import (
     FaceBoxes,
     HaarDetector,
@@ -14,6 +16,7 @@ from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkF
 from torchface.landmarks.images.landmark_measures import Agreement, agreement, find_blinks, lid_openings, mouth_gap
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.network_detector import NetworkDetector
 from torchface.landmarks.images.network_training import NetworkSettings
 from torchface.landmarks.images.tracking import (
     LandmarkTracker,
@@ -42,6 +45,8 @@ __all__ = [
     "AppearanceModel",
     "AppearanceSettings",
     "AutomaticLandmarks",
+    "BoxNetwork",
+    "BoxTrainingSettings",
     "Contour",
     "CylinderLayout",
     "DetectorSettings",
@@ -49,11 +54,13 @@ __all__ = [
     "FaceFrame",
     "FoundLandmarks",
     "HaarDetector",
+    "LabelledPicture",
     "LandmarkFinder",
     "LandmarkNetwork",
     "LandmarkPairs",
     "LandmarkTracker",
     "LandmarkTrees",
+    "NetworkDetector",
     "NetworkLandmarks",
     "NetworkSettings",
     "NoFaceError",

@@ -85,6 +85,24 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
     return torch.where(torch.isfinite(box).all(-1, keepdim=True), box, torch.nan)
 
 
+def turned_box(landmarks: Tensor) -> tuple[Tensor, Tensor]:
+    """The box of :func:`box_around` with each face's own tilt, and these tilts.
+
+    Args:
+        landmarks: iBUG's 68, (...,68,2), pixels.
+
+    Returns:
+        x, y, width, height of squares whose middle and side are those of the box in the face's own frame, (...,4); and
+        :func:`tilt_around` the landmarks, (...).
+    """
+    angle = tilt_around(landmarks)
+    across = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    frame = torch.stack([across, torch.stack([-across[..., 1], across[..., 0]], dim=-1)], dim=-1)  # (...,2,2), columns
+    upright = box_around(landmarks @ frame)
+    middle = (frame @ (upright[..., :2] + upright[..., 2:] / 2)[..., None])[..., 0]
+    return torch.cat([middle - upright[..., 2:] / 2, upright[..., 2:]], dim=-1), angle
+
+
 def relative_errors(found: Tensor, truth: Tensor) -> Tensor:
     """The mean distance of each face's landmarks from the truth, over that of the outer corners of its eyes, (B,).
 

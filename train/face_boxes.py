@@ -1,0 +1,153 @@
+"""``python -m train.face_boxes --out models/NAME``: the network that finds faces in whole pictures, at every angle.
+
+Its scenes are put together from rendered people, which are rendered once and kept in ``--pictures``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from torchface import TorchfaceError, zoo
+from torchface.files.whole_files import make_folder
+from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
+from torchface.landmarks.images.face_box import overlaps
+from torchface.progress import Progress, silent
+from torchface.synthetic.stages.face_scenes import CutOuts, SceneSettings, face_scene
+from train.face_pictures import render_pictures
+from train.runner import metric_lines, run
+
+_SAME, _NOTHING = 0.4, 0.3  # overlaps from which a box is the face's, and under which it is none's
+_TEST_SIZE = 320  # pixels a side of the scenes that it is tested on
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        pictures: Folder of rendered people; what is missing is rendered into it.
+        people: Pictures of people that scenes are made of.
+        ict: ICT-FaceKit's FaceXModel, whose heads are four people in five; embedded performers alone without.
+        out: Folder for the model and its card.
+        held_out: Share of the pictures that no scene it learns from shows.
+        tested: Scenes of those that are held out.
+        seed: Draws people, scenes and the first weights.
+        workers: Processes that render, and that put scenes together; 0 for this one alone.
+        scenes: What is in them.
+        training: How it learns.
+    """
+
+    pictures: Path = Path("out/face_pictures")
+    people: int = 9600
+    ict: Path | None = None
+    out: Path = Path("models/face_boxes")
+    held_out: float = 0.1
+    tested: int = 200
+    seed: int = 1
+    workers: int = 0
+    scenes: SceneSettings = field(default_factory=SceneSettings)
+    training: BoxTrainingSettings = field(default_factory=BoxTrainingSettings)
+
+
+def train(settings: Settings, progress: Progress | None = None) -> tuple[BoxNetwork, dict[str, float]]:
+    """Renders, learns, tests and saves; the network, and what was measured on people held out.
+
+    A checkpoint is kept in ``out`` until the model is saved: a run that was killed goes on from there.
+
+    Raises:
+        TorchfaceError: too few people, or a file that cannot be used.
+    """
+    progress = progress or silent
+    if not (0 < settings.held_out < 1 and settings.tested > 0):
+        raise TorchfaceError(
+            f"found held_out {settings.held_out}, tested {settings.tested}; expected a share in (0,1), and 1 at least"
+        )
+    rendered = render_pictures(
+        settings.pictures, settings.people, settings.seed, settings.ict, max(1, settings.workers), progress
+    )
+    split = round(len(rendered) * (1 - settings.held_out))
+    people = CutOuts(rendered.rgba[:split], rendered.landmarks[:split])
+    others = CutOuts(rendered.rgba[split:], rendered.landmarks[split:])
+    progress(f"{len(people)} pictures of people to learn from, {len(others)} to test on")
+    make_folder(settings.out)
+    checkpoint = settings.out / "checkpoint.safetensors"
+    model = BoxNetwork.fit(
+        partial(_scene, people, settings.scenes, settings.seed),
+        settings.training,
+        progress,
+        checkpoint,
+        settings.seed,
+        settings.workers,
+        {"scenes": settings.scenes, "people": len(people), "ict": settings.ict is not None},
+    )
+    measured = evaluate(model, others, settings.tested, settings.seed, progress)
+    _save(model, settings, measured, len(people))
+    checkpoint.unlink(missing_ok=True)
+    return model, measured
+
+
+def evaluate(
+    model: BoxNetwork, people: CutOuts, count: int, seed: int, progress: Progress | None = None
+) -> dict[str, float]:
+    """What is found in scenes of these people: faces, boxes where there is none, how well they fit."""
+    progress, detector = progress or silent, NetworkDetector(model)
+    settings = SceneSettings(size=_TEST_SIZE, smallest=24.0, largest=0.7 * _TEST_SIZE)
+    faces = found = wrong = 0
+    fits, angles = [], []
+    for number in range(count):  # pictures have different numbers of faces
+        scene = face_scene(people, number, settings, seed + 1_000_000)
+        seen = detector(scene.image)
+        side = scene.faces[:, 2:3]
+        truth = torch.cat([scene.faces[:, :2] - side / 2, side, side], 1)
+        shared = overlaps(truth, seen.boxes)
+        wrong += int((shared < _NOTHING).all(0).sum())
+        for row in (~scene.doubtful).nonzero()[:, 0].tolist():
+            faces += 1
+            if len(seen) and float(shared[row].max()) > _SAME:
+                found += 1
+                fits.append(float(shared[row].max()))
+                off = float(seen.tilts[shared[row].argmax()] - scene.faces[row, 3])
+                angles.append(abs(math.degrees(math.remainder(off, 2 * math.pi))))
+        progress("testing", number + 1, count)
+    return {
+        "faces found, %": 100 * found / max(1, faces),
+        "boxes where there is no face, in 100 pictures": 100 * wrong / count,
+        "median overlap of box and truth, %": 100 * float(torch.tensor(fits or [0.0]).median()),
+        "median error of the roll angle, degrees": float(torch.tensor(angles or [180.0]).median()),
+    }
+
+
+def _scene(people: CutOuts, settings: SceneSettings, seed: int, number: int) -> LabelledPicture:
+    return face_scene(people, number, settings, seed)
+
+
+def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], count: int) -> None:
+    effective = {key: value for key, value in asdict(settings).items() if value is not None}
+    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
+    heads = "ICT-FaceKit's heads (MIT) and the embedded performer" if settings.ict else "the embedded performer"
+    flags = f"--people {settings.people} --seed {settings.seed} --training.pictures {settings.training.pictures}"
+    zoo.save_model(
+        model,
+        settings.out,
+        licence="MIT",
+        data=f"Scenes of {count} rendered pictures of {heads}; no person's photograph.",
+        metrics=measured,
+        recipe=f"python -m train.face_boxes {'--ict FaceXModel ' if settings.ict else ''}{flags} "
+        f"--out models/{settings.out.name}",
+        card=(
+            "Faces in whole colour or grey pictures: centre, side, score and roll angle of each. Boxes are those of "
+            "`torchface.landmarks.images.ibug_68.turned_box`. Good for faces from 24 pixels in pictures of 640. Tested "
+            f"on {settings.tested} scenes of {_TEST_SIZE} pixels with people that it had not seen."
+        ),
+        settings=effective,
+        half=[name for name, value in model.state_dict().items() if value.ndim == 4],
+    )
+
+
+if __name__ == "__main__":
+    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained[1], "8.2f"))
