@@ -21,10 +21,10 @@ from torchface.workflows.track.track_video import TrackSettings, track_video
 FRAMES, FPS = 150, 60.0
 WIDTH, HEIGHT = 320, 240
 RUNS = {
-    "no prior": TrackSettings(overlay=False),
-    "shape prior": TrackSettings(overlay=False, prior="shape_prior"),
-    "shape and dynamics": TrackSettings(overlay=False, prior="shape_prior", dynamics="dynamics_prior"),
-    "whole take": TrackSettings(overlay=False, prior="shape_prior", dynamics="dynamics_prior", whole_take=True),
+    "no prior": TrackSettings(overlay="none"),
+    "shape prior": TrackSettings(overlay="none", prior="shape_prior"),
+    "shape and dynamics": TrackSettings(overlay="none", prior="shape_prior", dynamics="dynamics_prior"),
+    "whole take": TrackSettings(overlay="none", prior="shape_prior", dynamics="dynamics_prior", whole_take=True),
 }
 
 

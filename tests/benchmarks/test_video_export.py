@@ -42,7 +42,7 @@ def test_the_graph_gives_the_weights_of_track(
     data: Path, ict_folder: Path, tmp_path: Path, film: str, remembers: bool
 ) -> None:
     priors = PRIORS if remembers else {"prior": PRIORS["prior"]}
-    settings = TrackSettings(**priors, part="face", overlay=False)
+    settings = TrackSettings(**priors, part="face", overlay="none")
     tracked = track_video(data / "video" / film, ict_folder, tmp_path / "take", settings)
     camera, graph = tmp_path / "camera.toml", tmp_path / "solver.onnx"
     save_calibration(tracked.calibration, camera)

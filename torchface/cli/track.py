@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -27,7 +27,7 @@ def track(
     face: int = 0,
     whole_take: bool = False,
     part: str | None = None,
-    overlay: bool = True,
+    overlay: Literal["side", "over", "none"] = "side",
     fps: float | None = None,
     size: str | None = None,
     live: str | None = None,
@@ -60,7 +60,8 @@ def track(
         face: Which of several faces to follow, from 0, the largest first.
         whole_take: Smooth landmarks over all frames, those after each too; with --dynamics the weights as well.
         part: Keep this region of the rig only, such as face.
-        overlay: Draw the face over the video, as overlay.mp4.
+        overlay: overlay.mp4: the rig as opaque clay beside the picture, with what is doubtful tinted; half through over
+            it; or none.
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
         size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
         live: A camera's number, such as 0, or a video file that is played in its own time.

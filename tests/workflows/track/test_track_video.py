@@ -32,6 +32,7 @@ from torchface.synthetic.stages.light_stage import LightStageSettings, render_li
 from torchface.workflows.live.live_track import track_live
 from torchface.workflows.track import track_video as workflow
 from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.track.side_by_side import head_window
 from torchface.workflows.track.track_models import TrackModels, load_track_models
 from torchface.workflows.track.track_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.track_page import write_track_page
@@ -42,7 +43,7 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 FRAMES = 11
 PIECE = 4
-QUICK = TrackSettings(overlay=False)
+QUICK = TrackSettings(overlay="none")
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,8 @@ def test_every_file_tells_the_same(done: Done) -> None:
     depth = marks.extras["columns"]["pose_Tz"]
     torch.testing.assert_close(depth, tracked.solution.translation[:, 2].double(), atol=1e-3, rtol=0)
     drawn = open_video(out / "overlay.mp4")
-    assert (drawn.width, drawn.height) == (160, 120)
+    assert drawn.height == 480
+    assert drawn.width == 2 * head_window(tracked).width
     assert len(list(drawn.frames())) == FRAMES
     told = json.loads((out / "summary.json").read_text())
     assert told["found"] == FRAMES
@@ -172,11 +174,13 @@ def test_every_file_tells_the_same(done: Done) -> None:
 
 def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     page = write_track_page(done.tracked, tmp_path).read_text()
-    for picture in ("frames.png", "error.png", "head.png", "weights1.png"):
+    for picture in ("frames.png", "landmarks.png", "error.png", "head.png", "weights1.png"):
         assert picture in page
         assert (tmp_path / picture).is_file()
     assert "as given, 0.10 px from what it was fitted to" in page
     assert "frames with a face" in page
+    assert '<video src="overlay.mp4"' in page
+    assert "face_landmarks" in page
 
 
 def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
@@ -198,7 +202,7 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
     assert set(again.seconds) == {"steadying"}
     torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
     smooth = track_video(
-        filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay=False, whole_take=True)
+        filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)
     )
     assert set(smooth.seconds) == {"steadying", "weights"}  # landmarks stay
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
@@ -363,7 +367,7 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     wide[..., :160] = frame
     wide[..., 15:105, 170:290] = small
     write_video([wide.round().to(torch.uint8)], tmp_path / "two.avi", 30.0)
-    tracked = track_video(tmp_path / "two.avi", filmed.rig, tmp_path / "out", TrackSettings(face=1, overlay=False))
+    tracked = track_video(tmp_path / "two.avi", filmed.rig, tmp_path / "out", TrackSettings(face=1, overlay="none"))
     assert float(tracked.frames.landmarks[..., 0].min()) > 170
     assert tracked.faces == 2
     told = " ".join(tracked.lines())

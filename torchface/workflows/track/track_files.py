@@ -131,6 +131,7 @@ def summary(tracked: Tracked) -> dict[str, object]:
         "frames": len(tracked.frames),
         "fps": tracked.video.fps,
         "found": int(tracked.seen.sum()),
+        "landmarks_found_by": tracked.finder,
         "jitter_px": tracked.jitter,
         "reprojection_median_px": float(errors.nanmedian()),
         "reprojection_95_px": float(errors.nanquantile(0.95)),

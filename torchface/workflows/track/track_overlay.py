@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -17,14 +17,12 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.images.transparent_images import load_paint
-from torchface.io.video import write_video
-from torchface.progress import Progress, silent
 from torchface.rendering.point_light import vertex_albedo
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, skin_faces
 from torchface.workflows.track.track_result import Tracked
 
-CHUNK = 8
+_CHUNK = 8
 _STRENGTH = 0.6
 _LIGHT_FRAMES = 2
 _EVEN_SKIN = (0.80, 0.62, 0.53)
@@ -32,29 +30,6 @@ _SKIN = (0.62, 0.74, 0.90)
 _FOUND, _SOLVED = (60, 230, 60), (250, 70, 60)
 _MAX_SIDE = 480
 _SUBPIXEL = 4  # binary digits of OpenCV's drawing coordinates
-
-
-def write_overlay(tracked: Tracked, path: Path, texture: Path | None, progress: Progress | None = None) -> None:
-    """Writes the overlay of a whole video; it appears when it is complete.
-
-    Args:
-        tracked: what was solved.
-        path: of the video to write.
-        texture: an image to put on the face; without, the mesh is shown and the landmarks on it.
-        progress: called with each step and how far it is.
-    """
-    progress = progress or silent
-    draw = mesh_drawer(tracked) if texture is None else paint_drawer(tracked, texture)
-
-    def drawn() -> Iterator[Tensor]:
-        at = 0
-        for chunk in tracked.video.color_chunks(CHUNK):
-            for frame in chunk[: len(tracked.frames) - at]:  # each frame has a surface of its own
-                yield draw(at, frame)[None]
-                at += 1
-                progress("drawing the overlay", at, len(tracked.frames))
-
-    write_video(drawn(), path, tracked.video.fps)
 
 
 def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
@@ -111,7 +86,7 @@ def video_light(tracked: Tracked) -> PointLight:
     rig, found = tracked.rig, tracked.seen.nonzero()[:, 0]
     wanted = found[torch.linspace(0, len(found) - 1, min(_LIGHT_FRAMES, len(found))).round().long()].tolist()
     frames, at = [], 0
-    for chunk in tracked.video.color_chunks(CHUNK):
+    for chunk in tracked.video.color_chunks(_CHUNK):
         frames += [chunk[t - at] for t in wanted if at <= t < at + len(chunk)]
         at += len(chunk)
         if len(frames) == len(wanted):

@@ -10,10 +10,12 @@ from torch import Tensor
 
 from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
+from torchface.shown_text import as_markup
 from torchface.viz.figures.curves import error_curve, weight_curves
 from torchface.viz.figures.helmet_motion import motion_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
 from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.track.side_by_side import side_by_side_drawer
 from torchface.workflows.track.track_overlay import camera_at, mesh_drawer, paint_drawer
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 
@@ -41,8 +43,16 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
         Section("Figures", tables=[Table(("figure", "value"), figures(tracked))]),
         Section(
             "Frames",
-            "The solved face over the video; found landmarks are green, those of the solved rig red.",
-            figures=[("frames.png", frames_sheet(tracked, mesh_drawer(tracked)))],
+            "The picture and, beside it, the solved rig in the same pose; landmarks are green, doubtful ones and what "
+            "of the rig lies there orange.",
+            [_doubtful(tracked)],
+            [("frames.png", frames_sheet(tracked, side_by_side_drawer(tracked), cut=False))],
+            _player(tracked),
+        ),
+        Section(
+            "Landmarks over the picture",
+            "The solved face half through over the video; found landmarks are green, those of the solved rig red.",
+            figures=[("landmarks.png", frames_sheet(tracked, mesh_drawer(tracked)))],
         ),
         Section(
             "Reprojection error",
@@ -54,7 +64,7 @@ def write_track_page(tracked: Tracked, out: Path, texture: Path | None = None) -
     if texture is not None:
         painted = ("painted.png", frames_sheet(tracked, paint_drawer(tracked, texture)))
         text = f"{texture.name} on the face, in the light of the video."
-        sections.insert(3, Section("Texture", text, figures=[painted]))
+        sections.insert(4, Section("Texture", text, figures=[painted]))
     angles = torch.rad2deg(head_angles(solution.rotation.detach().double()))
     moved = solution.translation.detach().double()
     still = moved - moved.mean(0)
@@ -84,6 +94,7 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
     weights = tracked.solution.weights.detach()
     rows = [
         ("frames", str(count)),
+        ("landmarks found by", tracked.finder),
         ("frames with a face", f"{100 * float(seen.float().mean()):.1f} %"),
         ("frames with fewer than six stable landmarks", str(few)),
         ("jitter of the landmarks", f"{tracked.jitter:.2f} px"),
@@ -100,12 +111,14 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
     return rows
 
 
-def frames_sheet(tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: int = SHOWN) -> Tensor:
-    """Frames spread over the video, cut to the face, as ``draw`` makes frame number t, (3,H,W)."""
+def frames_sheet(
+    tracked: Tracked, draw: Callable[[int, Tensor], Tensor], most: int = SHOWN, cut: bool = True
+) -> Tensor:
+    """Frames spread over the video as ``draw`` makes frame number t, (3,H,W), cut to the face unless they are."""
     count = len(tracked.frames)
     wanted = torch.linspace(0, count - 1, min(most, count)).round().long().unique().tolist()
     cells, at = [], 0
-    box = _face_box(tracked, wanted)
+    box = _face_box(tracked, wanted) if cut else None
     for chunk in tracked.video.color_chunks():
         for t in [t for t in wanted if at <= t < at + len(chunk)]:
             cells.append(caption(_cut(draw(t, chunk[t - at]).float() / 255, box), f"frame {t}", 12))
@@ -127,12 +140,25 @@ def _face_box(tracked: Tracked, frames: list[int]) -> tuple[int, int, int, int]:
     return (x0, y0, x1, y1) if x1 - x0 > 8 and y1 - y0 > 8 else (0, 0, video.width, video.height)
 
 
-def _cut(image: Tensor, box: tuple[int, int, int, int]) -> Tensor:
-    x0, y0, x1, y1 = box
+def _cut(image: Tensor, box: tuple[int, int, int, int] | None) -> Tensor:
+    x0, y0, x1, y1 = box or (0, 0, image.shape[2], image.shape[1])
     part = image[:, y0:y1, x0:x1]
     scale = _WIDTH / part.shape[2]
     size = (max(1, round(part.shape[1] * scale)), _WIDTH)
     return torch.nn.functional.interpolate(part[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+
+def _player(tracked: Tracked) -> str:
+    """The overlay video where there is one."""
+    name = tracked.products["overlay"].name if "overlay" in tracked.products else ""
+    return f'<video src="{as_markup(name)}" controls loop muted style="max-width: 100%"></video>\n' if name else ""
+
+
+def _doubtful(tracked: Tracked) -> Table:
+    spans = tracked.doubtful_spans()
+    fps = tracked.video.fps
+    rows = [(f"{first} to {last}", f"{first / fps:.2f} to {last / fps:.2f} s", what) for first, last, what in spans]
+    return Table(("frames", "time", "what is doubtful"), rows or [("none", "", "")])
 
 
 def _bounds(tracked: Tracked) -> Table:

@@ -22,6 +22,7 @@ from torchface.workflows.track.track_state import TrackedFrames
 MIN_STABLE = 6
 """Stable landmarks that a pose needs."""
 _POOR = 0.04  # of the distance of the eyes' outer corners; landmarks of a rig's own face are off by 2 to 3 %
+_DOUBTFUL = 0.5
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
 
@@ -44,6 +45,7 @@ class Tracked:
         unlearned: shapes that a prior says nothing of.
         light: of the video, where a texture was put on the face.
         offsets: between the rig's landmarks and those found; None where the take is too short to tell.
+        finder: what found the landmarks, by its name.
     """
 
     video: VideoFile
@@ -59,6 +61,7 @@ class Tracked:
     unlearned: tuple[str, ...] = ()
     light: PointLight | None = None
     offsets: LandmarkOffsets | None = None
+    finder: str = ""
 
     @property
     def seen(self) -> Tensor:
@@ -74,6 +77,19 @@ class Tracked:
     def jitter(self) -> float:
         """How much the landmarks tremble, pixels."""
         return float(landmark_jitter(self.frames.landmarks))
+
+    def doubtful_spans(self) -> list[tuple[int, int, str]]:
+        """First and last frame of each span without a face, or with landmarks that are doubtful in the mean."""
+        frames = self.frames
+        sure = (frames.confidence * frames.visibility).nan_to_num().mean(1) * frames.presence.nan_to_num()
+        kind = torch.where(self.seen, (sure < _DOUBTFUL).long(), 2)
+        runs, counts = kind.unique_consecutive(return_counts=True)
+        ends = counts.cumsum(0)
+        return [
+            (end - count, end - 1, ("", "low confidence", "no face")[run])
+            for run, count, end in zip(runs.tolist(), counts.tolist(), ends.tolist(), strict=True)
+            if run
+        ]
 
     def bounds(self) -> Tensor:
         """The share of frames in which each weight is at 1, (N,)."""

@@ -34,6 +34,7 @@ from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.given_frames import blank_clip, given_frames, is_table
+from torchface.workflows.track.overlay_video import Overlay, write_overlay
 from torchface.workflows.track.track_files import (
     OFFSETS,
     OVERLAY,
@@ -51,7 +52,7 @@ from torchface.workflows.track.track_models import (
     TrackModels,
     load_track_models,
 )
-from torchface.workflows.track.track_overlay import video_light, write_overlay
+from torchface.workflows.track.track_overlay import video_light
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 from torchface.workflows.track.track_state import TrackedFrames, TrackState
 
@@ -76,7 +77,8 @@ class TrackSettings:
             prior.
         part: keep this region of the rig only.
         texture: an image to put on the face in the overlay, in the rig's texture coordinates.
-        overlay: draw the overlay video.
+        overlay: the rig in a video "side" by side with the picture, "over" it half through, or "none"; a texture
+            goes over the face.
         fps: frames a second of a table of landmarks without a video; by its times if absent.
         size: width and height of the pictures that such landmarks were found in; the camera's if absent.
         offsets: a file of fixed offsets between this rig's landmarks and this finder's; those in the folder of results,
@@ -92,7 +94,7 @@ class TrackSettings:
     whole_take: bool = False
     part: str | None = None
     texture: Path | None = None
-    overlay: bool = True
+    overlay: Overlay = "side"
     fps: float | None = None
     size: tuple[int, int] | None = None
     offsets: Path | None = None
@@ -194,17 +196,18 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         products,
         models.unlearned,
         offsets=offsets,
+        finder=Path(settings.landmarks).name,
     )
     with all_or_none():
         products |= write_curves(tracked, out)
-    if settings.overlay and video is not None:
-        overlay_key = content_key(_METHOD, solution=solve_key, texture=settings.texture)
+    if settings.overlay != "none" and video is not None:
+        overlay_key = content_key(_METHOD, solution=solve_key, texture=settings.texture, kind=settings.overlay)
         products["overlay"] = out / OVERLAY
         if settings.texture is not None:
             tracked = replace(tracked, light=_light(tracked, state, solve_key, progress))
         if not state.is_current(out / OVERLAY, overlay_key):
             begin = time.perf_counter()
-            write_overlay(tracked, out / OVERLAY, settings.texture, progress)
+            write_overlay(tracked, out / OVERLAY, settings.texture, progress, settings.overlay)
             seconds["overlay"] = time.perf_counter() - begin
             state.made(out / OVERLAY, overlay_key)
     write_json(out / SUMMARY, summary(tracked))

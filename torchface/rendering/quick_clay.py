@@ -1,0 +1,147 @@
+"""A rig as clay with coloured eyes and mouth, drawn fast enough to play."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import vertex_openness
+from torchface.rendering.rasterization import DrawnPixels, rasterize
+
+BACKGROUND = (38, 40, 44)
+_CLAY, _TINT = (205, 180, 163), (236, 92, 40)
+# Colours of parts, by the names of their regions.
+_PARTS: dict[tuple[str, ...], tuple[int, int, int]] = {
+    ("upper_lip", "lower_lip"): (196, 132, 120),
+    ("eyeball",): (238, 236, 232),
+    ("teeth",): (236, 230, 214),
+    ("gums", "tongue", "mouth_interior", "mouth_socket"): (122, 52, 50),
+    ("eye_socket",): (92, 50, 46),
+}
+_IRIS, _PUPIL = (92, 66, 44), (16, 14, 12)
+_IRIS_ANGLE, _PUPIL_ANGLE = 27.0, 11.0  # degrees from the way the eye looks
+_CLEAR = ("lacrimal", "eye_blend", "eye_occlusion", "eyelash")  # shells that are to be seen through
+_LEVELS, _TINT_LEVELS = 256, 4
+_AMBIENT, _HIGHLIGHT = 0.30, 0.16
+_LIGHTS = (((-0.55, 0.60, 0.60), 0.66), ((0.80, 0.05, 0.45), 0.24))  # right, up, toward the viewer; strength
+_LEAST_OPEN = 0.6
+_SMALLEST = 1.0  # millimetres before the lens
+_JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
+
+
+@dataclass(frozen=True, eq=False)
+class QuickClay:
+    """What of a mesh stays while it moves.
+
+    Args:
+        faces: triangles that are drawn, (F,3).
+        part: which colour each has, (F,).
+        openness: how much light creases let in, (V,).
+        colors: of each part, tint and light, (parts * tints * levels,3) uint8.
+    """
+
+    faces: Tensor
+    part: Tensor
+    openness: Tensor
+    colors: np.ndarray
+
+    @staticmethod
+    def of(mesh: Mesh) -> QuickClay:
+        """A mesh at rest, prepared; eyes look along z there."""
+        regions = {} if mesh.annotations is None else mesh.annotations.regions
+        faces = mesh.faces.cpu()
+
+        def those(prefixes: tuple[str, ...]) -> Tensor:
+            inside = torch.zeros(len(mesh.vertices), dtype=torch.bool)
+            for name, mask in regions.items():
+                if name.startswith(prefixes):
+                    inside |= mask.cpu()
+            return inside[faces].all(1)
+
+        part = torch.zeros(len(faces), dtype=torch.int64)
+        for number, prefixes in enumerate(_PARTS, 1):
+            part[those(prefixes)] = number
+        for name, mask in regions.items():
+            if name.startswith("eyeball") and bool(mask.any()):
+                angle = _off_axis(mesh.vertices.cpu(), faces, mask.cpu())
+                part[angle < _IRIS_ANGLE] = len(_PARTS) + 1
+                part[angle < _PUPIL_ANGLE] = len(_PARTS) + 2
+        drawn = ~those(_CLEAR)
+        palette = np.array([_CLAY, *_PARTS.values(), _IRIS, _PUPIL], np.float64)
+        openness = vertex_openness(Mesh(mesh.vertices, mesh.faces[drawn.to(mesh.faces.device)]))
+        lit = faces[drawn & (part > 0)].unique()  # a closed mouth at rest would leave its teeth dark when it opens
+        openness[lit] = openness[lit].clamp(min=_LEAST_OPEN)
+        return QuickClay(faces[drawn], part[drawn], openness, _lit_colors(palette))
+
+    def draw(self, vertices: Tensor, camera: Camera, tint: Tensor | None = None) -> np.ndarray:
+        """The mesh before a dark ground, (H,W,3) uint8.
+
+        Args:
+            vertices: (V,3), millimetres.
+            camera: of the image.
+            tint: how far each vertex is marked, (V,) in [0,1]; none if absent.
+        """
+        image = np.empty((camera.height, camera.width, 3), np.uint8)
+        image[:] = BACKGROUND
+        points = vertices.double() @ camera.rotation.double().T + camera.translation.double()
+        if bool((points[:, 2] < _SMALLEST).any()):
+            return image  # before or behind the lens there is no picture of a face
+        nearness = 1 / points[:, 2]
+        pixels = (points @ camera.intrinsics.double().T)[:, :2] * nearness[:, None]
+        drawn = rasterize(pixels, nearness, self.faces, camera.height, camera.width)
+        light = drawn.of_vertices(self._light(points.float()), self.faces)
+        row = self.part[drawn.triangle] * _TINT_LEVELS
+        if tint is not None:
+            level = (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
+            row = row + level[drawn.triangle]
+        index = row * _LEVELS + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
+        image.reshape(-1, 3)[drawn.pixel.numpy()] = self.colors[index.numpy()]
+        return _smooth_edges(image, drawn)
+
+    def _light(self, points: Tensor) -> Tensor:
+        """The light on vertices (V,3) in the camera's frame, (V,), 1 at most but in highlights."""
+        normals = vertex_normals(points, self.faces)
+        light = _AMBIENT * self.openness
+        for (x, y, z), strength in _LIGHTS:
+            toward = torch.nn.functional.normalize(points.new_tensor([x, -y, -z]), dim=0)
+            facing = normals @ toward
+            light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * (0.4 + 0.6 * self.openness)
+            half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
+            light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
+        return light
+
+
+def _off_axis(vertices: Tensor, faces: Tensor, eyeball: Tensor) -> Tensor:
+    """Degrees between z and the way from an eyeball's centre to each triangle, (F,); infinite off the eyeball."""
+    low, high = vertices[eyeball].amin(0), vertices[eyeball].amax(0)
+    middle = (low + high) / 2
+    middle[2] = high[2] - (high[:2] - low[:2]).amax() / 2  # what is seen is a ball, behind it may be a nerve
+    way = vertices[faces].mean(1) - middle
+    angle = torch.rad2deg(torch.acos((way[:, 2] / way.norm(dim=1)).clamp(-1, 1)))
+    return torch.where(eyeball[faces].all(1), angle, torch.inf)
+
+
+def _lit_colors(palette: np.ndarray) -> np.ndarray:
+    """Colours (P,3) under every tint and light, one after the other, uint8."""
+    tint = np.linspace(0, 0.75, _TINT_LEVELS)[:, None]
+    tinted = palette[:, None] * (1 - tint) + np.array(_TINT) * tint
+    light = np.linspace(0, 1, _LEVELS)[:, None]
+    return (tinted[:, :, None] * light).clip(0, 255).round().astype(np.uint8).reshape(-1, 3)
+
+
+def _smooth_edges(image: np.ndarray, drawn: DrawnPixels) -> np.ndarray:
+    """The image with its outlines blurred by a pixel, so that they do not crawl."""
+    near = np.zeros(image.shape[:2], np.float32)
+    near.reshape(-1)[drawn.pixel.numpy()] = drawn.nearness.numpy()
+    square = np.ones((3, 3), np.uint8)
+    edge = cv2.dilate(near, square) - cv2.erode(near, square) > _JUMP * near.max(initial=0.0)
+    rows, columns = np.nonzero(edge)
+    image[rows, columns] = cv2.GaussianBlur(image, (3, 3), 0)[rows, columns]
+    return image
