@@ -237,6 +237,24 @@ def test_a_moved_or_mirrored_picture_moves_the_landmarks(trees: LandmarkTrees, f
     assert tilt_of(trees, turned) - tilt_of(trees, found.landmarks) == pytest.approx(0.3, abs=1e-5)
 
 
+@pytest.mark.parametrize("quarters", [1, 2])
+def test_trees_find_a_face_that_is_turned_as_they_are_told(
+    trees: LandmarkTrees, film: tuple[Tensor, Tensor], quarters: int
+) -> None:
+    image, truth = film[0][0], film[1][0]
+    image = image[1]
+    angle = math.pi / 2 * quarters
+    upright = consensus(trees, image, box_around(truth))
+    last = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0])
+    turned = [torch.stack([last[1] - truth[:, 1], truth[:, 0]], 1), last - truth][quarters - 1]
+    found = consensus(trees, image.rot90(-quarters).contiguous(), box_around(turned, angle), angle)
+    off, before = (
+        (one - two).norm(dim=1).mean() for one, two in ((found.landmarks, turned), (upright.landmarks, truth))
+    )
+    assert float(off) < 1.2 * float(before)
+    assert float(found.dispersion.mean()) < 1.5 * float(upright.dispersion.mean())
+
+
 def test_jitter_is_the_deviation_of_planted_noise() -> None:
     noise = 0.7 * torch.randn(400, 68, 2, generator=torch.Generator().manual_seed(0))
     path = torch.arange(400.0)[:, None, None] * torch.tensor([1.3, -0.4]) + 100
