@@ -1,0 +1,66 @@
+"""The rig beside the picture: where the camera sees it, tinted where landmarks are doubtful, absent without a face."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from torchface.capture.video import VideoSolution
+from torchface.geometry.cameras.calibration import assumed_calibration
+from torchface.io.video import VideoFile
+from torchface.synthetic import performer
+from torchface.workflows.track.side_by_side import head_window, side_by_side_drawer
+from torchface.workflows.track.track_overlay import camera_at
+from torchface.workflows.track.track_result import Tracked
+from torchface.workflows.track.track_state import TrackedFrames
+
+
+def test_the_rig_stands_where_the_camera_sees_it_and_shows_what_is_doubtful() -> None:
+    rig, calibration = performer(), assumed_calibration(320, 240)
+    marks = rig.vertices[rig.neutral.landmarks].double()
+    rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    move = torch.tensor([40.0, 10.0, 900.0]).double() - rotation @ marks.mean(0)
+    solution = VideoSolution(
+        weights=torch.zeros(2, len(rig.names)),
+        rotation=rotation.repeat(2, 1, 1),
+        translation=move.repeat(2, 1),
+        errors=torch.zeros(2),
+        solved=torch.ones(2) > 0,
+        confidence=torch.ones(2, len(rig.names)),
+    )
+    rays = (marks @ rotation.T + move) @ calibration.intrinsics.double().T
+    landmarks = (rays[:, :2] / rays[:, 2:]).float().repeat(2, 1, 1)
+    frames = TrackedFrames(landmarks, torch.ones(2, 68), torch.ones(2, 4))
+    tracked = Tracked(
+        video=VideoFile(Path("film.avi"), 30.0, 320, 240, 2),
+        rig=rig,
+        frames=frames,
+        pinhole=landmarks,
+        solution=solution,
+        calibration=calibration,
+        faces=1,
+        reused=0,
+        seconds={},
+        products={},
+    )
+    picture = torch.full((3, 240, 320), 120, dtype=torch.uint8)
+    window, at = head_window(tracked), camera_at(tracked, 0)
+    seen = replace(window, rotation=at.rotation, translation=at.translation)
+    x, y = seen.project(marks[30]).round().long().tolist()
+    assert 0 < x < window.width
+    assert 0 < y < window.height
+    clay = side_by_side_drawer(tracked)(0, picture).int()
+    assert clay.shape == (3, window.height, 2 * window.width)
+    assert (clay[:, y, window.width + x] > 90).all()  # the tip of the nose, lit
+    assert clay[1, y, x] - clay[0, y, x] > 60  # the landmark found there, green
+    doubted = replace(tracked, frames=replace(frames, confidence=torch.zeros(2, 68)))
+    tinted = side_by_side_drawer(doubted)(0, picture).int()[:, y, window.width + x]
+    assert tinted[0] - tinted[2] > 60
+    assert doubted.doubtful_spans() == [(0, 1, "low confidence")]
+    gone = landmarks.clone()
+    gone[0] = torch.nan
+    lost = replace(tracked, frames=replace(frames, landmarks=gone))
+    assert (side_by_side_drawer(lost)(0, picture)[:, y, window.width + x] < 50).all()
+    assert lost.doubtful_spans() == [(0, 0, "no face")]
