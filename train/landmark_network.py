@@ -1,8 +1,8 @@
 """``python -m train.landmark_network --out models/NAME``: a network that finds 68 landmarks in pictures of faces.
 
 Learns from rendered people alone: ``--ict FaceXModel`` takes ICT-FaceKit's heads of real people beside the embedded
-performers. 15,000 pictures take an hour and a half of two processors, 7,000 steps as long; a GPU is used where there is
-one. Killed and started again it goes on.
+performers. 15,000 pictures take about 50 minutes of one core, 8,000 steps two hours; a GPU is used if there is one.
+Killed and started again it goes on.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Settings:
         network: How the network is trained.
     """
 
-    out: Path = Path("models/face_network")
+    out: Path = Path("models/landmark_network")
     pictures: int = 15_000
     held_out: int = 480
     folder: Path = Path("out/face_pictures")

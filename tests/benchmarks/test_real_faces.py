@@ -46,5 +46,12 @@ def test_finders_beside_each_other(outcomes: dict[str, Outcome], print_machine: 
     assert inner_error(trees.hand) < 0.075
     assert trees.difference() < 0.12
     assert all(counts.total() == 20 for counts in trees.verdicts.values())
+    if NETWORK in outcomes:
+        network = outcomes[NETWORK]
+        assert inner_error(network.hand) < 0.048
+        assert network.difference() < 0.05
+        assert sum(counts["wrong"] for counts in network.verdicts.values()) <= 6
+        if PEER in outcomes:
+            assert inner_error(network.hand) < 1.1 * inner_error(outcomes[PEER].hand)
     if PEER in outcomes:  # what made the clips' reference finds it again, frame by frame
         assert outcomes[PEER].difference() < 0.05

@@ -14,10 +14,13 @@ from torchface import zoo
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LARGEST = 2_000_000
+HOURS = {"landmark_network": "it learns for hours, from ICT-FaceKit's heads, and its pictures changed while it did"}
 
 
 @pytest.mark.parametrize("name", sorted(path.parent.name for path in (REPOSITORY / "models").glob("*/model.toml")))
 def test_the_recipe_makes_the_model_again(name: str, tmp_path: Path) -> None:
+    if name in HOURS:
+        pytest.skip(f"{name} is not made again: {HOURS[name]}")
     shipped = zoo.describe(name)
     command = shlex.split(shipped.recipe)
     assert command[:2] == ["python", "-m"]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def annotate(
     video: Positional[Path],
     out: Path,
-    landmarks: str = "face_landmarks",
+    landmarks: str = "landmark_network",
     count: int = 15,
     face: int = 0,
     browser: bool = True,

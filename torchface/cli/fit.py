@@ -15,7 +15,7 @@ def fit(
     model: str,
     out: Path,
     landmarks: tuple[str, ...] = (),
-    landmark_model: str = "face_landmarks",
+    landmark_model: str = "landmark_network",
     template: Path | None = None,
     part: str | None = None,
     focal: float | None = None,

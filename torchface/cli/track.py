@@ -17,7 +17,7 @@ def track(
     *,
     rig: Path,
     out: Path | None = None,
-    landmarks: str = "face_landmarks",
+    landmarks: str = "landmark_network",
     appearance: str | None = None,
     prior: str = "shape_prior",
     dynamics: str | None = None,

@@ -16,7 +16,7 @@ from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.onnx.landmark_network_graph import landmark_network_model
 
-DEFAULT_LANDMARKS = "face_landmarks"
+DEFAULT_LANDMARKS = "landmark_network"
 """The model of the zoo that finds landmarks where none is named."""
 
 MEDIAPIPE = "mediapipe"

@@ -1,6 +1,7 @@
 """The landmark network: heat maps read by their means, training that goes on where it stopped, the graph."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import onnxruntime
 import pytest
@@ -8,11 +9,13 @@ import torch
 
 from torchface import zoo
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.io.images.image_files import load_image
+from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images import network_training
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.finders.crop_finder import BothSides
-from torchface.landmarks.images.ibug_68 import MIRROR_68
+from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
 from torchface.landmarks.images.network_training import fit_network
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
 from torchface.onnx import export_model
@@ -162,3 +165,19 @@ def test_a_finder_runs_the_network_of_a_folder(network: LandmarkNetwork, tmp_pat
     found = finder(image, box, 0.3)
     torch.testing.assert_close(found.landmarks, from_crop(expected.landmarks[0], transform), atol=0.1, rtol=0)
     torch.testing.assert_close(found.visibility, expected.visibility[0], atol=0.01, rtol=0)
+
+
+@pytest.mark.real
+def test_the_shipped_network_finds_photographed_faces(data: Path) -> None:
+    finder, errors = load_finder(photographs=True).finder, []
+    for path in sorted((data / "images" / "people").glob("*.pts")):
+        (image,) = (one for one in path.parent.glob(f"{path.stem}.*") if one.suffix != ".pts")
+        truth = load_landmark_points(path).points.float()
+        found = finder((255 * load_image(image)).round().byte(), box_around(truth), 0.0)
+        assert found.presence > 0.9
+        assert float(found.visibility.mean()) > 0.9
+        eyes = (truth[36] - truth[45]).norm()
+        errors.append(float((found.landmarks - truth)[INNER].norm(dim=1).mean() / eyes))
+    # One of the four laughs with hair over his forehead, in grey.
+    assert sorted(errors)[1] < 0.045
+    assert sum(errors) / len(errors) < 0.055

@@ -116,7 +116,7 @@ def test_landmarks_that_no_file_gives_are_found(
     rest = ["--model", str(studio / "heads"), "--template", str(studio / "template.glb"), "--texture-size", "0"]
     main(["fit", str(studio / "p1.png"), *rest, "--out", str(out), "--quiet"])
     printed = capsys.readouterr()
-    assert "p1.png: landmarks found by face_landmarks in the face at" in printed.err
+    assert "p1.png: landmarks found by landmark_network in the face at" in printed.err
     assert "confidence 0." in printed.err
     written = tmp_path / "rig_1_p1.pts"
     assert str(written) in printed.out
@@ -296,7 +296,7 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     made = fit_photographs([photograph], files, people.model, tmp_path / "rig.glb", texture_size=0)
     assert len(made.remarks) == 1
     assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
-    assert "those that face_landmarks finds have" in made.remarks[0]
+    assert "those that landmark_network finds have" in made.remarks[0]
     assert made.remarks[0] in made.lines([photograph])
 
 

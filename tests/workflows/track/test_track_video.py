@@ -30,6 +30,7 @@ from torchface.shape_names import ARKIT
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.workflows.live.live_track import track_live
+from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track import track_video as workflow
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.side_by_side import head_window
@@ -180,14 +181,14 @@ def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     assert "as given, 0.10 px from what it was fitted to" in page
     assert "frames with a face" in page
     assert '<video src="overlay.mp4"' in page
-    assert "face_landmarks" in page
+    assert "landmark_network" in page
 
 
 def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed: Filmed) -> None:
     assert done.left == (FOLDER,)
     assert done.steps == FRAMES - 2 * PIECE
     assert done.tracked.reused == 2 * PIECE
-    tracker = LandmarkTracker(zoo.get_model("face_landmarks"))
+    tracker = LandmarkTracker(load_finder().finder)
     whole: list[torch.Tensor] = []
     whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
     assert torch.equal(done.tracked.frames.landmarks, torch.stack(whole))
@@ -327,7 +328,9 @@ def test_what_cannot_be_tracked_is_told_and_leaves_nothing(
 
 
 def test_models_that_do_not_fit_are_told(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    with pytest.raises(NameMismatchError, match="--landmarks: found head, a HeadModel, expected a LandmarkTrees"):
+    with pytest.raises(
+        NameMismatchError, match="--landmarks: found head, a HeadModel, expected a LandmarkTrees or LandmarkNetwork"
+    ):
         load_track_models(dome_rig, "head")
     with pytest.raises(NameMismatchError, match="--dynamics: found face_landmarks, a LandmarkTrees"):
         load_track_models(dome_rig, dynamics="face_landmarks")
