@@ -23,7 +23,7 @@ def exported_model(
     inputs: Mapping[str, Tensor],
     outputs: Sequence[str],
     metadata: Mapping[str, object],
-    sizes: Mapping[str, Sequence[str]] | None = None,
+    sizes: Mapping[str, Sequence[str | None]] | None = None,
     translations: Mapping[Callable[..., object], Callable[..., object]] | None = None,
 ) -> onnx.ModelProto:
     """The checked model of a module.
@@ -33,7 +33,8 @@ def exported_model(
         inputs: examples by name.
         outputs: names of what the module returns.
         metadata: values that are not text become JSON.
-        sizes: names of the first axes of inputs, which may then have any size; the example's is to be 2 or more.
+        sizes: names of the first axes of inputs, which may then have any size, None for one that keeps the example's;
+            the example's is to be 2 or more.
         translations: of operators that PyTorch does not know from ONNX, functions of the operator's arguments.
     """
     # Loaded here: it takes a second, and solvers that run graphs have no need of it.

@@ -118,7 +118,8 @@ class BoxNetwork(nn.Module):
         """
         centre, geometry = self.maps(images)
         likely = centre.sigmoid()
-        peaks = likely * (max_pool2d(likely, 3, 1, 1) == likely).to(likely)
+        # Cells beside a peak keep a thousandth: among equal ones the order would be anybody's.
+        peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, 1e-3)
         column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
         row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
         said = torch.cat([column, row, geometry[:, 2:]], 1).flatten(2)
