@@ -17,19 +17,20 @@ from torchface.onnx.face_box_graph import FACE_VALUES
 
 @pytest.fixture(scope="module")
 def network() -> BoxNetwork:
-    """One with weights as large as learned ones, so that its scores differ."""
+    """A small one that has seen noise, with weights as large as learned ones, so that its scores differ."""
     with torch.random.fork_rng([]):
         torch.manual_seed(3)
-        drawn = BoxNetwork(faces=8)
-    with torch.no_grad():
-        drawn.said.weight.mul_(30)
+        drawn = BoxNetwork((8, 8, 12, 12), (1, 1, 1, 1), faces=8)
+        with torch.no_grad():
+            drawn.said.weight.normal_()
+            for _ in range(30):  # batch normalisation learns what comes
+                drawn.train()(torch.rand(2, 3, 96, 96))
     return drawn.eval()
 
 
 def test_other_sizes_than_it_was_exported_with(network: BoxNetwork, tmp_path: Path) -> None:
     path = tmp_path / "boxes.onnx"
-    report = export_model(network, path, {"licence": "MIT"})
-    assert report.size < 500_000
+    export_model(network, path, {"licence": "MIT"})
     session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
     for batch, height, width in ((1, 96, 224), (3, 160, 64)):
         images = torch.rand(batch, 3, height, width, generator=torch.Generator().manual_seed(height))

@@ -15,7 +15,7 @@ from torchface.landmarks.images.box_network import FaceMaps, face_geometry
 from torchface.landmarks.images.box_training import box_loss
 
 FEW = BoxTrainingSettings(
-    pictures=960, batch=8, rate=1e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1), checkpoint=2
+    pictures=1440, batch=8, rate=2e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1), checkpoint=2
 )
 
 

@@ -1,4 +1,4 @@
-"""What else is in a picture: coloured walls, shapes, stripes, writing, leaves, skin, hands; no faces."""
+"""What else is in a picture: coloured walls, shapes, stripes, writing, skin, hands, cloth, screens; no faces."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def clutter(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     image = _clouds(height, width, rng)
     plain = rng.random() < 0.2
     drawn = 0 if plain else int(rng.integers(3, 26))
-    kinds = (_box, _ellipse, _line, _writing, _stripes, _leaves, _limb, _spots)
-    for kind in rng.choice(len(kinds), drawn, p=[0.2, 0.16, 0.12, 0.14, 0.1, 0.08, 0.12, 0.08]):
+    kinds = (_box, _ellipse, _line, _writing, _stripes, _leaves, _limb, _spots, _cloth, _screen)
+    for kind in rng.choice(len(kinds), drawn, p=[0.15, 0.13, 0.1, 0.15, 0.08, 0.06, 0.13, 0.08, 0.07, 0.05]):
         kinds[kind](image, rng)  # each over those before
     if rng.random() < 0.4:
         image = cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.5, 4)))
@@ -190,6 +190,39 @@ def _spots(image: np.ndarray, rng: np.random.Generator) -> None:
         _capsule(image, middle - way, middle + way * count, rng.uniform(1, 3) * size / count, ground)
     for number in range(count):
         cv2.circle(image, _at(middle + way * number), max(1, int(radius)), color, -1, cv2.LINE_AA)
+
+
+def _cloth(image: np.ndarray, rng: np.random.Generator) -> None:
+    """Cloth of one colour, warm ones most often, with soft folds and a hem."""
+    size = int(_size(image, rng)) + 8
+    x, y = _at(_place(image, rng) - size / 2)
+    left, top = max(0, x), max(0, y)
+    part = image[top : max(0, y + size), left : max(0, x + size)]
+    if not part.size:
+        return
+    warm = np.array([rng.uniform(120, 255), rng.uniform(30, 170), rng.uniform(0, 110)])
+    color = warm if rng.random() < 0.5 else np.array(random_color(rng, 0.2))
+    coarse = rng.normal(0, 1, (int(rng.integers(3, 9)), int(rng.integers(3, 9)))).astype(np.float32)
+    folds = cv2.resize(coarse, (part.shape[1], part.shape[0]), interpolation=cv2.INTER_CUBIC)[..., None]
+    part[:] = np.clip(color * (1 + rng.uniform(0.05, 0.35) * folds), 0, 255).astype(np.uint8)
+    if rng.random() < 0.5:
+        cv2.rectangle(image, (left, top), (x + size, y + size), random_color(rng), int(rng.integers(1, 5)), cv2.LINE_AA)
+
+
+def _screen(image: np.ndarray, rng: np.random.Generator) -> None:
+    """A monitor, a window, a picture without people: a frame round something bright or dark, with boxes and writing."""
+    size, middle = _size(image, rng), _place(image, rng)
+    half = size * np.array([0.5, rng.uniform(0.25, 0.45)])
+    low, far = _at(middle - half), _at(middle + half)
+    cv2.rectangle(image, low, far, random_color(rng, 0), -1)
+    for _ in range(int(rng.integers(0, 8))):  # over each other
+        first = middle + rng.uniform(-0.9, 0.7, 2) * half
+        cv2.rectangle(image, _at(first), _at(first + rng.uniform(0.03, 0.4, 2) * size), random_color(rng, 0.1), -1)
+    if rng.random() < 0.6:
+        text = "".join(rng.choice(_LETTERS, int(rng.integers(2, 12))))
+        cv2.putText(image, text, _at(middle - (0.8 * half[0], 0)), int(rng.integers(0, 8)), size / 200,
+                    random_color(rng, 0), 1, cv2.LINE_AA)  # fmt: skip
+    cv2.rectangle(image, low, far, random_color(rng, 0), max(1, int(size * rng.uniform(0.01, 0.08))), cv2.LINE_AA)
 
 
 def _capsule(image: np.ndarray, start: np.ndarray, end: np.ndarray, thick: float, color: np.ndarray) -> None:
