@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks import FaceBoxes, FoundLandmarks, LandmarkTracker, track_landmarks
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around
-from torchface.landmarks.images.landmark_finder import confidence_of
+from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
 from torchface.synthetic import performer
 
 
@@ -174,3 +174,13 @@ def test_a_finder_that_breaks_the_protocol_is_named(face: Tensor) -> None:
         tracker = LandmarkTracker(finder, detector=lambda _: FaceBoxes(box_around(face + 100)[None], torch.ones(1)))
         with pytest.raises(kind, match=message):
             track_landmarks(frames, tracker)
+
+
+def test_a_mouth_behind_a_hand_counts_nothing() -> None:
+    confidence, visibility = torch.full((2, 68), 0.9), torch.full((2, 68), 0.99)
+    visibility[1, 48:58] = 0.1  # the other half of the lips is said to be seen
+    trust = trust_of(confidence, visibility)
+    torch.testing.assert_close(trust[0], confidence[0])
+    assert float(trust[1, 48:].max()) == 0
+    assert float(trust[1, 4:13].max()) == 0  # nor does the chin below it
+    torch.testing.assert_close(trust[1, 13:48], confidence[1, 13:48])

@@ -15,6 +15,10 @@ COUNT = 68
 """iBUG's landmarks, that every finder gives."""
 
 _HALF = 0.02
+_HIDDEN, _SEEN = 0.7, 0.95
+_LIPS, _CHIN = slice(48, 68), slice(4, 13)
+_GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
+"""Brows, nose, eyes, lips."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +52,26 @@ class LandmarkFinder(Protocol):
 def confidence_of(deviation: Tensor) -> Tensor:
     r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the face's box: one half at 0.02."""
     return 1 / (1 + (deviation / _HALF).square())
+
+
+def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
+    """How much each landmark counts, (...,68) in [0,1]: its confidence, if it is seen and so is what it belongs to.
+
+    A landmark behind a hand is a guess, however sure: below a visibility of 0.7 it does not count at all, above 0.95
+    fully. Brows, nose, eyes and lips are each hidden as a whole where they are hidden in the mean: from a few points
+    beside a hand a mouth would be invented.
+
+    Args:
+        confidence, visibility: of landmarks, (...,68) in [0,1].
+    """
+    seen = visibility.clone()
+    for group in _GROUPS:
+        mean = visibility[..., group].mean(-1, keepdim=True)
+        seen[..., group] = visibility[..., group].minimum(mean)
+    # Who hides the mouth hides the chin: what is found of it would open the jaw.
+    lips = visibility[..., _LIPS].mean(-1, keepdim=True)
+    seen[..., _CHIN] = visibility[..., _CHIN].minimum(lips)
+    return confidence * ((seen - _HIDDEN) / (_SEEN - _HIDDEN)).clamp(0, 1)
 
 
 def finder_name(finder: LandmarkFinder) -> str:

@@ -18,6 +18,7 @@ from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.io.weights.live_link_stream import LiveLinkSender, find_receiver
+from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.landmarks.images.tracking import LandmarkTracker
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
@@ -116,12 +117,14 @@ class LiveSolver:
             interval: seconds since the frame before, where they are known.
         """
         seen = self._tracker.step(frame)
-        landmarks = self._filter.step(undistort(seen.landmarks, self._calibration))
+        trust = trust_of(seen.confidence, seen.visibility)
+        # What is hidden is a guess, that a filter would carry on into the frames after.
+        shown = torch.where(trust[:, None] > 0, seen.landmarks, torch.nan)
+        landmarks = self._filter.step(undistort(shown, self._calibration))
         enough = int(torch.isfinite(landmarks).all(1).sum()) >= _MIN_LANDMARKS
         if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
         before = self._state or self._solver.start()
-        trust = seen.confidence * seen.visibility
         self._state = self._solver.step(before, landmarks, confidence=trust, interval=interval)
         weights, rotation = self._state.weights.detach().float(), self._state.rotation.detach().float()
         return LiveFrame(weights, rotation, seen.landmarks)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
+from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.mesh import Mesh
 from torchface.rendering.quick_clay import BACKGROUND, QuickClay
 from torchface.workflows.track.track_overlay import camera_at
@@ -32,7 +33,7 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     window = head_window(tracked)
     rig, weights = tracked.rig, tracked.solution.weights.detach()
     clay, near = QuickClay.of(rig.neutral), _near_landmarks(rig.neutral)
-    confidence = torch.nan_to_num(tracked.frames.confidence * tracked.frames.visibility)
+    confidence = torch.nan_to_num(trust_of(tracked.frames.confidence, tracked.frames.visibility))
     doubt = ((_SURE - confidence) / _SURE).clamp(0, 1)
     width = window.width
     view = (window.intrinsics @ torch.linalg.inv(tracked.calibration.intrinsics.double())).numpy()

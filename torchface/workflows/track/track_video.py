@@ -28,7 +28,7 @@ from torchface.io.images.transparent_images import load_paint
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.face_box import find_faces
-from torchface.landmarks.images.landmark_finder import LandmarkFinder
+from torchface.landmarks.images.landmark_finder import LandmarkFinder, trust_of
 from torchface.landmarks.images.tracking import LandmarkTracker, naming_the_frame
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
@@ -59,7 +59,7 @@ from torchface.workflows.track.track_state import TrackedFrames, TrackState
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
 
-_METHOD = "track/3"
+_METHOD = "track/4"
 """Of the keys; another number where the same inputs, or another ``PIECE``, come to give other results."""
 
 
@@ -154,9 +154,11 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         raise ValueRangeError(f"{clip.path}: found no face in any of its {len(frames)} frames, expected one")
     begin = time.perf_counter()
     steadied = smooth_landmarks if settings.whole_take else filter_landmarks
-    pinhole = steadied(undistort(frames.landmarks.double(), calibration)).float()
+    trust = trust_of(frames.confidence, frames.visibility)
+    # What is hidden is a guess, that a filter would carry on into the frames after.
+    seen = torch.where(trust[..., None] > 0, frames.landmarks.double(), torch.nan)
+    pinhole = steadied(undistort(seen, calibration)).float()
     seconds["steadying"] = time.perf_counter() - begin
-    trust = frames.confidence * frames.visibility
     solver = solver_for(actor, models, calibration, clip.fps)
     begin = time.perf_counter()
     offsets, known = _offsets(solver, actor, models, pinhole, trust, settings.offsets, out)
