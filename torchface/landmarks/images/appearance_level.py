@@ -60,11 +60,13 @@ class AppearanceLevel(nn.Module):
         self.register_buffer("typical", torch.ones(()))
         self._curvature: Tensor | None = None
         self._curvature_of: tuple[int, int, torch.device] | None = None
+        self._placing: Tensor | None = None
+        self._placing_of: tuple[int, int, int] | None = None
 
     def sample(self, features: Tensor, points: Tensor) -> Tensor:
         """Features (B,C,h,w) at the level's places on faces with these points (B,P,2), pixels: (B,C,N)."""
-        places = (points[:, self.corner] * self.weight[..., None]).sum(2)
-        return sample_pixels(features, places)
+        places = points.transpose(1, 2) @ self._placing_matrix(points.shape[1])
+        return sample_pixels(features, places.transpose(1, 2).contiguous())
 
     def residual(self, sampled: Tensor) -> TextureResidual:
         """What the modes leave of sampled features (B,C,N), and the coefficients that explain the rest."""
@@ -109,6 +111,15 @@ class AppearanceLevel(nn.Module):
         whole[:, rows, columns] = flat
         whole[:, columns, rows] = flat
         return whole
+
+    def _placing_matrix(self, points: int) -> Tensor:
+        """What each of P points adds to each place, (P,N): a product with it takes an eighth of gathering corners."""
+        known = (self.weight.data_ptr(), self.weight._version, self.corner._version)
+        if self._placing is None or self._placing_of != known:
+            matrix = self.weight.new_zeros(points, len(self.weight))
+            self._placing = matrix.scatter_add(0, self.corner.T, self.weight.T)
+            self._placing_of = known
+        return self._placing
 
     def _curvature_terms(self) -> Tensor:
         r"""What each product of two coefficients adds to each entry of the curvature, (J,R): upper triangles of both.

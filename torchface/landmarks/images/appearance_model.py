@@ -18,10 +18,10 @@ from torchface.landmarks.images.face_warp import with_forehead
 from torchface.landmarks.images.shape_modes import PlanarPose, planar_pose
 
 COUNT = 68
-_MARGIN = 0.3
+_MARGIN = 0.15
 _MAX_SAMPLES = 8
 _ASTRAY = 4.0  # times the lowest energy: steps that have come to this lead nowhere
-_STILL = 0.02  # pixels of a level: a face whose landmarks move by less has arrived
+_STILL = 0.05  # pixels of a level: a face whose landmarks move by less has arrived
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,14 @@ class AppearanceFit(NamedTuple):
     initial_error: Tensor
 
 
+class _LinearMaps(NamedTuple):
+    """What is linear in the landmarks: the points that textures hang on (P,68), and how they change a unit of the mean
+    shape along x and y round each landmark (2,68,68)."""
+
+    points: Tensor
+    steps: Tensor
+
+
 class FaceCrop(NamedTuple):
     """Features (B,C,h,w) of upright images of faces, and the similarities from their pixels to the image's."""
 
@@ -145,6 +153,8 @@ class AppearanceModel(nn.Module):
                 f"expected {len(self.settings.resolutions)}"
             )
         channels = CHANNELS[self.settings.features]
+        self._maps: _LinearMaps | None = None
+        self._maps_of: tuple[int, int, int, torch.dtype] | None = None
         self.register_buffer("mean_shape", torch.zeros(COUNT, 2))
         self.register_buffer("motions", torch.zeros(4 + shape_modes, COUNT, 2))
         self.register_buffer("deviations", torch.ones(shape_modes))
@@ -259,12 +269,12 @@ class AppearanceModel(nn.Module):
     def _refine_level(self, level: AppearanceLevel, crop: FaceCrop, initial: Tensor) -> Tensor:
         """The best landmarks, by residual and shape, of an initial guess and what its steps lead to; crop pixels."""
         found = best = initial
+        state = self._shape(found)[1]
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
         still = torch.zeros_like(lowest, dtype=torch.bool)
         for iteration in range(self.settings.iterations + 1):
             residual = level.residual(level.sample(crop.features, self._points(found)))
-            state = self._shape(found)[1]
             energy = residual.left.square().sum((1, 2)) / level.noise + (precision * state.square()).sum(1)
             better = energy < lowest
             best = torch.where(better[:, None, None], found, best)
@@ -272,22 +282,24 @@ class AppearanceModel(nn.Module):
             still = still | ~(energy < _ASTRAY * lowest)
             if iteration == self.settings.iterations or still.all():
                 break
-            moved = torch.einsum("bq,qlc->blc", level.step(residual, state, precision), self.motions)
+            moved = (level.step(residual, state, precision) @ self.motions.flatten(1)).view_as(found)
             warp = self._linear_parts(found)
-            ahead = self._onto_modes(found - torch.einsum("blij,blj->bli", warp, moved))
-            still = still | ~self._plausible(ahead, level)
+            pose, shape = self._shape(found - (warp * moved[:, :, None]).sum(3))
+            ahead = self._landmarks(pose, shape)
+            still = still | ~self._plausible(ahead, pose, level)
             ahead = torch.where(still[:, None, None], found, ahead)
+            state = torch.where(still[:, None], state, shape)
             still = still | ((ahead - found).flatten(1).abs().amax(1) < _STILL)
             found = ahead
         return best
 
-    def _plausible(self, landmarks: Tensor, level: AppearanceLevel) -> Tensor:
+    def _plausible(self, landmarks: Tensor, pose: PlanarPose, level: AppearanceLevel) -> Tensor:
         """Whether landmarks (B,68,2) in a crop are finite, and of about the size that faces have in it, (B,)."""
-        size = planar_pose(self.mean_shape, landmarks).scale / level.scale
+        size = pose.scale / level.scale
         return torch.isfinite(landmarks).flatten(1).all(1) & (size > 0.5) & (size < 2)
 
     def _points(self, landmarks: Tensor) -> Tensor:
-        return with_forehead(landmarks, self.settings.jaw_margin)
+        return self._linear_maps().points @ landmarks
 
     def _extent(self) -> tuple[Tensor, Tensor]:
         """Corners (2,) of what a crop shows, in units of the mean shape."""
@@ -299,13 +311,12 @@ class AppearanceModel(nn.Module):
         """Pose and state (B,Q) of landmarks (B,68,2)."""
         pose = planar_pose(self.mean_shape, landmarks)
         offset = pose.undo(landmarks) - self.mean_shape
-        state = torch.einsum("blc,klc->bk", offset, self.motions[4:])
+        state = offset.flatten(1) @ self.motions[4:].flatten(1).T
         return pose, torch.cat([state.new_zeros(len(state), 4), state], dim=1)
 
-    def _onto_modes(self, landmarks: Tensor) -> Tensor:
-        """The nearest landmarks that the model can show."""
-        pose, state = self._shape(landmarks)
-        return pose.apply(self.mean_shape + torch.einsum("bq,qlc->blc", state, self.motions))
+    def _landmarks(self, pose: PlanarPose, state: Tensor) -> Tensor:
+        """Landmarks (B,68,2) of faces with a pose and a state (B,Q)."""
+        return pose.apply(self.mean_shape + (state @ self.motions.flatten(1)).unflatten(1, (COUNT, 2)))
 
     def _linear_parts(self, landmarks: Tensor) -> Tensor:
         """What the warp from the mean shape does to small steps at each landmark, (B,68,2,2).
@@ -315,12 +326,28 @@ class AppearanceModel(nn.Module):
 
         Source: Matthews and Baker 2004, section 4.3.
         """
-        mean = self._points(self.mean_shape[None])
+        steps = self._linear_maps().steps.flatten(0, 1) @ landmarks
+        return steps.unflatten(1, (2, COUNT)).permute(0, 2, 3, 1)
+
+    def _linear_maps(self) -> _LinearMaps:
+        """Kept until the state changes."""
+        known = (self.mean_shape.data_ptr(), self.mean_shape._version, self.triangles._version, self.mean_shape.dtype)
+        if self._maps is None or self._maps_of != known:
+            units = torch.zeros(COUNT, COUNT, 2).to(self.mean_shape)
+            units[..., 0] = torch.eye(COUNT)
+            points = with_forehead(units, self.settings.jaw_margin)[..., 0].T.contiguous()
+            self._maps = _LinearMaps(points, self._warp_steps(units)[:, :, 0].permute(2, 1, 0).contiguous())
+            self._maps_of = known
+        return self._maps
+
+    def _warp_steps(self, landmarks: Tensor) -> Tensor:
+        """See :meth:`_linear_parts`: linear in the landmarks."""
+        mean = with_forehead(self.mean_shape[None], self.settings.jaw_margin)
         edges = _edges(mean, self.triangles)
         area = torch.linalg.det(edges)[0].abs()
         sound = area > 1e-3 * area.max()
         edges = torch.where(sound[:, None, None], edges, torch.eye(2).to(edges))
-        parts = _edges(self._points(landmarks), self.triangles) @ torch.linalg.inv(edges)
+        parts = _edges(with_forehead(landmarks, self.settings.jaw_margin), self.triangles) @ torch.linalg.inv(edges)
         share = area * sound
         total = parts.new_zeros(len(parts), mean.shape[1], 2, 2)
         weights = share.new_zeros(mean.shape[1])
@@ -332,10 +359,14 @@ class AppearanceModel(nn.Module):
 
 def _cut_out(images: Tensor, pose: PlanarPose, size: tuple[int, int], samples: int) -> Tensor:
     """Images (B,1,height,width) whose pixels lie where a pose puts them, each a mean over ``samples`` a side."""
-    step = (torch.arange(samples, device=images.device) + 0.5) / samples - 0.5
-    x, y = ((torch.arange(count, device=images.device)[:, None] + step).flatten() for count in size)
-    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2).to(images.dtype)
-    return avg_pool2d(sample_pixels(images, pose.apply(grid)).unflatten(2, (len(y), len(x))), samples)
+    x, y = (
+        (torch.arange(count * samples, device=images.device, dtype=images.dtype) + 0.5) / samples - 0.5
+        for count in size
+    )
+    cos, sin = pose.rotation.real[:, None, None], pose.rotation.imag[:, None, None]
+    right, down = pose.translation.real[:, None, None], pose.translation.imag[:, None, None]
+    places = torch.stack([cos * x + (right - sin * y[:, None]), sin * x + (down + cos * y[:, None])], dim=-1)
+    return avg_pool2d(sample_pixels(images, places.flatten(1, 2)).unflatten(2, (len(y), len(x))), samples)
 
 
 def _edges(points: Tensor, triangles: Tensor) -> Tensor:

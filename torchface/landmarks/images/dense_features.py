@@ -7,10 +7,9 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import avg_pool2d, conv2d, pad
 
 from torchface.errors import NameMismatchError
-from torchface.rendering.gaussian_blur import gaussian_blur
 
 Features = Literal["grey", "gradient_direction", "oriented_gradients"]
 CHANNELS: dict[str, int] = {"grey": 1, "gradient_direction": 2, "oriented_gradients": 8}
@@ -19,6 +18,7 @@ CHANNELS: dict[str, int] = {"grey": 1, "gradient_direction": 2, "oriented_gradie
 _FAINT = 0.01  # grey values a pixel: gradients below count as flat
 _WINDOW = 17  # pixels of the neighbourhood that grey values are measured against
 _CELL = 1.5  # pixels: deviation of the window that gradients are gathered in
+_BELL = [math.exp(-(step**2) / (2 * _CELL**2)) for step in range(-4, 5)]
 
 
 def dense_features(images: Tensor, kind: Features) -> Tensor:
@@ -50,12 +50,22 @@ def dense_features(images: Tensor, kind: Features) -> Tensor:
         strength = (along_x.square() + along_y.square() + _FAINT**2).sqrt()
         return torch.cat([along_x, along_y], dim=1) / strength
     if kind == "oriented_gradients":
-        angle = torch.arange(8, dtype=images.dtype, device=images.device)[:, None, None] * (math.pi / 4)
-        directed = (angle.cos() * along_x + angle.sin() * along_y).clamp(min=0)
-        gathered = gaussian_blur(directed, _CELL, truncate=2.5)
-        around = avg_pool2d(pad(gathered.square().sum(1, keepdim=True), (3,) * 4, mode="replicate"), 7, 1)
-        return gathered / (around + _FAINT**2).sqrt()
+        angle = torch.arange(4, dtype=images.dtype, device=images.device)[:, None, None] * (math.pi / 4)
+        directed = angle.cos() * along_x + angle.sin() * along_y
+        # The other four directions are these four's opposites.
+        directed = torch.cat([directed, -directed], dim=1).clamp(min=0)
+        gathered = _filtered(directed, images.new_tensor(_BELL) / sum(_BELL))
+        around = _filtered(gathered.square().sum(1, keepdim=True), images.new_full((7,), 1 / 7))
+        return gathered * (around + _FAINT**2).rsqrt()
     raise NameMismatchError(f"features: found {kind!r}, expected one of {', '.join(get_args(Features))}")
+
+
+def _filtered(images: Tensor, kernel: Tensor) -> Tensor:
+    """Every channel convolved with a kernel (S,) of odd size across and down, the border continued."""
+    reach, channels = len(kernel) // 2, images.shape[1]
+    padded = pad(images, (reach,) * 4, mode="replicate")
+    down = conv2d(padded, kernel.view(1, 1, -1, 1).expand(channels, -1, -1, -1), groups=channels)
+    return conv2d(down, kernel.view(1, 1, 1, -1).expand(channels, -1, -1, -1), groups=channels)
 
 
 def _window_mean(images: Tensor) -> Tensor:
