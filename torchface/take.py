@@ -108,6 +108,20 @@ class Take:
         if len(set(lengths.values())) > 1:
             raise ShapeError(f"take: found frame counts {lengths}, expected the same for all")
 
+    def uneven_seconds(self) -> Tensor | None:
+        """When each frame is shown, (T,) float64, rising, where ``extras["seconds"]`` says; else frames come evenly.
+
+        Raises:
+            ValueRangeError: that is of another length, or does not rise.
+        """
+        seconds = self.extras.get("seconds")
+        if seconds is None:
+            return None
+        seconds = torch.as_tensor(seconds).detach().cpu().double()
+        if seconds.shape != (len(self),) or not bool((seconds.diff() > 0).all()):
+            raise ValueRangeError(f"take: found times {tuple(seconds.shape)}, expected ({len(self)},), rising")
+        return seconds
+
     def __len__(self) -> int:
         for track in (self.markers, self.landmarks, self.weights, self.timecode):
             if track is not None:
@@ -149,6 +163,8 @@ def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, An
         cut["columns"] = {name: column[rows] for name, column in extras["columns"].items()}
     if "blendshape_count" in extras:
         cut["blendshape_count"] = extras["blendshape_count"][rows]
+    if "seconds" in extras:
+        cut["seconds"] = extras["seconds"][rows]
     if "gaps" in extras:
         cut["gaps"] = tuple((row - rows.start, lost) for row, lost in extras["gaps"] if rows.start < row < rows.stop)
     return cut

@@ -129,3 +129,15 @@ def test_bad_input() -> None:
         kalman_filter(torch.full((3, 1), torch.inf), KalmanSettings(1, 1))
     with pytest.raises(ValueRangeError, match="expected at least 8"):
         estimate_settings(torch.zeros(3, 1))
+
+
+def test_two_short_steps_are_a_long_one() -> None:
+    once, twice = (KalmanFilter(2, KalmanSettings(1.5, 0.4)) for _ in range(2))
+    for running in (once, twice):
+        for frame in torch.tensor([[0.0, 5.0], [1.0, 4.0], [3.0, 4.5]], dtype=torch.float64):
+            running.step(frame)
+    once.predict(1.3)
+    for interval in (0.5, 0.8):
+        twice.predict(interval)
+    torch.testing.assert_close(once.state, twice.state)
+    torch.testing.assert_close(once.covariance, twice.covariance)

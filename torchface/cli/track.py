@@ -45,7 +45,7 @@ def track(
     With --live it does so from a webcam as the face moves, and sends each frame as Live Link Face does.
 
     Args:
-        video: A file: .avi, .mkv, .webm, .mp4 or .mov, of one size and an even frame rate.
+        video: A file: .avi, .mkv, .webm, .mp4, .mov or .gif, of one size; its frame rate may vary.
         rig: The actor's own rig, with 68 annotated landmarks: .glb, or ICT-FaceKit's FaceXModel folder.
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -79,8 +80,12 @@ class AdaptiveFilter:
         self.scores = torch.zeros(self._models, points, dtype=torch.float64)
         """What each model's forecasts of each point were worth, logarithms of probability, (M,P)."""
 
-    def step(self, measured: Tensor) -> Tensor:
+    def step(self, measured: Tensor, interval: float = 1.0) -> Tensor:
         """Filtered points (P,D) float64 after a frame's (P,D); NaN for not seen, and before the first and in long gaps.
+
+        Args:
+            measured: the frame's.
+            interval: since the frame before, in frames of the usual length.
 
         Raises:
             ShapeError: another number of points.
@@ -95,7 +100,7 @@ class AdaptiveFilter:
         every = measured.double().flatten().repeat(self._models)
         self.scores = self.scores.to(measured.device)
         running = self._filter.to(measured.device)
-        running.predict()
+        running.predict(interval)
         variance = running.covariance[:, 0, 0] + running.variance
         residual = every - running.state[:, 0]
         certainty = -0.5 * (residual.square() / variance + variance.log())
@@ -115,18 +120,27 @@ class AdaptiveFilter:
         return torch.lerp(likely, calmer, self.settings.calm).flatten(0, 1)
 
 
-def adaptive_filter(values: Tensor, settings: AdaptiveSettings | None = None) -> Tensor:
-    """Points (T,P,D), NaN for not seen, each frame from itself and those before; see :class:`AdaptiveFilter`."""
+def adaptive_filter(
+    values: Tensor, settings: AdaptiveSettings | None = None, intervals: Sequence[float] | None = None
+) -> Tensor:
+    """Points (T,P,D), NaN for not seen, each frame from itself and those before; see :class:`AdaptiveFilter`.
+
+    ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
+    """
     _check(values)
     running = AdaptiveFilter(values.shape[1], values.shape[2], settings)
     # A frame needs the one before.
-    return torch.stack([running.step(frame) for frame in values]).to(values.dtype)
+    steps = zip(values, intervals or [1.0] * len(values), strict=True)
+    return torch.stack([running.step(frame, interval) for frame, interval in steps]).to(values.dtype)
 
 
-def adaptive_smoother(values: Tensor, settings: AdaptiveSettings | None = None) -> Tensor:
+def adaptive_smoother(
+    values: Tensor, settings: AdaptiveSettings | None = None, intervals: Sequence[float] | None = None
+) -> Tensor:
     """Points (T,P,D) from all frames, those after each too, under the noise and motion that are most likely of each.
 
     Gaps are bridged up to ``longest_gap`` frames; longer ones, and what is before the first measurement, stay NaN.
+    ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
 
     Source: Rauch, Tung, Striebel 1965.
     """
@@ -135,11 +149,12 @@ def adaptive_smoother(values: Tensor, settings: AdaptiveSettings | None = None) 
     points, dimensions = values.shape[1:]
     endless = replace(chosen, calm=0.0, memory=float("inf"), longest_gap=len(values))
     running = AdaptiveFilter(points, dimensions, endless)
-    for frame in values:  # a frame needs the one before
-        running.step(frame)
+    intervals = intervals or [1.0] * len(values)
+    for frame, interval in zip(values, intervals, strict=True):  # a frame needs the one before
+        running.step(frame, interval)
     combinations = chosen.combinations()
     each = [combinations[m] for m in running.scores.argmax(0).tolist() for _ in range(dimensions)]
-    return torch.where(_long_gaps(values, chosen.longest_gap), torch.nan, kalman_smoother(values, each))
+    return torch.where(_long_gaps(values, chosen.longest_gap), torch.nan, kalman_smoother(values, each, intervals))
 
 
 def _long_gaps(values: Tensor, longest: int) -> Tensor:

@@ -76,20 +76,42 @@ class KalmanFilter:
         self._unseen = torch.zeros(channels, dtype=torch.int64)
         if len({one.damping for one in each}) > 1:
             raise ValueRangeError("Kalman filter: found settings of different damping, expected one for all channels")
-        self._transition, noise = _model(each[0].damping)
-        self._noise = noise * torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
+        self._damping = each[0].damping
+        self._jerk = torch.tensor([one.jerk**2 for one in each], dtype=torch.float64)[:, None, None]
+        self._go_on(1.0)
 
     def to(self, device: torch.device) -> KalmanFilter:
         """The filter itself, with all that it holds on a device; ``step`` follows its measurements there."""
         if self.state.device != device:
-            for name in ("variance", "state", "covariance", "_longest_gap", "_unseen", "_transition", "_noise"):
+            for name in (
+                "variance",
+                "state",
+                "covariance",
+                "_longest_gap",
+                "_unseen",
+                "_jerk",
+                "_transition",
+                "_noise",
+            ):
                 setattr(self, name, getattr(self, name).to(device))
         return self
 
-    def predict(self) -> None:
-        """Goes one frame on."""
+    def predict(self, interval: float = 1.0) -> None:
+        """Goes on to the next frame.
+
+        Args:
+            interval: since the frame before, in frames of the usual length.
+        """
+        if interval != self._interval:
+            self._go_on(interval)
         self.state = self.state @ self._transition.T
         self.covariance = self._transition @ self.covariance @ self._transition.T + self._noise
+
+    def _go_on(self, interval: float) -> None:
+        transition, noise = _model(self._damping, interval)
+        self._interval = interval
+        self._transition = transition.to(self.state.device)
+        self._noise = noise.to(self.state.device) * self._jerk
 
     def correct(self, measured: Tensor) -> None:
         """Takes in a frame's measurements (C,); NaN means not seen."""
@@ -142,13 +164,16 @@ def kalman_filter(values: Tensor, settings: KalmanSettings | Sequence[KalmanSett
     return torch.stack([running.step(frame).clone() for frame in curves]).to(values.dtype).reshape(values.shape)
 
 
-def kalman_smoother(values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings]) -> Tensor:
+def kalman_smoother(
+    values: Tensor, settings: KalmanSettings | Sequence[KalmanSettings], intervals: Sequence[float] | None = None
+) -> Tensor:
     """Each frame from all frames, those after it too; for work that need not be live.
 
     Args:
         values: measurements (T,...), NaN for not seen.
         settings: see :class:`KalmanSettings`, of all channels or one a channel; all gaps are bridged, whatever
             ``longest_gap`` is.
+        intervals: from the frame before to each of T frames, in frames of the usual length; 1 if absent.
 
     Returns:
         Smoothed values of the same shape and dtype; NaN for a channel that was never seen, and before its first
@@ -163,16 +188,15 @@ def kalman_smoother(values: Tensor, settings: KalmanSettings | Sequence[KalmanSe
     else:
         running = KalmanFilter(curves.shape[1], [replace(one, longest_gap=frames) for one in settings])
     running.to(curves.device)
-    transition = running._transition
     predicted, filtered = [], []
-    for frame in curves:
-        running.predict()
-        predicted.append((running.state, running.covariance))
+    for frame, interval in zip(curves, intervals or [1.0] * frames, strict=True):
+        running.predict(interval)
+        predicted.append((running.state, running.covariance, running._transition))
         running.correct(frame)
         filtered.append((running.state, running.covariance))
     state = filtered[-1][0]
     smoothed = [state[:, 0]]
-    for (ahead, ahead_covariance), (here, covariance) in zip(
+    for (ahead, ahead_covariance, transition), (here, covariance) in zip(
         reversed(predicted[1:]), reversed(filtered[:-1]), strict=True
     ):
         gain = torch.linalg.solve(_regular(ahead_covariance), transition @ covariance).transpose(1, 2)
@@ -227,11 +251,12 @@ def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) 
     return KalmanSettings(deviation, calm * float(_RATIOS[best]) * deviation, longest_gap)
 
 
-def _model(damping: float) -> tuple[Tensor, Tensor]:
-    """The transition, and the covariance that white jerk of deviation 1 adds in a frame."""
-    transition = torch.tensor([[1, 1, 0.5], [0, 1, 1], [0, 0, damping]], dtype=torch.float64)
-    noise = torch.tensor([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]], dtype=torch.float64)
-    return transition, noise
+def _model(damping: float, interval: float) -> tuple[Tensor, Tensor]:
+    """The transition over an interval in frames, and the covariance that white jerk adds, of deviation 1 in a frame."""
+    h = interval
+    transition = torch.tensor([[1, h, h**2 / 2], [0, 1, h], [0, 0, damping**h]], dtype=torch.float64)
+    noise = [[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2], [h**3 / 6, h**2 / 2, h]]
+    return transition, torch.tensor(noise, dtype=torch.float64)
 
 
 def _first(measured: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:

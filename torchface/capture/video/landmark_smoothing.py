@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from torchface.errors import ShapeError
@@ -35,8 +37,12 @@ class LandmarkFilter:
         return self._filter.step(landmarks).to(landmarks.dtype)
 
 
-def filter_landmarks(landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SETTINGS) -> Tensor:
+def filter_landmarks(
+    landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SETTINGS, intervals: Sequence[float] | None = None
+) -> Tensor:
     """Landmarks (T,L,2) of a whole video, NaN for not seen, as :class:`LandmarkFilter` gives them.
+
+    ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
 
     Raises:
         ShapeError: landmarks of another shape.
@@ -44,15 +50,18 @@ def filter_landmarks(landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SE
 
     Source: thesis 4.2.5.
     """
-    return adaptive_filter(_checked(landmarks), settings)
+    return adaptive_filter(_checked(landmarks), settings, intervals)
 
 
-def smooth_landmarks(landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SETTINGS) -> Tensor:
+def smooth_landmarks(
+    landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SETTINGS, intervals: Sequence[float] | None = None
+) -> Tensor:
     """Landmarks (T,L,2) of a whole video from all frames, those after each too, for work that need not be live.
 
     Args:
         landmarks: pixels, NaN for not seen.
         settings: noises and motions, pixels; gaps up to ``longest_gap`` frames are bridged.
+        intervals: from the frame before to each of T, in frames of the usual length; 1 if absent.
 
     Returns:
         Smoothed landmarks, (T,L,2); NaN in longer gaps and before a landmark was first seen.
@@ -63,7 +72,7 @@ def smooth_landmarks(landmarks: Tensor, settings: AdaptiveSettings = LANDMARK_SE
 
     Source: Rauch, Tung, Striebel 1965; thesis 4.2.5.
     """
-    return adaptive_smoother(_checked(landmarks), settings)
+    return adaptive_smoother(_checked(landmarks), settings, intervals)
 
 
 def _checked(landmarks: Tensor) -> Tensor:

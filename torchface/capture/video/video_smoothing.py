@@ -60,14 +60,19 @@ def solve_whole_take(
     return VideoSolution(weights, turned, moved, errors, enough, told)
 
 
-def interpolated(weights: Tensor, solved: Tensor) -> Tensor:
-    """Weights (T,N) with straight lines where ``solved`` (T,) is false; at both ends they stay."""
+def interpolated(weights: Tensor, solved: Tensor, seconds: Tensor | None = None) -> Tensor:
+    """Weights (T,N) with straight lines where ``solved`` (T,) is false; at both ends they stay.
+
+    ``seconds`` (T,) say when frames are shown; evenly if absent.
+    """
     known = solved.nonzero()[:, 0]
     at = torch.arange(len(weights), device=weights.device)
     after = torch.searchsorted(known, at).clamp(max=len(known) - 1)
     before = (torch.searchsorted(known, at, right=True) - 1).clamp(min=0)
     left, right = known[before], known[after]
-    fraction = ((at - left) / (right - left).clamp(min=1)).clamp(0, 1).to(weights)[:, None]
+    when = at.double() if seconds is None else seconds.to(weights.device).double()
+    length = when[right] - when[left]
+    fraction = torch.where(length > 0, (when - when[left]) / length, 0.0).clamp(0, 1).to(weights)[:, None]
     return torch.lerp(weights[left], weights[right], fraction)
 
 

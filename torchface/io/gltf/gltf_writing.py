@@ -71,7 +71,7 @@ def save_gltf_mesh(mesh: Mesh, path: str | Path) -> None:
 
 
 def save_animation(rig: BlendshapeRig, take: Take, path: str | Path, detail: DetailMaps | None = None) -> ShapeMatch:
-    """Writes a rig as ``.glb`` with the take's weights as its animation, a key a frame, linear between.
+    """Writes a rig as ``.glb`` with the take's weights as its animation, a key a frame at its time, linear between.
 
     Args:
         rig: the rig.
@@ -104,7 +104,9 @@ def save_animation(rig: BlendshapeRig, take: Take, path: str | Path, detail: Det
             f"take: none of its {len(track.names)} channels ({', '.join(track.names[:5])}, ...) drives one of the "
             f"rig's {len(rig.names)} shapes ({', '.join(rig.names[:5])}, ...)"
         )
-    times = torch.arange(len(values), dtype=torch.float64) / take.fps
+    times = take.uneven_seconds()
+    if times is None:
+        times = torch.arange(len(values), dtype=torch.float64) / take.fps
     _write(path, rig.neutral, rig.deltas, rig.names, (times.float(), values @ matrix.T), detail)
     by_shape, by_channel = drives.any(1).tolist(), drives.any(0).tolist()
     return ShapeMatch(

@@ -98,12 +98,14 @@ def save_landmarks_csv(take: Take, path: str | Path) -> None:
     confidence = take.landmarks.confidence
     level = torch.ones(len(take)) if confidence is None else confidence.detach().cpu().double().mean(1).float()
     numbers = frame_numbers(take, first=1)
+    seconds = take.uneven_seconds()
+    times = [(number - numbers[0]) / fps for number in numbers] if seconds is None else seconds.tolist()
     coordinates = [number_texts(values[:, :, axis].reshape(-1)) for axis in (0, 1)]
     others = [number_texts(column.detach().cpu().to(torch.float64).numpy()) for column in columns.values()]
     levels, width = number_texts(level.numpy()), len(names)
     rows = (
         [
-            *(str(number), repr((number - numbers[0]) / fps), levels[row], str(int(not unseen[row].all()))),
+            *(str(number), repr(times[row]), levels[row], str(int(not unseen[row].all()))),
             *(cell for cells in coordinates for cell in cells[row * width : (row + 1) * width]),
             *(cells[row] for cells in others),
         ]

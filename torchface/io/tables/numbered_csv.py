@@ -74,18 +74,20 @@ def write_numbered(
     before: Mapping[str, Sequence[str]] = {},
     behind: Mapping[str, Sequence[str]] = {},
 ) -> None:
-    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none.
+    """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none, and its times.
 
     Columns of texts, one a frame, stand before and behind them.
     """
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     numbers = frame_numbers(take, first=0)
+    seconds = take.uneven_seconds()
+    times = [number / fps for number in numbers] if seconds is None else seconds.tolist()
     cells = number_texts(values.reshape(-1))
     width = len(names)
     rows = (
         [
             str(number),
-            repr(number / fps),
+            repr(times[row]),
             *(texts[row] for texts in before.values()),
             *cells[row * width : (row + 1) * width],
             *(texts[row] for texts in behind.values()),

@@ -99,7 +99,17 @@ def _base(seconds: np.ndarray, frames: np.ndarray, drop: bool) -> int:
 def write_timecodes(count: int, fps: float, first: int = 0) -> tuple[str, ...]:
     """Timecodes of ``count`` frames from number ``first`` on, 0 at midnight, in thousandths of the base's frames."""
     base = max(1, round(fps))
-    ticks = np.rint(np.arange(first, first + count) * (1000 * base / fps)).astype(np.int64)
+    return _texts(np.rint(np.arange(first, first + count) * (1000 * base / fps)), base)
+
+
+def timecodes_at(seconds: np.ndarray, fps: float) -> tuple[str, ...]:
+    """Timecodes of times (T,), 0 at midnight, in thousandths of frames of the nearest whole rate."""
+    base = max(1, round(fps))
+    return _texts(np.rint(seconds * (1000 * base)), base)
+
+
+def _texts(ticks: np.ndarray, base: int) -> tuple[str, ...]:
+    ticks = ticks.astype(np.int64)
     seconds, parts = ticks // (1000 * base) % _DAY, ticks % (1000 * base)
     return tuple(
         f"{second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}:{part // 1000:02d}.{part % 1000:03d}"

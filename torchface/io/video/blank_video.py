@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from torchface.io.video.video_file import VideoFile
 
@@ -18,6 +19,10 @@ class BlankVideo(VideoFile):
 
     def check(self) -> None:
         """There is nothing to refuse."""
+
+    def uneven_seconds(self) -> tuple[Tensor | None, str]:
+        """There are no times but even ones."""
+        return None, ""
 
     def _decoded(self) -> Iterator[np.ndarray]:
         frame = np.full((self.height, self.width, 3), _GREY, np.uint8)

@@ -122,4 +122,6 @@ def _demuxer(path: Path) -> str:
         return "matroska"
     if head[4:8] in _MOV_BOXES:
         return "mov"
-    raise FileFormatError(f"{path}: found {head[:8]!r} at its start, expected an AVI, Matroska, MP4 or MOV video")
+    if head[:6] in (b"GIF87a", b"GIF89a"):
+        return "gif"
+    raise FileFormatError(f"{path}: found {head[:8]!r} at its start, expected an AVI, Matroska, MP4, MOV or GIF video")

@@ -18,23 +18,39 @@ _MAX_DEVIATION = 0.25  # a jitter of ±0.2 frames in the times makes 0.16 in the
 
 
 def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
-    """Refuses a video of variable frame rate: what is solved counts in frames of one length.
+    """Refuses a video of variable frame rate, where what reads it counts in frames of one length.
+
+    Args:
+        path: for the message.
+        seconds, fps: as of :func:`rate_changes`.
+
+    Raises:
+        FileFormatError: the message says how frames last and how to convert the file.
+    """
+    changes = rate_changes(seconds, fps)
+    if changes:
+        usual = float(np.median(np.diff(np.unique(seconds[np.isfinite(seconds)]))))
+        rate = min(COMMON_RATES, key=lambda other: abs(other - 1 / usual))
+        raise FileFormatError(
+            f"{path}: found a variable frame rate: {changes}; expected an even rate. "
+            f"To convert it: ffmpeg -i {path.name} -vf fps={rate:.5g} {path.stem}_even.mp4"
+        )
+
+
+def rate_changes(seconds: np.ndarray, fps: float) -> str:
+    """How a video's frame rate varies, in words; empty where it is even.
 
     Phone cameras jitter by some milliseconds and lose a frame now and then: that passes. What does not: a rate that
     changes by more than a tenth, averaged over fifteen frames, durations that deviate by more than a quarter (root mean
     square), and holes in which more than one frame in a hundred is missing.
 
     Args:
-        path: for the message.
         seconds: when each frame is shown, (P,), in any order; a repeated time counts once.
         fps: what the header says.
-
-    Raises:
-        FileFormatError: the message says how frames last and how to convert the file.
     """
     durations = np.diff(np.unique(seconds[np.isfinite(seconds)]))
     if len(durations) < 3:
-        return
+        return ""
     usual = float(np.median(durations))
     holes = np.abs(durations / usual - 1) > _HOLE
     usual = float(durations[~holes].mean())
@@ -53,10 +69,8 @@ def check_even_rate(path: Path, seconds: np.ndarray, fps: float) -> None:
     elif abs(float(durations.mean()) - 1 / fps) > allowed:
         what = f"its header says {fps:g} frames a second"
     else:
-        return
-    rate = min(COMMON_RATES, key=lambda other: abs(other - 1 / usual))
-    raise FileFormatError(
-        f"{path}: found a variable frame rate: frames last {1000 * usual:.1f} ms as a rule, but {what} "
-        f"({1000 * durations.min():.1f} to {1000 * durations.max():.1f} ms); expected an even rate. "
-        f"To convert it: ffmpeg -i {path.name} -vf fps={rate:.5g} {path.stem}_even.mp4"
+        return ""
+    return (
+        f"frames last {1000 * usual:.1f} ms as a rule, but {what} "
+        f"({1000 * durations.min():.1f} to {1000 * durations.max():.1f} ms)"
     )

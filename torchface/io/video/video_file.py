@@ -17,7 +17,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.video.container import frames_beside, open_container, pyav, reason
 from torchface.io.video.packets import key_frame_sizes, packets_of, quarter_turns, read_packets
-from torchface.io.video.timing import check_even_rate
+from torchface.io.video.timing import check_even_rate, rate_changes
 from torchface.number_checks import check_rate
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class VideoFile:
         fps: frames a second.
         width, height: pixels, upright: a phone's rotation is applied.
         count: frames that are shown; of a file that is cut off, those its header promises.
+        even: whether frames must come at an even rate; else what reads them asks ``uneven_seconds`` when they come.
     """
 
     path: Path
@@ -44,6 +45,21 @@ class VideoFile:
     width: int
     height: int
     count: int
+    even: bool = True
+
+    def uneven_seconds(self) -> tuple[Tensor | None, str]:
+        """When each frame is shown, (count,) float64 from 0, and how the rate varies; None where it is even.
+
+        Raises:
+            FileFormatError: the rate varies, and times are missing or repeated.
+        """
+        seconds = read_packets(self.path).seconds
+        changes = rate_changes(seconds, self.fps)
+        if not changes:
+            return None, ""
+        if len(seconds) != self.count or not np.all(np.diff(seconds) > 0):  # NaN rises nowhere
+            check_even_rate(self.path, seconds, self.fps)
+        return torch.from_numpy(seconds - seconds[0]), changes
 
     def check(self) -> None:
         """Goes through the file, decoding key frames alone, and refuses what cannot become a take.
@@ -51,10 +67,11 @@ class VideoFile:
         ``chunks`` and ``color_chunks`` do so before their first frame.
 
         Raises:
-            FileFormatError: frames change their size on the way, or come at a variable rate.
+            FileFormatError: frames change their size on the way, or come at a variable rate where it must be ``even``.
         """
         packets = read_packets(self.path)
-        check_even_rate(self.path, packets.seconds, self.fps)
+        if self.even:
+            check_even_rate(self.path, packets.seconds, self.fps)
         first: tuple[int, int] | None = None
         for seconds, width, height in key_frame_sizes(self.path):
             first = first or (width, height)
@@ -148,7 +165,7 @@ def open_video(path: str | Path) -> VideoFile:
     """Opens a video, counts its frames and decodes the first one, so that a bad file is refused at once.
 
     Args:
-        path: an ``.avi``, ``.mkv``, ``.webm``, ``.mp4`` or ``.mov`` file; recognised by its content.
+        path: an ``.avi``, ``.mkv``, ``.webm``, ``.mp4``, ``.mov`` or ``.gif`` file; recognised by its content.
 
     Raises:
         FileFormatError: the file is missing, no video, of a codec that is not there, or claims absurd sizes.

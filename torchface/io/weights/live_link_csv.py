@@ -13,7 +13,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Val
 from torchface.io.tables.csv_table import TableReader, parse_number, quoted, write_table
 from torchface.io.tables.frame_rates import frame_numbers
 from torchface.io.tables.numbered_csv import is_numbered
-from torchface.io.tables.timecode import read_timecodes, write_timecodes
+from torchface.io.tables.timecode import read_timecodes, timecodes_at, write_timecodes
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
@@ -142,7 +142,11 @@ def save_live_link(take: Take, path: str | Path) -> None:
     names, values = values_to_write(take.weights, "weights", 1, path)
     names, values = _as_arkit(names, values[..., 0], path)
     check_rate(take.fps, f"{path}: the take", ValueRangeError)
-    timecodes = take.timecode or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
+    seconds = take.uneven_seconds()
+    timecodes = take.timecode
+    if timecodes is None and seconds is not None:
+        timecodes = timecodes_at(seconds.numpy(), take.fps)
+    timecodes = timecodes or write_timecodes(len(take), take.fps, max(0, frame_numbers(take, first=0)[0]))
     try:
         read_timecodes(timecodes, path)
     except FileFormatError as error:

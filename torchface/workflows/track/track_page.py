@@ -156,8 +156,10 @@ def _player(tracked: Tracked) -> str:
 
 def _doubtful(tracked: Tracked) -> Table:
     spans = tracked.doubtful_spans()
-    fps = tracked.video.fps
-    rows = [(f"{first} to {last}", f"{first / fps:.2f} to {last / fps:.2f} s", what) for first, last, what in spans]
+    rows = [
+        (f"{first} to {last}", f"{tracked.seconds_at(first):.2f} to {tracked.seconds_at(last):.2f} s", what)
+        for first, last, what in spans
+    ]
     return Table(("frames", "time", "what is doubtful"), rows or [("none", "", "")])
 
 

@@ -46,6 +46,8 @@ class Tracked:
         light: of the video, where a texture was put on the face.
         offsets: between the rig's landmarks and those found; None where the take is too short to tell.
         finder: what found the landmarks, by its name.
+        times: when each frame is shown, (T,) seconds, where the frame rate varies; even at the video's if absent.
+        rate_varies: how, in words.
     """
 
     video: VideoFile
@@ -62,6 +64,12 @@ class Tracked:
     light: PointLight | None = None
     offsets: LandmarkOffsets | None = None
     finder: str = ""
+    times: Tensor | None = None
+    rate_varies: str = ""
+
+    def seconds_at(self, frame: int) -> float:
+        """When a frame is shown."""
+        return frame / self.video.fps if self.times is None else float(self.times[frame])
 
     @property
     def seen(self) -> Tensor:
@@ -115,6 +123,11 @@ class Tracked:
             f"landmarks: jitter {self.jitter:.2f} px; to the solved rig's: median {float(errors.nanmedian()):.2f} px, "
             f"95th percentile {float(errors.nanquantile(0.95)):.2f} px",
         ]
+        if self.times is not None:
+            lines.append(
+                f"variable frame rate: {self.rate_varies}; weights.csv and animation.glb have the frames' own times, "
+                f"the overlay and the timecodes run at {self.video.fps:.2f} frames a second"
+            )
         if self.calibration.assumed:
             lines.append(
                 f"camera: none given; assumed a field of view of {self.calibration.field_of_view:.0f} degrees "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -11,10 +12,12 @@ import torch
 from torch import Tensor
 
 from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
+from torchface.capture.video.even_frames import even_times, solution_at, values_at
 from torchface.capture.video.landmark_offsets import LandmarkOffsets
 from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
 from torchface.capture.video.offset_estimate import estimate_offsets
 from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
+from torchface.capture.video.weight_walk import frame_intervals
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
@@ -30,6 +33,7 @@ from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.face_box import find_faces
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, trust_of
 from torchface.landmarks.images.tracking import LandmarkTracker, naming_the_frame
+from torchface.number_checks import check_rate
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
@@ -59,6 +63,7 @@ from torchface.workflows.track.track_state import TrackedFrames, TrackState
 PIECE = 64
 """Frames whose landmarks are kept at a time: what a killed run loses at most."""
 
+_AT_ITS_TIMES = "solved at the frames' own times; the overlay and live_link.csv's timecodes run at the mean rate"
 _METHOD = "track/4"
 """Of the keys; another number where the same inputs, or another ``PIECE``, come to give other results."""
 
@@ -111,12 +116,15 @@ def track_video(
 
     Without a video the landmarks are those of a table, and no overlay is drawn.
 
+    A video of variable frame rate is solved at its frames' own times, with a warning; with a dynamics prior at its mean
+    rate, brought back to those times.
+
     A run killed at any moment leaves complete files only. Started again, it goes on behind the landmarks that it had,
     and makes anew what depends on something that has changed.
 
     Raises:
-        FileFormatError: the video cannot be decoded, changes its size or has a variable frame rate; or another file
-            is broken.
+        FileFormatError: the video cannot be decoded, changes its size or repeats times of frames; or another file is
+            broken.
         ValueRangeError: there is no face in the video, the rig has no 68 landmarks, the take is too short for the
             dynamics prior, or the offsets are another rig's or finder's; or another run is writing into ``out``.
         NameMismatchError: a model is missing, or a prior has learned other shapes than the rig has.
@@ -128,6 +136,10 @@ def track_video(
 def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettings, progress: Progress) -> Tracked:
     clip = _clip(video, settings)
     clip.check()
+    times, rate_varies = clip.uneven_seconds()
+    if times is not None:
+        clip = replace(clip, fps=check_rate(float((len(times) - 1) / times[-1]), str(clip.path)))
+        warnings.warn(f"{clip.path}: found a variable frame rate: {rate_varies}; {_AT_ITS_TIMES}", stacklevel=3)
     actor = load_actor(rig, settings.part)
     calibration = camera_of(clip, settings.camera)
     models = load_track_models(
@@ -153,11 +165,15 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         state.clear()
         raise ValueRangeError(f"{clip.path}: found no face in any of its {len(frames)} frames, expected one")
     begin = time.perf_counter()
+    times = None if times is None else _times_of(times, len(frames), clip.fps)
+    intervals = None
+    if times is not None:
+        intervals = [clip.fps * step for step in frame_intervals(times, len(frames), 1 / clip.fps)]
     steadied = smooth_landmarks if settings.whole_take else filter_landmarks
     trust = trust_of(frames.confidence, frames.visibility)
     # What is hidden is a guess, that a filter would carry on into the frames after.
     seen = torch.where(trust[..., None] > 0, frames.landmarks.double(), torch.nan)
-    pinhole = steadied(undistort(seen, calibration)).float()
+    pinhole = steadied(undistort(seen, calibration), intervals=intervals).float()
     seconds["steadying"] = time.perf_counter() - begin
     solver = solver_for(actor, models, calibration, clip.fps)
     begin = time.perf_counter()
@@ -177,11 +193,12 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         whole_take=settings.whole_take,
         solver=solver.settings,
         offsets=torch.zeros(0) if offsets is None else offsets.millimetres,
+        seconds=torch.zeros(0) if times is None else times,
     )
     solution = kept_solution(state, solve_key, len(frames), len(actor.names))
     if solution is None:
         begin = time.perf_counter()
-        solution = _solve(solver, pinhole, trust, settings.whole_take, progress)
+        solution = _solve(solver, pinhole, trust, settings.whole_take, progress, times)
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
@@ -199,6 +216,8 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         models.unlearned,
         offsets=offsets,
         finder=Path(settings.landmarks).name,
+        times=times,
+        rate_varies=rate_varies,
     )
     with all_or_none():
         products |= write_curves(tracked, out)
@@ -278,7 +297,7 @@ def _clip(video: Path | None, settings: TrackSettings) -> VideoFile:
     if video is not None:
         if settings.fps is not None or settings.size is not None:
             raise ValueRangeError(f"{video}: found --fps or --size beside a video, expected them without one alone")
-        return open_video(video)
+        return replace(open_video(video), even=False)
     if not is_table(settings.landmarks):
         raise ValueRangeError("track: found neither a video nor a table of landmarks, expected one at least")
     if settings.texture is not None:
@@ -320,6 +339,12 @@ def _track(
             progress("tracking landmarks", at, max(clip.count, at))
         state.append(TrackedFrames.of_faces(found), tracker.memory)
     return faces
+
+
+def _times_of(times: Tensor, count: int, fps: float) -> Tensor:
+    """Times of as many frames as could be decoded: a file that was cut lacks some at its end."""
+    more = times[-1] + torch.arange(1, max(count - len(times), 0) + 1, dtype=times.dtype) / fps
+    return torch.cat([times, more])[:count]
 
 
 def rig_digest(rig: BlendshapeRig) -> str:
@@ -382,15 +407,24 @@ def _solve(
     confidence: Tensor,
     whole_take: bool,
     progress: Progress,
+    times: Tensor | None,
 ) -> VideoSolution:
+    """What the landmarks tell; ``times`` (T,) say when frames are shown, evenly if absent."""
+    enough = torch.isfinite(landmarks).all(-1).sum(1) >= MIN_STABLE
+    if times is not None and solver.dynamics is not None:  # which has learned how faces go on in frames of one length
+        even = even_times(times)
+        points, trust = (values_at(x, times, even) for x in (landmarks, confidence))
+        if bool((torch.isfinite(points).all(-1).sum(1) >= MIN_STABLE).any()):
+            solution = _solve(solver, points, trust, whole_take, progress, None)
+            return solution_at(solution, solver, even, times, landmarks, confidence, enough)
     if whole_take and solver.dynamics is not None:
         progress("solving for weights")
         return solve_whole_take(solver, landmarks, confidence=confidence)
-    enough = torch.isfinite(landmarks).all(-1).sum(1) >= MIN_STABLE
     first = int(enough.nonzero()[0, 0])
+    intervals = frame_intervals(times, len(landmarks), solver.settings.interval)
     states, state = [], solver.start()
     for t in range(first, len(landmarks)):  # a frame leans on the one before
-        state = solver.step(state, landmarks[t], confidence=confidence[t])
+        state = solver.step(state, landmarks[t], confidence=confidence[t], interval=intervals[t])
         states.append(state)
         progress("solving for weights", t + 1, len(landmarks))
     states = [states[0]] * first + states
@@ -399,7 +433,7 @@ def _solve(
         for name in ("weights", "rotation", "translation")
     )
     if whole_take:
-        weights = interpolated(weights, enough)
+        weights = interpolated(weights, enough, times)
     errors = solver.reprojection_errors(landmarks, weights, rotation, translation)
     told = solver.shape_confidence(solver.landmark_trust(landmarks, confidence)).to(landmarks)
     return VideoSolution(weights, rotation, translation, errors, enough, told)
