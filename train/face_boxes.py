@@ -142,7 +142,10 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
         card=(
             "Faces in whole colour or grey pictures: centre, side, score and roll angle of each. Boxes are those of "
             "`torchface.landmarks.images.ibug_68.turned_box`. Good for faces from 24 pixels in pictures of 640. Tested "
-            f"on {settings.tested} scenes of {_TEST_SIZE} pixels with people that it had not seen."
+            f"on {settings.tested} scenes of {_TEST_SIZE} pixels with people that it had not seen. It has seen no "
+            "photograph: in real ones small faces of groups are missed where cascades find them, boxes fit more "
+            "loosely, and faces turned by more than 40 degrees are found best in turned copies of the picture "
+            "(`torchface.landmarks.images.turned_search.find_in_quarter_turns`)."
         ),
         settings=effective,
         half=[name for name, value in model.state_dict().items() if value.ndim == 4],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from torchface.errors import TorchfaceError
+from torchface.errors import FileFormatError, TorchfaceError
 from torchface.files.documents import read_toml
 from torchface.files.models import DESCRIPTION
 
@@ -23,6 +23,19 @@ def model_roots(package: Path, home: str | None) -> list[Path]:
     wanted = [checkout / "models"] if is_checkout(checkout, package.name) else []
     wanted += [package / "_models", *([Path(home)] if home else [])]
     return list({root.resolve(): root for root in reversed(wanted) if is_folder(root)}.values())[::-1]
+
+
+def shipped_model(name: str) -> Path:
+    """The folder of a model that comes with torchface.
+
+    Raises:
+        FileFormatError: it is not there.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for root in model_roots(package, None):
+        if is_model(root, name):
+            return root / name
+    raise FileFormatError(f"{package.parent / 'models' / name}: found no such folder, expected the shipped model")
 
 
 def is_checkout(folder: Path, package: str) -> bool:

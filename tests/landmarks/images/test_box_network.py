@@ -9,10 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface import zoo
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
 from torchface.landmarks.images.box_network import FaceMaps, face_geometry
 from torchface.landmarks.images.box_training import box_loss
+from torchface.landmarks.images.face_box import FaceBoxes
+from torchface.landmarks.images.network_detector import shipped_detector
+from torchface.landmarks.images.turned_search import find_in_quarter_turns
 
 FEW = BoxTrainingSettings(
     pictures=1440, batch=8, rate=2e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1), checkpoint=2
@@ -98,6 +102,34 @@ def test_a_turned_picture_turns_the_box(taught: NetworkDetector) -> None:
     assert float((middle - torch.tensor([95 - y, x])).abs().max()) < 3
     off = math.remainder(float(turned.tilts[0] - upright.tilts[0]) - math.pi / 2, 2 * math.pi)
     assert abs(off) < 0.25
+
+
+def test_quarter_turns_give_boxes_and_tilts_of_the_picture_itself() -> None:
+    image = torch.zeros(3, 90, 140, dtype=torch.uint8)
+    image[0, 20:31, 95:106] = 200  # what is white shows where up is
+    image[:, 20:23, 95:106] = 255
+
+    def upright_alone(shown: Tensor) -> FaceBoxes:
+        rows, columns = (shown[0] > 0).nonzero().unbind(1)
+        up = int((shown[1] > 0).nonzero()[:, 0].max()) - int(rows.min())
+        flat = int((shown[1] > 0).sum(1).amax()) == 11
+        middle = torch.stack([columns.float().mean(), rows.float().mean()])
+        box = torch.cat([middle - 5, torch.tensor([10.0, 10.0])])
+        return FaceBoxes(box[None], torch.tensor([0.9 if flat and up < 5 else 0.1]), torch.tensor([0.1]))
+
+    for quarters, tilt in ((0, 0.0), (1, -math.pi / 2), (2, math.pi), (3, math.pi / 2)):  # counter-clockwise
+        turned = image.rot90(quarters, (1, 2))
+        found = find_in_quarter_turns(turned, upright_alone)
+        rows, columns = (turned[0] > 0).nonzero().unbind(1)
+        middle = torch.stack([columns.float().mean(), rows.float().mean()])
+        assert len(found) == 1
+        torch.testing.assert_close(found.boxes[0, :2] + 5, middle)
+        assert math.remainder(float(found.tilts[0]) - tilt - 0.1, 2 * math.pi) == pytest.approx(0, abs=1e-5)
+
+
+def test_the_shipped_network_is_small_and_finds_nobody_on_a_wall() -> None:
+    assert zoo.describe("face_boxes").size < 500_000
+    assert len(shipped_detector()(torch.full((3, 240, 320), 128, dtype=torch.uint8))) == 0
 
 
 def test_a_plain_picture_shows_nobody(taught: NetworkDetector) -> None:

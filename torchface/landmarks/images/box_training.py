@@ -60,11 +60,11 @@ class BoxTrainingSettings:
         checkpoint: steps from one to the next.
     """
 
-    pictures: int = 20_480
-    batch: int = 8
-    rate: float = 4e-3
+    pictures: int = 80_000
+    batch: int = 16
+    rate: float = 3e-3
     decay: float = 1e-4
-    averaged: int = 150
+    averaged: int = 200
     channels: tuple[int, ...] = (24, 32, 64, 96)
     blocks: tuple[int, ...] = (1, 3, 4, 4)
     checkpoint: int = 100

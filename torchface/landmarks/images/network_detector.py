@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import cache
 
 import cv2
 import numpy as np
@@ -11,11 +12,14 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from torchface.errors import ValueRangeError
+from torchface.files.model_roots import shipped_model
+from torchface.files.models import read_model
 from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.landmarks.images.face_box import FaceBoxes, check_image, overlaps, sorted_boxes
 
 _MULTIPLE = 32  # pixels: the stride of the network's coarsest level
 _OVERLAP = 0.3  # of two boxes that are of one face
+_SHIPPED_SCORE = 0.55  # above the usual 0.4: four turns show four times as much that is no face
 
 
 class NetworkDetector:
@@ -60,6 +64,17 @@ class NetworkDetector:
         alone = _one_each(boxes)
         tilts = torch.atan2(faces[:, 5], faces[:, 4])
         return sorted_boxes(boxes[alone], faces[alone, 3], tilts[alone])
+
+
+@cache
+def shipped_detector() -> NetworkDetector:
+    """The detector of the zoo's ``face_boxes``, read once.
+
+    Raises:
+        FileFormatError: it is missing or damaged.
+    """
+    network = read_model(shipped_model("face_boxes"), {"face_boxes": BoxNetwork})
+    return NetworkDetector(network, _SHIPPED_SCORE)
 
 
 def _padded(pixels: Tensor) -> Tensor:

@@ -82,10 +82,10 @@ class SceneSettings:
         broken: share of people whose face is shuffled, covered with skin or with hair: they are none.
     """
 
-    size: int = 192
+    size: int = 256
     people: int = 4
     smallest: float = 15.0
-    largest: float = 210.0
+    largest: float = 260.0
     turned: float = 0.35
     broken: float = 0.12
 
