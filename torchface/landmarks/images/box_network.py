@@ -79,6 +79,7 @@ class BoxNetwork(nn.Module):
         self.from_16 = _convolution(third, second, 1)
         self.mixed_8 = nn.Sequential(_Separable(second, second, 3), _Separable(second, 2 * second, 3))
         self.said = nn.Conv2d(2 * second, 6, 1)
+        assert self.said.bias is not None
         with torch.no_grad():
             self.said.weight.mul_(0.1)
             self.said.bias.copy_(torch.tensor([-4.6, 0, 0, 0, 0.5, 0]))  # a cell in a hundred; upright

@@ -157,7 +157,8 @@ def fit_boxes(
         progress(f"learning, loss {recent:.3f}", step, settings.steps)
         if checkpoint is not None and step % settings.checkpoint == 0 and step < settings.steps:
             write_checkpoint(checkpoint, _state(step, model, average, optimiser), key)
-    found: BoxNetwork = average.module
+    found = average.module
+    assert isinstance(found, BoxNetwork)
     return found.to(memory_format=torch.contiguous_format).eval()  # type: ignore[call-overload]
 
 
