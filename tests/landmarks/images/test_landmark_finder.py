@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks import FaceBoxes, FoundLandmarks, LandmarkTracker, track_landmarks
+from torchface.landmarks import (
+    FaceBoxes,
+    FoundLandmarks,
+    LandmarkTracker,
+    NoFaceError,
+    find_landmarks,
+    track_landmarks,
+)
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around
 from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
 from torchface.synthetic import performer
@@ -184,3 +191,15 @@ def test_a_mouth_behind_a_hand_counts_nothing() -> None:
     assert float(trust[1, 48:].max()) == 0
     assert float(trust[1, 4:13].max()) == 0  # nor does the chin below it
     torch.testing.assert_close(trust[1, 13:48], confidence[1, 13:48])
+
+
+def test_a_box_that_shows_no_face_is_told() -> None:
+    def doubting(image: torch.Tensor, box: torch.Tensor, tilt: float = 0.0) -> FoundLandmarks:
+        marks = box[:2] + box[2:] * torch.rand(68, 2, generator=torch.Generator().manual_seed(1))
+        return FoundLandmarks(marks, torch.ones(68), torch.ones(68), 0.02)
+
+    def one_box(image: torch.Tensor) -> FaceBoxes:
+        return FaceBoxes(torch.tensor([[10.0, 10.0, 40.0, 40.0]]), torch.ones(1))
+
+    with pytest.raises(NoFaceError, match=r"with a probability of 0\.02, expected a face"):
+        find_landmarks(torch.zeros(80, 80, dtype=torch.uint8), doubting, detector=one_box)
