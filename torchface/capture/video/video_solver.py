@@ -123,8 +123,8 @@ class VideoSolver(VideoSolverParts):
         intervals = frame_intervals(seconds, count, self.settings.interval)
         # A frame leans on the one before, so frames come one after the other.
         for t in range(first, count):
-            given = (None if x is None else x[t] for x in (rotation, translation, confidence))
-            state = self.step(state, landmarks[t], *given, intervals[t])
+            turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
+            state = self.step(state, landmarks[t], turn, place, sure, intervals[t])
             states.append(state)
         return [states[0]] * first + states, enough
 

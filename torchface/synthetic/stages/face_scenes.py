@@ -128,7 +128,8 @@ def _staged(people: CutOuts, number: int, settings: SceneSettings, seed: int) ->
     owner = np.full((size, size), -1, dtype=np.int16)
     count = int(rng.choice(settings.people + 1, p=_crowd(settings.people)))
     sides = np.exp(rng.uniform(np.log(settings.smallest), np.log(settings.largest), count))
-    faces, hulls = [], []
+    faces: list[np.ndarray] = []
+    hulls: list[np.ndarray] = []
     for side in np.sort(sides):  # in front of those before
         face, hull = _stand(image, owner, people, float(side), len(faces), settings, rng)
         if face is not None:
@@ -260,7 +261,7 @@ def _broken(picture: np.ndarray, marks: np.ndarray, rng: np.random.Generator) ->
                 here[1] : here[1] + step[1], here[0] : here[0] + step[0]
             ]
         return picture
-    mask = np.zeros((side, side), dtype=np.float32)
+    mask: np.ndarray = np.zeros((side, side), dtype=np.float32)
     cv2.fillConvexPoly(mask, cv2.convexHull(hull.round().astype(np.int32)), 1.0)
     mask = cv2.GaussianBlur(cv2.dilate(mask, np.ones((5, 5))), (0, 0), 2)[..., None]
     x, y = marks[27].astype(int)
@@ -335,11 +336,11 @@ def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         taken = cv2.GaussianBlur(taken, (0, 0), float(rng.uniform(0.4, 1.6)))
     if rng.random() < 0.08:  # the camera moved
         length = int(rng.integers(3, 9))
-        line = np.zeros((length, length), dtype=np.float32)
+        line: np.ndarray = np.zeros((length, length), dtype=np.float32)
         line[length // 2] = 1
         middle = (length / 2 - 0.5, length / 2 - 0.5)
         line = cv2.warpAffine(line, cv2.getRotationMatrix2D(middle, float(rng.uniform(0, 180)), 1.0), (length, length))
-        taken = cv2.filter2D(taken, -1, line / max(1e-6, float(line.sum())))
+        taken = cv2.filter2D(taken, -1, (line / max(1e-6, float(line.sum()))).astype(np.float32))
     if rng.random() < 0.15:  # few pixels, made larger
         few = int(size * rng.uniform(0.4, 0.9))
         taken = cv2.resize(cv2.resize(taken, (few, few), interpolation=cv2.INTER_AREA), (size, size))
@@ -347,7 +348,7 @@ def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         taken = _noisy(taken, 14 * rng.random() ** 2, rng)
     if rng.random() < 0.55:
         packed = cv2.imencode(".jpg", taken, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))])[1]
-        taken = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+        taken = cv2.imdecode(packed, cv2.IMREAD_COLOR)  # type: ignore[assignment]
     return taken
 
 

@@ -79,7 +79,7 @@ def draw_hand(image: np.ndarray, middle: np.ndarray, size: float, rng: np.random
 def _clouds(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     """One colour, or one that runs into another, with clouds of all sizes."""
     base = np.array(random_color(rng, 0.1), dtype=np.float32)
-    image = np.broadcast_to(base, (2, 2, 3))
+    image: np.ndarray = np.broadcast_to(base, (2, 2, 3))
     if rng.random() < 0.5:
         image = np.array([random_color(rng, 0.1) for _ in range(4)], dtype=np.float32).reshape(2, 2, 3)
     for octave in range(1, 8):
