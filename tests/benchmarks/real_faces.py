@@ -23,6 +23,7 @@ from torchface.landmarks import (
     FaceBoxes,
     HaarDetector,
     LandmarkTracker,
+    NoFaceError,
     TrackedFace,
     agreement,
     find_blinks,
@@ -165,7 +166,10 @@ def see(finder: LandmarkFinder, picture: Picture, seed: int = 0) -> TrackedFace:
     middle = box[:2] + box[2:] * (0.5 + 0.04 * drawn[:2])
     moved = torch.cat([middle - side / 2, side.expand(2)])
     given = FaceBoxes(moved[None], torch.ones(1), torch.tensor([tilt]))
-    return find_landmarks(picture.image, finder, detector=lambda _: given)
+    try:
+        return find_landmarks(picture.image, finder, detector=lambda _: given)
+    except NoFaceError:  # the finder says so
+        return replace(TrackedFace.lost(), presence=0.0)
 
 
 def errors(finder: LandmarkFinder, pictures: list[Picture], seeds: int = 3) -> Tensor:
