@@ -13,7 +13,14 @@ from torchface.landmarks.images.face_box import (
 )
 from torchface.landmarks.images.finders.tree_finder import TreeFinder
 from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkFinder
-from torchface.landmarks.images.landmark_measures import Agreement, agreement, find_blinks, lid_openings, mouth_gap
+from torchface.landmarks.images.landmark_measures import (
+    Agreement,
+    agreement,
+    find_blinks,
+    landmark_jitter,
+    lid_openings,
+    mouth_gap,
+)
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.network_detector import NetworkDetector
@@ -22,7 +29,6 @@ from torchface.landmarks.images.tracking import (
     LandmarkTracker,
     TrackedFace,
     find_landmarks,
-    landmark_jitter,
     track_landmarks,
 )
 from torchface.landmarks.images.tree_training import TreeSettings

@@ -114,3 +114,26 @@ def _gap(landmarks: Tensor, pairs: tuple[tuple[int, int], ...]) -> Tensor:
     down = torch.stack([-along[..., 1], along[..., 0]], -1)
     upper, lower = (landmarks[..., [pair[side] for pair in pairs], :].mean(-2) for side in (0, 1))
     return ((lower - upper) * down).sum(-1) / along.square().sum(-1)
+
+
+def landmark_jitter(landmarks: Tensor) -> Tensor:
+    r"""How much landmarks tremble, in pixels.
+
+    .. math:: \sqrt{\tfrac16\, \operatorname{mean} (x_{t-1} - 2 x_t + x_{t+1})^2}
+
+    over all coordinates: the standard deviation of white noise on a motion of constant velocity. What accelerates
+    counts too, so that a still face tells it best.
+
+    Args:
+        landmarks: (T,L,2), pixels; NaN for not seen.
+
+    Returns:
+        A number; NaN where no landmark is seen in three frames in a row.
+
+    Raises:
+        ShapeError: not (T,L,2).
+    """
+    if landmarks.ndim != 3 or landmarks.shape[2] != 2:
+        raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,L,2)")
+    second = (landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]).double()
+    return (second.square().nanmean() / 6).sqrt()

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
+from torchface.landmarks.images.appearance_refinement import appearance_landmarks
 from torchface.landmarks.images.face_box import (
     FaceBoxes,
     FaceDetector,
@@ -498,48 +499,3 @@ def _turn(tilt: Tensor) -> Tensor:
     """The rotation (2,2) of a face with a tilt, clockwise as the image is seen."""
     cos, sin = tilt.cos(), tilt.sin()
     return torch.stack([cos, -sin, sin, cos]).view(2, 2)
-
-
-@torch.no_grad()
-def appearance_landmarks(appearance: AppearanceModel, grey: Tensor, start: Tensor) -> Tensor:
-    """Landmarks (68,2) where the face looks more as the person does; the start (68,2) where it does not.
-
-    Args:
-        appearance: of the person.
-        grey: the image, uint8 (H,W).
-        start: (68,2), pixels.
-    """
-    box = box_around(start)
-    height, width = grey.shape
-    low = (box[:2] - box[2:] / 2).clamp(min=0).long()
-    high = (box[:2] + 1.5 * box[2:]).ceil().long()
-    piece = grey[int(low[1]) : min(int(high[1]) + 1, height), int(low[0]) : min(int(high[0]) + 1, width)]
-    if 0 in piece.shape:
-        return start
-    fit = appearance.refine(piece[None, None].float() / 255, (start - low)[None])
-    better = bool(torch.isfinite(fit.landmarks).all()) and float(fit.error) <= float(fit.initial_error)
-    near = float((fit.landmarks[0] + low - start).norm(dim=1).mean()) < 0.15 * float(box[2]) if better else False
-    return (fit.landmarks[0] + low).to(start) if near else start
-
-
-def landmark_jitter(landmarks: Tensor) -> Tensor:
-    r"""How much landmarks tremble, in pixels.
-
-    .. math:: \sqrt{\tfrac16\, \operatorname{mean} (x_{t-1} - 2 x_t + x_{t+1})^2}
-
-    over all coordinates: the standard deviation of white noise on a motion of constant velocity. What accelerates
-    counts too, so that a still face tells it best.
-
-    Args:
-        landmarks: (T,L,2), pixels; NaN for not seen.
-
-    Returns:
-        A number; NaN where no landmark is seen in three frames in a row.
-
-    Raises:
-        ShapeError: not (T,L,2).
-    """
-    if landmarks.ndim != 3 or landmarks.shape[2] != 2:
-        raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,L,2)")
-    second = (landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]).double()
-    return (second.square().nanmean() / 6).sqrt()

@@ -15,7 +15,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
-from torchface.rendering.raycast import RayCaster
+from torchface.rendering.raycast import RayCaster, openness
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.head.head_annotations import head_annotations
@@ -299,7 +299,8 @@ def _light(
     ambient = uniform(0.15, 1.0, generator)
     # Light from a sky or a window: more from one side than from the other.
     sky = torch.nn.functional.normalize(torch.randn(3, generator=generator).double() - 0.8 * down, dim=0)
-    light = ambient * (1 + uniform(0, 0.8, generator) * (normals @ sky)) * _openness(caster, starts, normals, generator)
+    light = ambient * (1 + uniform(0, 0.8, generator) * (normals @ sky))
+    light = light * openness(caster, starts, normals, generator, 5, 50.0)
     mirrored = torch.zeros_like(light)
     for number in range(int(uniform(0.6, 4, generator))):
         x, y = torch.randn(2, generator=generator).tolist()
@@ -317,18 +318,6 @@ def _light(
             falls > 0
         )
     return albedo * light + gloss * mirrored
-
-
-def _openness(
-    caster: RayCaster, starts: Tensor, normals: Tensor, generator: torch.Generator, count: int = 5, reach: float = 50.0
-) -> Tensor:
-    """The share of the hemisphere over each point (R,) that is free within reach."""
-    free = torch.zeros(len(starts))
-    for _ in range(count):  # a ray of each point a turn
-        way = normals + torch.nn.functional.normalize(torch.randn(normals.shape, generator=generator).double(), dim=-1)
-        way = torch.nn.functional.normalize(way + 1e-6, dim=-1)
-        free += caster.distances(starts, way, reach)
-    return free.double() / (count * reach)
 
 
 def _glasses(image: Tensor, camera: Camera, marks: Tensor, form: tuple[float, float, float]) -> Tensor:

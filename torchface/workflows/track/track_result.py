@@ -14,7 +14,7 @@ from torchface.capture.video.landmark_offsets import LandmarkOffsets
 from torchface.capture.video.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
-from torchface.landmarks.images.tracking import landmark_jitter
+from torchface.landmarks.images.landmark_measures import landmark_jitter
 from torchface.rendering.point_light import PointLight
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.track_state import TrackedFrames

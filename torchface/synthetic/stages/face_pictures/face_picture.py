@@ -15,7 +15,7 @@ from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.gaussian_blur import gaussian_blur
-from torchface.rendering.raycast import RayCaster
+from torchface.rendering.raycast import RayCaster, openness
 from torchface.synthetic.stages.backdrops import uniform
 from torchface.synthetic.stages.face_pictures.expressions import draw_expression
 from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, GUMS, SKIN, TEETH, DrawnHead, HeadKind
@@ -100,8 +100,8 @@ def _photograph(person: _Person, generator: torch.Generator) -> FacePicture:
     color, gloss = _surface_color(person, scene, triangle, barycentric, points)
     normals = _normals(scene, triangle, barycentric, ways)
     material = scene.material[triangle]
-    openness = _smooth(_openness(caster, points + 0.3 * normals, normals, generator), seen)
-    light = _lit(caster, camera, points, normals, ways, material, to_linear(color), gloss, openness, generator)
+    free = _smooth(openness(caster, points + 0.3 * normals, normals, generator, 2, 45.0), seen)
+    light = _lit(caster, camera, points, normals, ways, material, to_linear(color), gloss, free, generator)
     face = (material == SKIN).float()
     exposure = uniform(0.07, 0.42, generator) / float((light.mean(1) * face).sum() / face.sum().clamp(min=1))
     shown = to_srgb((light * exposure).clamp(0, 1))
@@ -208,7 +208,7 @@ def _lit(
     material: Tensor,
     albedo: Tensor,
     gloss: Tensor,
-    openness: Tensor,
+    free: Tensor,
     generator: torch.Generator,
 ) -> Tensor:
     """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and a sky."""
@@ -217,7 +217,7 @@ def _lit(
     starts = points + 0.3 * normals
     sky = torch.nn.functional.normalize(torch.randn(3, generator=generator).double() - 0.8 * down, dim=0)
     even = uniform(0.15, 1.0, generator) * (1 + uniform(0, 0.9, generator) * (normals @ sky))
-    even = even * openness
+    even = even * free
     light = even[:, None].float() * _tint(generator, 0.12)
     mirrored = torch.zeros(len(points), 3)
     sharp = torch.where((material == EYEBALL), 220.0, uniform(8, 45, generator)).double()
@@ -243,18 +243,6 @@ def _lit(
 def _tint(generator: torch.Generator, spread: float) -> Tensor:
     warm = spread * float(torch.randn((), generator=generator).clamp(-2, 2))
     return torch.tensor([1 + warm, 1.0, 1 - warm]) * (1 + 0.03 * torch.randn(3, generator=generator))
-
-
-def _openness(
-    caster: RayCaster, starts: Tensor, normals: Tensor, generator: torch.Generator, count: int = 2, reach: float = 45.0
-) -> Tensor:
-    """The share of the hemisphere over each point (R,) that is free within reach."""
-    free = torch.zeros(len(starts))
-    for _ in range(count):  # a ray of each point a turn
-        way = normals + torch.nn.functional.normalize(torch.randn(normals.shape, generator=generator).double(), dim=-1)
-        way = torch.nn.functional.normalize(way + 1e-6, dim=-1)
-        free += caster.distances(starts, way, reach)
-    return free.double() / (count * reach)
 
 
 def _smooth(values: Tensor, seen: Tensor) -> Tensor:
