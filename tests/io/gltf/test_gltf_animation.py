@@ -44,6 +44,31 @@ def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
     assert torch.equal(found.weights.values, weights)
 
 
+def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
+    rig, seconds = sheet_rig(), torch.tensor([0.0, 0.033, 0.067, 0.2, 0.234, 0.266])
+    weights = torch.rand(6, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
+    save_animation(
+        rig, Take(30.0, weights=Track(rig.names, weights), extras={"seconds": seconds}), tmp_path / "take.glb"
+    )
+    found = read_gltf_weights(tmp_path / "take.glb")
+    assert found is not None
+    assert found.fps == pytest.approx(1 / 0.034, rel=1e-3)  # the usual step's
+    torch.testing.assert_close(found.uneven_seconds(), seconds.double(), atol=1e-6, rtol=0)
+    save_animation(rig, found, tmp_path / "again.glb")
+    again = read_gltf_weights(tmp_path / "again.glb")
+    assert again is not None
+    torch.testing.assert_close(again.uneven_seconds(), found.uneven_seconds())
+
+
+def test_key_poses_are_no_frames(tmp_path: Path) -> None:
+    rig = sheet_rig()
+    weights = torch.rand(4, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
+    take = Take(30.0, weights=Track(rig.names, weights), extras={"seconds": torch.tensor([0.0, 0.1, 0.2, 1.7])})
+    save_animation(rig, take, tmp_path / "take.glb")
+    with pytest.raises(FileFormatError, match=r"found keys 1\.5\d* s apart, the median being 0\.1"):
+        read_gltf_weights(tmp_path / "take.glb")
+
+
 def test_a_rig_at_rest_plays_nothing(tmp_path: Path) -> None:
     save_rig(sheet_rig(), tmp_path / "rig.glb")
     assert read_gltf_weights(tmp_path / "rig.glb") is None

@@ -17,6 +17,8 @@ from torchface.number_checks import MAX_FPS, MIN_FPS
 from torchface.take import Take, Track
 
 _UNEVEN = 0.01
+# Cameras drop a few frames in a row. Keys further apart are poses that a program blends: baked, they are frames.
+_LONGEST_GAP = 10.0
 _CUBIC = "CUBICSPLINE"
 
 
@@ -24,14 +26,14 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     """The weights that a file's first animation gives its shapes, one frame a key; none where nothing moves shapes.
 
     Args:
-        path: a ``.glb`` or ``.gltf`` whose keys are evenly spaced, as :func:`torchface.save_animation` writes them.
+        path: a ``.glb`` or ``.gltf`` whose keys are a film's frames, as :func:`torchface.save_animation` writes them.
 
     Returns:
         weights (T,N,1), by the names of the morph targets. Of several meshes with a shape of one name the first's
-        weights count.
+        weights count. Frames that come unevenly have their times in ``extras["seconds"]``, from 0.
 
     Raises:
-        FileFormatError: not glTF 2, broken, or keys that are no frames at one rate.
+        FileFormatError: not glTF 2, broken, or keys that are no frames: out of order, or with gaps of ten frames.
     """
     document = read_document(path)
     animations = document.objects("animations")
@@ -59,7 +61,9 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     if times is None:
         return None
     stacked = np.stack(list(weights.values()), axis=1)
-    return Take(_rate(document, times), weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]))
+    rate, seconds = _rate(document, times)
+    extras = {} if seconds is None else {"seconds": seconds}
+    return Take(rate, weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]), extras=extras)
 
 
 def _channel(
@@ -84,17 +88,22 @@ def _channel(
     return times, names, values
 
 
-def _rate(document: Document, times: np.ndarray) -> float:
-    """Frames a second; keys are rounded to single precision."""
+def _rate(document: Document, times: np.ndarray) -> tuple[float, torch.Tensor | None]:
+    """Frames a second, and when each is shown, (T,), if they come unevenly; keys are rounded to single precision."""
     if len(times) == 1:
-        return DEFAULT_RATE
+        return DEFAULT_RATE, None
     steps = np.diff(times.astype(np.float64))
+    usual = float(np.median(steps))
+    if not (steps.min() > 0 and steps.max() <= _LONGEST_GAP * usual):
+        worst = float(steps.min() if not steps.min() > 0 else steps.max())
+        found = f"keys {shown(worst)} s apart, the median being {usual:.6f}"
+        expected = f"frames, rising and at most {_LONGEST_GAP:.0f} steps apart: bake the animation"
+        raise document.error("animations[0]", found, expected)
     step = (float(times[-1]) - float(times[0])) / (len(times) - 1)
-    if step <= 0 or np.abs(steps - step).max() > _UNEVEN * step:
-        worst = shown(float(steps[np.abs(steps - step).argmax()]))
-        raise document.error("animations[0]", f"keys {worst} s apart, the mean being {step:.6f}", "even frames")
+    even = bool(np.abs(steps - step).max() <= _UNEVEN * step)
     slack = 2 * float(np.spacing(np.float32(times[-1])))
+    step = step if even else usual
     rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
     if not MIN_FPS <= rate <= MAX_FPS:
         raise document.error("animations[0]", f"{rate:.4g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
-    return rate
+    return rate, None if even else torch.from_numpy(times.astype(np.float64) - float(times[0]))
