@@ -65,7 +65,8 @@ def track(
         fps: Frames a second of a .csv of landmarks without VIDEO; by its times if absent.
         size: WIDTHxHEIGHT of the pictures that such landmarks were found in; the camera's if absent.
         live: A camera's number, such as 0, or a video file that is played in its own time.
-        stream: Where --live sends to; Unreal listens on port 11111.
+        stream: Where --live sends to; Unreal listens on port 11111. vmc://HOST:PORT and osc://HOST:PORT/PREFIX
+            send by the VMC protocol and as plain OSC.
         seconds: After which --live ends; until Ctrl-C if absent.
         quiet: Show no progress.
     """

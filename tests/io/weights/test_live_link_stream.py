@@ -17,8 +17,8 @@ from torchface.io.weights.live_link_stream import (
     LiveLinkSender,
     decode_frame,
     encode_frame,
-    parse_address,
 )
+from torchface.io.weights.udp_sending import parse_address
 from torchface.shape_names import ARKIT
 
 DEVICE = "0B57A4B6-6D4C-4C1F-9F24-0D0D6A3F6D11"
@@ -117,16 +117,16 @@ def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
 
 def test_broadcast_is_allowed_and_what_cannot_be_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with LiveLinkSender("udp://255.255.255.255:9", ARKIT, 60.0) as sender:
-        own = sender._socket
+        own = sender._socket._socket
         assert own.getsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST) != 0
 
         class Cut:
-            def sendto(self, *_: object) -> None:
+            def send(self, *_: object) -> None:
                 raise OSError(errno.ENETUNREACH, "Network is unreachable")
 
             def close(self) -> None:
                 own.close()
 
-        monkeypatch.setattr(sender, "_socket", Cut())
+        monkeypatch.setattr(sender._socket, "_socket", Cut())
         with pytest.raises(ValueRangeError, match=r"cannot send to udp://255.* \(Network is unreachable\)"):
             sender.send(torch.zeros(52))

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-import re
-import socket
 import struct
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.io.weights.arkit_weights import ArkitWeights
+from torchface.io.weights.udp_sending import UdpSocket
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT
 
 VALUES = len(ARKIT) + len(ROTATIONS)
 """How many numbers a packet carries: ARKit's 52 weights and nine rotations."""
@@ -27,7 +26,6 @@ _VERSION = 6
 _MAX_TEXT_BYTES = 256
 _TIME = struct.Struct("!ifii")
 _NUMBERS = struct.Struct(f"!{VALUES}f")
-_ADDRESS = re.compile(r"udp://(?P<host>\[[0-9a-fA-F:.]+\]|[^:/\[\]\s]+):(?P<port>[0-9]{1,5})/?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,43 +93,12 @@ def decode_frame(packet: bytes) -> LiveLinkFrame:
     return LiveLinkFrame(device, subject, number, subframe, (numerator, denominator), weights, rotations)
 
 
-def parse_address(address: str) -> tuple[str, int]:
-    """Host and port of ``udp://HOST:PORT``.
-
-    Example:
-        >>> parse_address("udp://127.0.0.1:11111")
-        ('127.0.0.1', 11111)
-
-    Raises:
-        ValueRangeError: the text is no such address.
-    """
-    match = _ADDRESS.fullmatch(address)
-    if match is None or not 0 < int(match["port"]) < 65536:
-        raise ValueRangeError(
-            f"stream: found {address!r:.200}, expected an address such as udp://127.0.0.1:11111, the port 1 to 65535"
-        )
-    return match["host"].strip("[]"), int(match["port"])
-
-
-def find_receiver(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Family and socket address of ``udp://HOST:PORT``, its host looked up.
-
-    Raises:
-        ValueRangeError: the text is no such address, or its host is not known.
-    """
-    host, port = parse_address(address)
-    try:
-        family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-    except (OSError, ValueError) as error:  # ValueError: a name that no host can have, such as a..b
-        raise ValueRangeError(f"stream: found {address!r:.200}, whose host is not known ({error})") from error
-    return family, target
-
-
 class LiveLinkSender:
     """Sends weights as Live Link Face's packets.
 
     Args:
-        address: ``udp://HOST:PORT``; Unreal listens on port 11111. A broadcast address reaches a whole network.
+        address: ``udp://HOST:PORT`` or ``livelink://HOST:PORT``; Unreal listens on port 11111. A broadcast address
+            reaches a whole network.
         names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
         fps: frames a second.
         subject: the name under which the receiver lists the face.
@@ -142,39 +109,35 @@ class LiveLinkSender:
     """
 
     def __init__(self, address: str, names: Sequence[str], fps: float, subject: str = "torchface") -> None:
-        target = find_receiver(address)
         check_rate(fps, "stream", ValueRangeError)
-        self._matrix = mapping(names, ARKIT)
-        if not self._matrix.any():
-            raise NameMismatchError(f"stream: found the shapes {', '.join(names[:5])}, expected some of ARKit's")
-        self._address, (family, self._target) = address, target
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._arkit = ArkitWeights(names)
+        self._socket = UdpSocket(address)
         self._device = str(uuid.uuid4()).upper()
         self._subject, self._fps, self._sent = subject, fps, 0
 
-    def send(self, weights: Tensor, rotations: Tensor | None = None) -> None:
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
         """Sends one frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
+
+        Returns:
+            Whether nothing told that a frame before was refused.
 
         Raises:
             ShapeError: another number of weights than names.
             ValueRangeError: this machine cannot send there.
         """
-        if weights.shape != self._matrix.shape[1:]:
-            raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({self._matrix.shape[1]},)")
-        arkit = self._matrix @ weights.detach().float().cpu().nan_to_num(0.0)
         rotations = torch.zeros(len(ROTATIONS)) if rotations is None else rotations.float().nan_to_num(0.0)
         frame = LiveLinkFrame(
-            self._device, self._subject, self._sent, 0.0, (round(self._fps * 1000), 1000), arkit, rotations
+            self._device,
+            self._subject,
+            self._sent,
+            0.0,
+            (round(self._fps * 1000), 1000),
+            self._arkit(weights),
+            rotations,
         )
-        try:
-            self._socket.sendto(encode_frame(frame), self._target)
-        except OSError as error:
-            raise ValueRangeError(
-                f"stream: cannot send to {self._address} ({error.strerror or error}); expected an address that this "
-                "machine's network reaches"
-            ) from error
+        welcome = self._socket.send(encode_frame(frame))
         self._sent += 1
+        return welcome
 
     def close(self) -> None:
         """Gives the socket back."""

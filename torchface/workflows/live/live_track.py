@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import all_or_none, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
-from torchface.io.weights.live_link_stream import LiveLinkSender, find_receiver
+from torchface.io.weights.udp_sending import find_receiver
+from torchface.io.weights.weight_senders import open_sender
 from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.landmarks.images.tracking import LandmarkTracker
 from torchface.number_checks import checked_number
@@ -173,7 +175,7 @@ def track_live(
         rows: list[LiveFrame] = []
         latency: list[float] = []
         started = time.perf_counter()
-        with LiveLinkSender(address, actor.names, source.video.fps) as sender:
+        with closing(open_sender(address, actor.names, source.video.fps)) as sender:
             try:
                 for came, frame in source.frames():
                     solved = solver.step(frame, None if before is None else max(came - before, _SHORTEST))

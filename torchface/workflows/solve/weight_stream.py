@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.io.weights.live_link_stream import LiveLinkSender
+from torchface.io.weights.weight_senders import open_sender
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.temporal import OneEuroFilter
 
@@ -76,7 +77,7 @@ def stream_weights(
         frames: (N,) each; each is asked for when it is due.
         names: of the weights.
         fps: frames a second; a frame that comes too early waits, one that comes too late goes at once.
-        address: ``udp://HOST:PORT``, in Live Link Face's packets.
+        address: where to and how; see :func:`torchface.io.weights.weight_senders.open_sender`.
         clock, wait: what time it is, and to let it pass, in seconds.
 
     Raises:
@@ -85,7 +86,7 @@ def stream_weights(
     sent: list[Tensor] = []
     latency: list[float] = []
     coming = iter(frames)
-    with LiveLinkSender(address, names, fps) as sender:
+    with closing(open_sender(address, names, fps)) as sender:
         begin = clock()
         while True:
             early = begin + len(sent) / fps - clock()

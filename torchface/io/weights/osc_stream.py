@@ -1,0 +1,156 @@
+"""Frames of weights as OSC messages: by the VMC protocol, which avatar programs receive, and plain."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message import OscMessage
+from pythonosc.osc_message_builder import OscMessageBuilder
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, ShapeError
+from torchface.io.weights.arkit_weights import ArkitWeights
+from torchface.io.weights.udp_sending import UdpSocket, parse_address
+from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.shape_names import ARKIT
+
+DEFAULT_PREFIX = "/torchface"
+
+_LARGEST_VMC = 1400  # bytes of a packet, which one Ethernet frame must hold
+_LARGEST = 60_000  # what UDP carries
+_NOT_IN_ADDRESSES = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # what OSC gives another meaning in an address
+
+
+class VmcSender:
+    """Sends weights by the VMC protocol: ``/VMC/Ext/Blend/Val`` a shape by ARKit's names, ``/VMC/Ext/Blend/Apply``,
+    the head's rotation as ``/VMC/Ext/Bone/Pos``, ``/VMC/Ext/OK`` and ``/VMC/Ext/T``.
+
+    Args:
+        address: ``vmc://HOST:PORT``; programs listen on port 39539.
+        names: of the weights that come, (N,); any rig's names that ARKit's can be had from.
+        clock: what time it is, seconds.
+
+    Raises:
+        ValueRangeError: the address is none, or its host is not known.
+        NameMismatchError: not one name is one of ARKit's.
+
+    Source: Virtual Motion Capture Protocol, marionette specification, protocol.vmc.info.
+    """
+
+    def __init__(self, address: str, names: Sequence[str], clock: Callable[[], float] = time.perf_counter) -> None:
+        self._arkit, self._clock = ArkitWeights(names), clock
+        self._socket = UdpSocket(address)
+        self._began = clock()
+
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends one frame: weights (N,), rotations (9,) in radians, of which the head's count; NaN is sent as 0.
+
+        Returns:
+            Whether nothing told that a frame before was refused.
+
+        Raises:
+            ShapeError: another number of weights than names.
+            ValueRangeError: this machine cannot send there.
+        """
+        turned = torch.zeros(len(ROTATIONS)) if rotations is None else rotations
+        messages = [
+            _message("/VMC/Ext/OK", 1),
+            _message("/VMC/Ext/T", self._clock() - self._began),
+            # The skeleton keeps its own places of bones: a receiver adds the rotation to the rest pose.
+            _message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *unity_quaternion(turned[:3])),
+        ]
+        values = self._arkit(weights).tolist()
+        messages += [_message("/VMC/Ext/Blend/Val", name, value) for name, value in zip(ARKIT, values, strict=True)]
+        messages.append(_message("/VMC/Ext/Blend/Apply"))
+        welcome = [self._socket.send(packet) for packet in _bundles(messages, _LARGEST_VMC)]
+        return all(welcome)
+
+    def close(self) -> None:
+        """Gives the socket back."""
+        self._socket.close()
+
+
+class OscSender:
+    """Sends weights as plain OSC, one bundle a frame: ``PREFIX/weights/NAME`` and, in radians,
+    ``PREFIX/rotations/HeadYaw`` and so on by Live Link Face's nine names, one float each.
+
+    Args:
+        address: ``osc://HOST:PORT/PREFIX``; ``/torchface`` is the prefix if absent.
+        names: of the weights that come, (N,).
+
+    Raises:
+        ValueRangeError: the address is none, or its host is not known.
+        NameMismatchError: a name that no OSC address can hold.
+    """
+
+    def __init__(self, address: str, names: Sequence[str]) -> None:
+        strange = [name for name in names if not name or _NOT_IN_ADDRESSES.search(name)]
+        if strange:
+            raise NameMismatchError(
+                f"stream: found the shape {strange[0]!r:.60}, expected names without blanks and without any of "
+                "# * , / ? [ ] { }, which OSC addresses cannot hold"
+            )
+        prefix = parse_address(address).path or DEFAULT_PREFIX
+        self._weights = [f"{prefix}/weights/{name}" for name in names]
+        self._rotations = [f"{prefix}/rotations/{name}" for name in ROTATIONS]
+        self._socket = UdpSocket(address)
+
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends one frame: weights (N,), rotations (9,) in radians; NaN is sent as 0.
+
+        Returns:
+            Whether nothing told that a frame before was refused.
+
+        Raises:
+            ShapeError: another number of weights than names.
+            ValueRangeError: this machine cannot send there.
+        """
+        if weights.shape != (len(self._weights),):
+            raise ShapeError(f"stream: found weights {tuple(weights.shape)}, expected ({len(self._weights)},)")
+        turned = torch.zeros(len(ROTATIONS)) if rotations is None else rotations
+        values = torch.cat([weights.detach().float().cpu(), turned.float()]).nan_to_num(0.0).tolist()
+        addresses = self._weights + self._rotations
+        messages = [_message(address, value) for address, value in zip(addresses, values, strict=True)]
+        welcome = [self._socket.send(packet) for packet in _bundles(messages)]
+        return all(welcome)
+
+    def close(self) -> None:
+        """Gives the socket back."""
+        self._socket.close()
+
+
+def unity_quaternion(angles: Tensor) -> tuple[float, float, float, float]:
+    r"""A head's yaw, pitch and roll (3,), radians, as Unity's quaternion x, y, z, w; NaN counts as 0.
+
+    Ours is :math:`R_y R_x R_z` with x to the person's left; Unity's x is to their right, which turns the signs of y
+    and z.
+    """
+    half = angles.detach().double().cpu().nan_to_num(0.0) / 2
+    (sy, sx, sz), (cy, cx, cz) = half.sin().tolist(), half.cos().tolist()
+    x, y = cy * sx * cz + sy * cx * sz, sy * cx * cz - cy * sx * sz
+    z, w = cy * cx * sz - sy * sx * cz, cy * cx * cz + sy * sx * sz
+    return x, -y, -z, w
+
+
+def _message(address: str, *values: str | int | float) -> OscMessage:
+    kinds = {str: "s", int: "i", float: "f"}
+    builder = OscMessageBuilder(address)
+    for value in values:
+        builder.add_arg(value, kinds[type(value)])
+    return builder.build()
+
+
+def _bundles(messages: Iterable[OscMessage], largest: int = _LARGEST) -> list[bytes]:
+    """The messages in bundles of at most so many bytes, in their order."""
+    packets, bundle, size = list[bytes](), OscBundleBuilder(IMMEDIATELY), 16
+    for message in messages:
+        if size + message.size + 4 > largest:
+            packets.append(bundle.build().dgram)
+            bundle, size = OscBundleBuilder(IMMEDIATELY), 16
+        bundle.add_content(message)
+        size += message.size + 4
+    return [*packets, bundle.build().dgram]
