@@ -19,21 +19,16 @@ class BufferWriter:
     def __init__(self) -> None:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
-        self._pieces: list[bytes] = []
-        self._size = 0
+        self.pieces: list[bytes] = []
+        self.size = 0
         self._still: dict[int, int] = {}
-
-    @property
-    def data(self) -> bytes:
-        """All bytes so far."""
-        return b"".join(self._pieces)
 
     def view(self, data: bytes, **fields: int) -> int:
         """The index of a bufferView of ``data``, which begins at a multiple of four."""
-        self.views.append({"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **fields})
+        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(data), **fields})
         padded = data + b"\0" * (-len(data) % 4)
-        self._pieces.append(padded)
-        self._size += len(padded)
+        self.pieces.append(padded)
+        self.size += len(padded)
         return len(self.views) - 1
 
     def texture(self, root: dict[str, Any], image: bytes, kind: str = "image/png", name: str | None = None) -> int:

@@ -7,6 +7,7 @@ import binascii
 import json
 import reprlib
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -222,8 +223,8 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, memoryview | None]:
     return text, memoryview(b"") if binary is None else binary
 
 
-def glb_bytes(root: dict[str, Any], buffers: BufferWriter, source: str | Path = "glTF") -> bytes:
-    """A ``.glb`` of one scene whose root is the first node.
+def glb_pieces(root: dict[str, Any], buffers: BufferWriter, source: str | Path = "glTF") -> Iterator[bytes]:
+    """A ``.glb`` of one scene whose root is the first node, in pieces to write one behind the other.
 
     Args:
         root: nodes, meshes, materials and what else the document has.
@@ -233,7 +234,6 @@ def glb_bytes(root: dict[str, Any], buffers: BufferWriter, source: str | Path = 
     Raises:
         FileFormatError: it would pass the format's 4 GB.
     """
-    binary = buffers.data
     root = {
         "asset": {"version": "2.0", "generator": "torchface"},
         "scene": 0,
@@ -241,13 +241,14 @@ def glb_bytes(root: dict[str, Any], buffers: BufferWriter, source: str | Path = 
         **root,
         "accessors": buffers.accessors,
         "bufferViews": buffers.views,
-        "buffers": [{"byteLength": len(binary)}],
+        "buffers": [{"byteLength": buffers.size}],
     }
     text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    binary += b"\0" * (-len(binary) % 4)
-    size = 12 + 8 + len(text) + 8 + len(binary)
+    size = 12 + 8 + len(text) + 8 + buffers.size  # views begin and end at multiples of four
     if size >= 2**32:
         raise FileFormatError(f"{source}: would take {size} bytes, expected less than 4 GB for a .glb")
-    head = _MAGIC + struct.pack("<II", 2, size) + struct.pack("<II", len(text), _JSON_CHUNK)
-    return b"".join([head, text, struct.pack("<II", len(binary), _BINARY_CHUNK), binary])
+    yield _MAGIC + struct.pack("<II", 2, size) + struct.pack("<II", len(text), _JSON_CHUNK)
+    yield text
+    yield struct.pack("<II", buffers.size, _BINARY_CHUNK)
+    yield from buffers.pieces

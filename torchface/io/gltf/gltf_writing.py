@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, TopologyError, ValueRangeError
-from torchface.files.whole_files import write_file
+from torchface.files.whole_files import replaced_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.container import glb_bytes
+from torchface.io.gltf.container import glb_pieces
 from torchface.io.gltf.material_writing import MaterialWriter
 from torchface.io.gltf.mesh_extras import write_extras, write_order
 from torchface.io.gltf.part_colors.eyes import eye_centre
@@ -166,7 +166,8 @@ def _write(
         write_detail(detail, mesh, names, root, buffers)
     if keys is not None:
         root["animations"] = [_animation(*keys, len(nodes), buffers)]
-    write_file(path, glb_bytes(root, buffers, path))
+    with replaced_file(path) as temporary, temporary.open("wb") as file:
+        file.writelines(glb_pieces(root, buffers, path))
 
 
 def _animation(times: Tensor, weights: Tensor, nodes: int, buffers: BufferWriter) -> dict[str, Any]:

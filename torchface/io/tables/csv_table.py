@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.whole_files import read_file, write_file
+from torchface.files.whole_files import read_file, replaced_file
 
 MAX_TABLE_BYTES = 2**29
 """Bytes of text; two hours of 60 fps Live Link Face stay below."""
@@ -217,16 +217,14 @@ def quoted(names: Sequence[str], limit: int = 5) -> str:
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]], line_end: str = "\n") -> None:
-    """Writes what ``TableReader`` reads; the file appears only when it is complete."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator=line_end)
-    writer.writerow(header)
-    writer.writerows(rows)
+    """Writes what ``TableReader`` reads, row by row; the file appears only when it is complete."""
     try:
-        data = text.getvalue().encode("utf-8")
+        with replaced_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as text:
+            writer = csv.writer(text, lineterminator=line_end)
+            writer.writerow(header)
+            writer.writerows(rows)
     except UnicodeEncodeError as error:
         raise NameMismatchError(f"{path}: found a name that is no valid Unicode ({error.reason})") from error
-    write_file(path, data)
 
 
 def number_texts(values: np.ndarray) -> list[str]:

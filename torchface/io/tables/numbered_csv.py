@@ -72,25 +72,23 @@ def write_numbered(
     names: Sequence[str],
     values: np.ndarray,
     before: Mapping[str, Sequence[str]] = {},
-    behind: Mapping[str, Sequence[str]] = {},
+    behind: Mapping[str, np.ndarray] = {},
 ) -> None:
     """Writes columns (T,C), float32, with the take's frame numbers, or 0, 1, ... where it has none, and its times.
 
-    Columns of texts, one a frame, stand before and behind them.
+    Columns of texts, one a frame, stand before them, columns of numbers (T,) behind.
     """
     fps = check_rate(take.fps, f"{path}: the take", ValueRangeError)
     numbers = frame_numbers(take, first=0)
     seconds = take.uneven_seconds()
     times = [number / fps for number in numbers] if seconds is None else seconds.tolist()
-    cells = number_texts(values.reshape(-1))
-    width = len(names)
-    rows = (
+    rows = (  # written as they are made: an hour's cells would fill the memory
         [
             str(number),
             repr(times[row]),
             *(texts[row] for texts in before.values()),
-            *cells[row * width : (row + 1) * width],
-            *(texts[row] for texts in behind.values()),
+            *number_texts(values[row]),
+            *number_texts(np.array([numbers[row] for numbers in behind.values()])),
         ]
         for row, number in enumerate(numbers)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -159,18 +159,21 @@ def save_live_link(take: Take, path: str | Path) -> None:
         counts = [len(names) + sum(isinstance(column, torch.Tensor) for column in columns.values())] * len(take)
     if len(counts) != len(take):
         raise ShapeError(f"{path}: found {len(counts)} kept blendshape counts, expected {len(take)} frames")
-    cells = _ten_decimals(values.reshape(-1))
-    width = len(names)
-    others = [
-        _ten_decimals(column.detach().cpu().to(torch.float64).numpy()) if isinstance(column, torch.Tensor) else column
-        for column in columns.values()
-    ]
+    numbers = [column for column in columns.values() if isinstance(column, torch.Tensor)]
+    angles = torch.stack(numbers, 1).detach().cpu().double().numpy() if numbers else np.zeros((len(take), 0))
     rows = (
-        [timecode, str(count), *cells[row * width : (row + 1) * width], *(str(column[row]) for column in others)]
+        [timecode, str(count), *_ten_decimals(values[row]), *_in_order(columns, row, _ten_decimals(angles[row]))]
         for row, (timecode, count) in enumerate(zip(timecodes, counts, strict=True))
     )
     header = [name[0].upper() + name[1:] if name in ARKIT else name for name in names]
     write_table(path, ["Timecode", "BlendshapeCount", *header, *columns], rows)
+
+
+def _in_order(columns: Mapping[str, Any], row: int, numbers: Sequence[str]) -> Iterator[str]:
+    """One row's cells of columns of numbers, which are given, and of texts."""
+    given = iter(numbers)
+    for column in columns.values():
+        yield next(given) if isinstance(column, torch.Tensor) else str(column[row])
 
 
 def _as_arkit(names: tuple[str, ...], values: np.ndarray, path: Path) -> tuple[tuple[str, ...], np.ndarray]:

@@ -9,7 +9,7 @@ import torch
 
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.markers.marker_csv import is_marker_header
-from torchface.io.tables.csv_table import TableReader, number_texts
+from torchface.io.tables.csv_table import TableReader
 from torchface.io.tables.numbered_csv import COLUMNS, read_numbered, write_numbered
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.take import Take, Track
@@ -77,7 +77,7 @@ def save_weights_csv(take: Take, path: str | Path) -> None:
     if is_marker_header(header) or set(names) & {*COLUMNS, _TIMECODE, *ROTATIONS}:
         raise NameMismatchError(f"{path}: found shapes named like other columns of the file, expected other names")
     rotations = {
-        name: number_texts(column.detach().cpu().double().numpy())
+        name: column.detach().cpu().double().numpy()
         for name, column in kept_columns(take, path).items()
         if name in ROTATIONS and isinstance(column, torch.Tensor)
     }

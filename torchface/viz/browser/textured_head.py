@@ -13,7 +13,7 @@ from torchface.color_space import to_linear
 from torchface.geometry.meshes.normal_maps import encode_normals
 from torchface.geometry.meshes.uv_seams import split_at_seams
 from torchface.io.gltf.buffers import BufferWriter
-from torchface.io.gltf.container import glb_bytes
+from torchface.io.gltf.container import glb_pieces
 from torchface.io.gltf.part_colors.surfaces import ColorSource, Surface
 from torchface.io.gltf.primitive_writing import PrimitiveWriter
 from torchface.io.gltf.region_materials import SKIN
@@ -68,7 +68,7 @@ class TexturedHead:
         if normal_map is not None and mesh.uvs is not None:
             image = _encoded(encode_normals(normal_map.cpu().float()), "PNG", _MAX_NORMALS_SIDE)
             material["normalTexture"] = {"index": buffers.texture(root, image)}
-        return glb_bytes(root, buffers)
+        return b"".join(glb_pieces(root, buffers))
 
 
 def _encoded(image: Tensor, kind: str, max_side: int) -> bytes:
