@@ -1,4 +1,4 @@
-"""Derivatives of a box-constrained quadratic program's solution, apart from the solver that found it."""
+"""Derivatives of a constrained quadratic program's solution, apart from the solver that found it."""
 
 from __future__ import annotations
 
@@ -52,3 +52,44 @@ class BoxSolution(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             to_f = (-s).to(x.dtype)
         return to_H, to_f, None, None, None
+
+
+class SimplexSolution(torch.autograd.Function):
+    r"""The solution on the simplex as a differentiable function of H and f.
+
+    Variables that take part keep to the sum, :math:`H_{AA} x_A + f_A = \mu \mathbf 1`, :math:`\mathbf 1^\top x_A = 1`,
+    and the others stay 0. With :math:`v = \partial L/\partial x` and s the solution of
+
+    .. math:: \begin{pmatrix} H_{AA} & \mathbf 1 \\ \mathbf 1^\top & 0 \end{pmatrix}
+        \begin{pmatrix} s_A \\ \cdot \end{pmatrix} = \begin{pmatrix} v_A \\ 0 \end{pmatrix}
+
+    derivatives are those of ``BoxSolution``.
+
+    Source: Amos and Kolter 2017, OptNet, specialised to a simplex.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, H: Tensor, f: Tensor, solve: Callable[[], Tensor]) -> Tensor:
+        x = solve()
+        ctx.save_for_backward(H, x)
+        return x
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        H, x = ctx.saved_tensors
+        exact = H.detach().double()
+        exact = 0.5 * (exact + exact.transpose(-1, -2))
+        wide, taken = x.double(), x > 0
+        v = gradients[0].double().masked_fill(~taken, 0.0)
+        spread = metric(exact)
+        tangent = solve_free(exact, spread, taken, taken.to(wide))
+        s = solve_free(exact, spread, taken, v)
+        s = s - tangent * (s.sum(1) / tangent.sum(1))[:, None]
+        to_H = to_f = None
+        if ctx.needs_input_grad[0]:
+            outer = s.T @ wide if H.ndim == 2 else s[:, :, None] * wide[:, None, :]
+            to_H = (-0.5 * (outer + outer.transpose(-1, -2))).to(H.dtype)
+        if ctx.needs_input_grad[1]:
+            to_f = (-s).to(x.dtype)
+        return to_H, to_f, None
