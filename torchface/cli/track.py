@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchface.cli.progress import Quiet, console, print_path, progress_bars
+from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
 
 
 def track(
@@ -133,12 +133,12 @@ def _live(
 ) -> None:
     from torchface.files.job_lock import job_lock
     from torchface.workflows.live.live_track import track_live
+    from torchface.workflows.track.track_files import WEIGHTS
     from torchface.workflows.track.track_video import TrackSettings
 
     assert isinstance(settings, TrackSettings)
     with nullcontext() if out is None else job_lock(out), progress_bars(quiet) as progress:
-        report = track_live(camera, rig, address, out, settings, seconds, progress)
-    for line in report.lines():
-        console.print(line, highlight=False, soft_wrap=True)
-    if report.path is not None:
-        print_path(report.path)
+        report = track_live(camera, rig, [address], out, settings, seconds, progress)
+    print_lines(report.lines())
+    if out is not None:
+        print_path(out / WEIGHTS)

@@ -26,7 +26,7 @@ from torchface.io.video import open_video, write_video
 from torchface.io.weights.live_link_stream import decode_frame
 from torchface.landmarks.images.tracking import LandmarkTracker, TrackedFace
 from torchface.rendering.point_light import PointLight
-from torchface.shape_names import ARKIT
+from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.workflows.live.live_track import track_live
@@ -383,20 +383,21 @@ def test_a_played_video_is_sent_frame_by_frame(filmed: Filmed, tmp_path: Path) -
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5)
         address = f"udp://127.0.0.1:{receiver.getsockname()[1]}"
-        report = track_live(str(filmed.video), filmed.rig, address, tmp_path)
-        frames = [decode_frame(receiver.recv(2048)) for _ in range(len(report.weights))]
-    assert len(report.weights) + report.dropped == FRAMES
-    assert report.found.all()
-    jaw = torch.stack([frame.weights[ARKIT.index("jawOpen")] for frame in frames])
-    torch.testing.assert_close(jaw, report.weights[:, filmed.actor.names.index("jawOpen")])
-    assert frames[-1].rotations[:3].abs().max() > 0
+        report = track_live(str(filmed.video), filmed.rig, [address], tmp_path)
+        frames = [decode_frame(receiver.recv(2048)) for _ in range(report.figures.frames)]
+    assert report.figures.frames + report.dropped == FRAMES
+    assert report.figures.found == report.figures.frames
+    sent = torch.stack([frame.weights for frame in frames])
     kept = load_take(tmp_path / "weights.csv").weights
     assert kept is not None
-    torch.testing.assert_close(kept.values[..., 0], report.weights)
+    torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[:, ARKIT.index("jawOpen")])
+    torch.testing.assert_close(kept.values[..., 0] @ mapping(kept.names, ARKIT).T, sent)
+    assert sent.any()
+    assert frames[-1].rotations[:3].abs().max() > 0
     with pytest.raises(ValueRangeError, match="expected an address"):
-        track_live(str(filmed.video), filmed.rig, "tcp://x")
+        track_live(str(filmed.video), filmed.rig, ["tcp://x"])
     with pytest.raises(FileFormatError, match="camera 97: cannot be opened"):
-        track_live("97", filmed.rig, address)
+        track_live("97", filmed.rig, [address])
 
 
 def test_the_command_says_what_is_missing(filmed: Filmed, capsys: pytest.CaptureFixture[str]) -> None:

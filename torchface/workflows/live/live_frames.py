@@ -2,110 +2,99 @@
 
 from __future__ import annotations
 
-import threading
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import cv2
+import numpy as np
 import torch
-from torch import Tensor
 
-from torchface.errors import FileFormatError
 from torchface.io.video import VideoFile, open_video
+from torchface.workflows.live.camera import DEFAULT_SIZE, Camera
 
-_DEFAULT_FPS = 30.0
-_MAX_WAIT = 5.0
+Say = Callable[[str], None]
+"""Takes a sentence for the user."""
+
+
+class FrameSource(Protocol):
+    """Where frames come from.
+
+    ``video`` tells rate and size, ``dropped`` how many frames came while another was worked on.
+    """
+
+    @property
+    def video(self) -> VideoFile: ...
+
+    @property
+    def dropped(self) -> int: ...
+
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        """When each frame came, seconds, and the frame, uint8 (H,W,3), red first."""
+
+    def close(self) -> None:
+        """Gives the camera back."""
 
 
 class PlayedVideo:
-    """A video file whose frames come at its own rate, as a camera's would; those that come too early are dropped.
+    """A video file whose frames come at its own rate, as a camera's would; those that come too late are dropped.
 
     Args:
-        path: of the file.
+        path: of the file; its frame rate may vary.
 
     Raises:
         FileFormatError: it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
-        self.video: VideoFile = open_video(path)
+        self.video = replace(open_video(path), even=False)
         self.dropped = 0
+        self._times, _ = self.video.uneven_seconds()
 
-    def frames(self) -> Iterator[tuple[float, Tensor]]:
-        """When each frame was due, and the frame, uint8 (3,H,W)."""
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        """When each frame was due, and the frame, uint8 (H,W,3), red first."""
         started = time.perf_counter()
         for number, frame in enumerate(self.video.color_frames()):
-            due = started + number / self.video.fps
+            due = started + self._time(number)
             early = due - time.perf_counter()
             if early > 0:
                 time.sleep(early)
             elif -early > 1 / self.video.fps:  # a camera would have shown the next one by now
                 self.dropped += 1
                 continue
-            yield due, frame
+            yield due, cv2.merge(list(frame.numpy()))
 
-    def __enter__(self) -> PlayedVideo:
-        return self
+    def _time(self, number: int) -> float:
+        if self._times is None or number >= len(self._times):
+            return number / self.video.fps
+        return float(self._times[number])
 
-    def __exit__(self, *error: object) -> None:
-        return None
+    def close(self) -> None:
+        """A file needs no closing."""
 
 
-class Camera:
-    """A camera at this machine; a thread takes its frames, and the newest one is given.
+def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE) -> FrameSource:
+    """A camera by its number, or a video file by its path.
 
     Args:
-        number: of the device, from 0.
+        camera: ``"0"``, ``"1"``, ... or a path.
+        say: told what happens to the camera on the way.
+        size: width and height to ask a camera for.
 
     Raises:
-        FileFormatError: there is none, or it gives no image.
+        FileFormatError: there is no such camera, it gives no frame, or the file is no video.
     """
+    if re.fullmatch("[0-9]{1,3}", camera):
+        return Camera(int(camera), say, size)
+    return PlayedVideo(Path(camera))
 
-    def __init__(self, number: int) -> None:
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
-        self._capture = cv2.VideoCapture(number)
-        good, frame = self._capture.read() if self._capture.isOpened() else (False, None)
-        if not good or frame is None:
-            self._capture.release()
-            raise FileFormatError(f"camera {number}: cannot be opened, expected the number of a device, from 0")
-        rate = self._capture.get(cv2.CAP_PROP_FPS)
-        height, width = frame.shape[:2]
-        self.video = VideoFile(Path(f"camera {number}"), rate if 1 <= rate <= 1000 else _DEFAULT_FPS, width, height, 1)
-        self.dropped = 0
-        self._newest: tuple[float, object] | None = None
-        self._change = threading.Condition()
-        self._open = True
-        self._thread = threading.Thread(target=self._take, daemon=True)
-        self._thread.start()
 
-    def frames(self) -> Iterator[tuple[float, Tensor]]:
-        """When each frame came, and the frame, uint8 (3,H,W); until the camera gives no more."""
-        while True:
-            with self._change:
-                self._change.wait_for(lambda: self._newest is not None or not self._open, _MAX_WAIT)
-                newest, self._newest = self._newest, None
-            if newest is None:
-                return
-            came, frame = newest
-            pixels = torch.from_numpy(frame)  # type: ignore[arg-type]
-            yield came, pixels.flip(-1).permute(2, 0, 1).contiguous()
-
-    def _take(self) -> None:
-        while self._open:
-            good, frame = self._capture.read()
-            with self._change:
-                if not good:
-                    self._open = False
-                else:
-                    self.dropped += self._newest is not None
-                    self._newest = (time.perf_counter(), frame)
-                self._change.notify()
-
-    def __enter__(self) -> Camera:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open = False
-        self._thread.join(_MAX_WAIT)
-        self._capture.release()
+def planes(picture: np.ndarray) -> torch.Tensor:
+    """A picture (H,W,3) as a tensor (3,H,W)."""
+    height, width = picture.shape[:2]
+    split = np.empty((3, height, width), np.uint8)
+    cv2.split(picture, list(split))
+    return torch.from_numpy(split)

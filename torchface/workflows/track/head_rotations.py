@@ -23,6 +23,18 @@ def head_angles(rotation: Tensor) -> Tensor:
     return torch.stack([yaw, pitch, roll], dim=-1)
 
 
+def eye_angles(gaze: Tensor) -> Tensor:
+    """Yaw, pitch and roll of the left eye, then of the right, (6,), as Live Link Face has them.
+
+    Positive yaw looks to the person's right, positive pitch down; eyes do not roll.
+
+    Args:
+        gaze: right eye first, to the person's left and up, (2,2) radians.
+    """
+    still = gaze.new_zeros(2, 1)
+    return torch.cat([-gaze.flip(0), still], 1).flatten()
+
+
 def rotation_columns(rotation: Tensor) -> dict[str, Tensor]:
     """Live Link Face's nine columns by name, each (T,) float64: the head's of rotations (T,3,3), the eyes' 0."""
     angles = head_angles(rotation.detach().cpu().double())

@@ -1,0 +1,200 @@
+"""A camera at this machine: opened with little delay, watched while it runs, and named where there are several."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from torchface.errors import FileFormatError
+from torchface.io.video import VideoFile
+
+DEFAULT_SIZE = (640, 480)
+"""Width and height that suit faces before a webcam."""
+
+_DEFAULT_FPS, _WANTED_FPS = 30.0, 60.0
+_MAX_WAIT = 5.0  # seconds without a frame
+_TICK = 0.2  # seconds until an interrupt is looked for
+_RETRY = 0.05
+_MEASURED = 2.0  # seconds over which the rate is measured
+_RATE_CHANGE = 1.4
+_MAX_PROBED = 6
+_BY_FILE = "a video file does as well: torchface live film.mp4"
+
+
+class Camera:
+    """A camera; a thread takes its frames, and the newest one is given.
+
+    It is asked for Motion-JPEG, 60 frames a second and the shortest queue; what it gives instead is taken. Frames of
+    another size than the first are fitted into that size.
+
+    Args:
+        number: of the device, from 0.
+        say: told of a change of size or rate, and why the frames ended.
+        size: width and height to ask for.
+
+    Raises:
+        FileFormatError: there is none, or it gives no frame within five seconds.
+    """
+
+    def __init__(self, number: int, say: Callable[[str], None], size: tuple[int, int] = DEFAULT_SIZE) -> None:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what matters comes as an error
+        self._name, self._say = f"camera {number}", say
+        self._capture = cv2.VideoCapture(number)
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise FileFormatError(f"{self._name}: cannot be opened; {_others(number)}. {_BY_FILE.capitalize()}")
+        for setting, value in (
+            (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
+            (cv2.CAP_PROP_FRAME_WIDTH, size[0]),
+            (cv2.CAP_PROP_FRAME_HEIGHT, size[1]),
+            (cv2.CAP_PROP_FPS, _WANTED_FPS),
+            (cv2.CAP_PROP_BUFFERSIZE, 1),
+        ):
+            self._capture.set(setting, value)
+        self.dropped = 0
+        self._newest: tuple[float, np.ndarray] | None = None
+        self._change = threading.Condition()
+        self._open = True
+        self._size: tuple[int, int] | None = None
+        self._thread = threading.Thread(target=self._take, name="torchface-camera", daemon=True)
+        self._thread.start()
+        with self._change:
+            first = self._wait()
+        if first is None:
+            self.close()
+            raise FileFormatError(
+                f"{self._name}: gives no frame within {_MAX_WAIT:.0f} seconds; expected one that no other program "
+                f"holds and that is switched on. {_BY_FILE.capitalize()}"
+            )
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        height, width = first[1].shape[:2]
+        self.video = VideoFile(Path(self._name), rate if 1 <= rate <= 1000 else _DEFAULT_FPS, width, height, 1)
+
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        """When each frame came, and the frame, uint8 (H,W,3), red first; until the camera gives no more."""
+        while True:
+            with self._change:
+                newest = self._wait()
+                self._newest = None
+            if newest is None:
+                self._say(f"{self._name} gave no frame for {_MAX_WAIT:.0f} seconds: is it still plugged in?")
+                return
+            came, frame = newest
+            yield came, cv2.cvtColor(self._fitted(frame), cv2.COLOR_BGR2RGB)
+
+    def close(self) -> None:
+        """Gives the camera back."""
+        self._open = False
+        self._thread.join(_MAX_WAIT)
+        if not self._thread.is_alive():  # one that hangs in its driver cannot be released
+            self._capture.release()
+
+    def _wait(self) -> tuple[float, np.ndarray] | None:
+        end = time.monotonic() + _MAX_WAIT
+        while self._newest is None and self._open and time.monotonic() < end:
+            self._change.wait(_TICK)
+        return self._newest
+
+    def _take(self) -> None:
+        failed: float | None = None
+        pace = _Pace()
+        while self._open:
+            good, frame = self._capture.read()
+            now = time.perf_counter()
+            if not good or frame is None:
+                failed = failed or now
+                if now - failed > _MAX_WAIT:
+                    break
+                time.sleep(_RETRY)
+                continue
+            failed = None
+            change = pace.changed(now)
+            if change is not None:
+                self._say(f"{self._name} now gives {change[1]:.0f} frames a second ({change[0]:.0f} before)")
+            with self._change:
+                self.dropped += self._newest is not None
+                self._newest = (now, frame)
+                self._change.notify()
+        with self._change:
+            self._open = False
+            self._change.notify()
+
+    def _fitted(self, frame: np.ndarray) -> np.ndarray:
+        """A frame in the size of the first, its aspect kept."""
+        width, height = self.video.width, self.video.height
+        size = (frame.shape[1], frame.shape[0])
+        if size != (self._size or (width, height)):
+            self._say(
+                f"{self._name} changed its pictures to {size[0]} x {size[1]} pixels; fitted into {width} x {height}"
+            )
+        self._size = size
+        if size == (width, height):
+            return frame
+        scale = min(width / size[0], height / size[1])
+        inside = (max(1, round(scale * size[0])), max(1, round(scale * size[1])))
+        left, top = (width - inside[0]) // 2, (height - inside[1]) // 2
+        fitted = np.zeros((height, width, 3), np.uint8)
+        fitted[top : top + inside[1], left : left + inside[0]] = cv2.resize(frame, inside, interpolation=cv2.INTER_AREA)
+        return fitted
+
+
+class _Pace:
+    """Tells when frames come markedly faster or slower than they did."""
+
+    def __init__(self) -> None:
+        self._told: float | None = None  # measured: what a camera says of its rate is often wrong
+        self._since: float | None = None
+        self._count = 0
+
+    def changed(self, came: float) -> tuple[float, float] | None:
+        """The rate before and now, if it changed with this frame."""
+        if self._since is None:
+            self._since = came
+            return None
+        self._count += 1
+        if came - self._since < _MEASURED:
+            return None
+        rate, before = self._count / (came - self._since), self._told
+        self._since, self._count = came, 0
+        if before is not None and max(rate / before, before / rate) < _RATE_CHANGE:
+            return None
+        self._told = rate
+        return None if before is None else (before, rate)
+
+
+def list_cameras() -> dict[int, str]:
+    """Cameras by number, with their names where the system tells them."""
+    if sys.platform == "linux":
+        found = {}
+        for folder in Path("/sys/class/video4linux").glob("video*"):
+            try:
+                number, first = int(folder.name.removeprefix("video")), (folder / "index").read_text().strip() == "0"
+                if first:  # the others are a camera's metadata
+                    found[number] = (folder / "name").read_text(errors="replace").strip()[:80]
+            except (OSError, ValueError):
+                continue
+        return dict(sorted(found.items()))
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    return {number: "" for number in range(_MAX_PROBED) if _opens(number)}
+
+
+def _opens(number: int) -> bool:
+    capture = cv2.VideoCapture(number)
+    try:
+        return bool(capture.isOpened())
+    finally:
+        capture.release()
+
+
+def _others(number: int) -> str:
+    cameras = {other: name for other, name in list_cameras().items() if other != number}
+    if not cameras:
+        return "found no camera at this machine, expected one that is plugged in and that this user may open"
+    named = ", ".join(f"{other} ({name})" if name else str(other) for other, name in cameras.items())
+    return f"expected a camera that no other program holds, or another one's number: {named}"

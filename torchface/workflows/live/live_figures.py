@@ -1,0 +1,86 @@
+"""The figures of a live session, in memory that does not grow: counts and a histogram of latency."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+_LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is told is within 1 %
+_BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
+_RECENT = 2.0  # seconds
+
+
+class LiveFigures:
+    """Counts frames as they go."""
+
+    def __init__(self) -> None:
+        self.frames = self.found = 0
+        self._histogram = np.zeros(_BINS + 1, np.int64)
+        self._first = self._last = 0.0
+        self._recent: deque[tuple[float, float]] = deque(maxlen=1000)
+
+    def add(self, came: float, gone: float, seen: bool) -> None:
+        """Counts a frame that came and was sent on at these times, in seconds."""
+        self._first = self._first if self.frames else came
+        self._last = gone
+        self.frames += 1
+        self.found += seen
+        latency = 1000 * (gone - came)
+        place = math.log(max(latency, _LEAST) / _LEAST) / math.log(_STEP)
+        self._histogram[min(int(place), _BINS)] += 1
+        self._recent.append((gone, latency))
+        while gone - self._recent[0][0] > _RECENT:
+            self._recent.popleft()
+
+    def latency(self, quantile: float) -> float:
+        """From a frame's arrival to its packets on the way, milliseconds; 0 before the first."""
+        if self.frames == 0:
+            return 0.0
+        place = int(np.searchsorted(self._histogram.cumsum(), max(1, math.ceil(quantile * self.frames))))
+        return _LEAST * _STEP ** (place + 0.5)
+
+    @property
+    def seconds(self) -> float:
+        """From the first frame's arrival to the last one's leaving."""
+        return self._last - self._first
+
+    @property
+    def fps(self) -> float:
+        """Frames a second, over all."""
+        return self.frames / max(self.seconds, 1e-9) if self.frames else 0.0
+
+    def recent(self) -> tuple[float, float]:
+        """Frames a second and the median latency of the last two seconds."""
+        recent = list(self._recent)
+        if len(recent) < 2:
+            return 0.0, 0.0
+        took = recent[-1][0] - recent[0][0]
+        return (len(recent) - 1) / max(took, 1e-9), float(np.median([latency for _, latency in recent]))
+
+
+@dataclass(frozen=True)
+class LiveReport:
+    """What was sent.
+
+    Args:
+        figures: of its frames.
+        dropped: frames that came while another was solved.
+        notes: what the user should know, such as receivers that were not there.
+    """
+
+    figures: LiveFigures
+    dropped: int
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        figures = self.figures
+        return [
+            f"{figures.frames} frames at {figures.fps:.1f} a second, a face in {figures.found}",
+            f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
+            f"{self.dropped} frames came too early and were left out",
+            *(f"warning: {note}" for note in self.notes),
+        ]
