@@ -13,11 +13,13 @@ from torchface.capture.markers import (
 )
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.video import VideoSolver
+from torchface.capture.webcam import ExampleSolver
 
 __all__ = [
     "ActionUnitClassifier",
     "DynamicsPrior",
     "DynamicsSettings",
+    "ExampleSolver",
     "HelmetSolver",
     "HybridSolver",
     "MarkerSolver",

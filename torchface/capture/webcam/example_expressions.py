@@ -1,0 +1,92 @@
+"""The paper's 16 expressions in its order, what each means in ARKit's shapes, and how they move a character."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import NameMismatchError
+from torchface.files.documents import read_toml
+from torchface.shape_names import ARKIT, mapping
+
+NEUTRAL = "neutral"
+"""The name of the face at rest, the first of the 16."""
+
+_FORMAT = "torchface.example_expressions/1"
+_TABLE = Path(__file__).with_name("tables") / "paper_expressions.toml"
+
+
+@dataclass(frozen=True)
+class ExampleExpression:
+    """One expression that somebody shows.
+
+    Args:
+        name: of the expression.
+        prompt: what the person is asked to do.
+        shapes: weights by ARKit's names.
+        yaw, roll: of the head, degrees: toward the person's left, the crown toward the person's left shoulder.
+    """
+
+    name: str
+    prompt: str
+    shapes: dict[str, float]
+    yaw: float
+    roll: float
+
+
+@cache
+def paper_expressions() -> tuple[ExampleExpression, ...]:
+    """The 16 of the paper: neutral, 11 expressions, and the head turned and tilted to either side.
+
+    Source: realtime_facial_animation, appendix, ``initial_example_face_matrix``.
+    """
+    rows = read_toml(_TABLE, _FORMAT)["expressions"].rows()
+    return tuple(
+        ExampleExpression(
+            row["name"].text(),
+            row["prompt"].text(),
+            {name: weight.number() for name, weight in row["shapes"].table().items()} if row["shapes"] else {},
+            row["yaw"].number() if row["yaw"] else 0.0,
+            row["roll"].number() if row["roll"] else 0.0,
+        )
+        for row in rows
+    )
+
+
+def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
+    """The matrix (M,N) that turns weights of examples into weights of a character's shapes, by name.
+
+    The paper's expressions become the shapes of ARKit that they mean, other examples the shape of their own name;
+    those that turn the head move no shape, see :func:`head_angles`. Order and count need not agree. Clamp what comes
+    out to [0,1]: two expressions may share a shape.
+
+    Args:
+        names: of the N examples.
+        shapes: of the character, M.
+
+    Raises:
+        NameMismatchError: no example moves a shape of the character.
+    """
+    known = {one.name: one for one in paper_expressions()}
+    matrix = mapping(names, shapes)
+    onto = mapping(ARKIT, shapes)
+    for column, name in enumerate(names):
+        for shape, weight in (known[name].shapes if name in known else {}).items():
+            matrix[:, column] += weight * onto[:, ARKIT.index(shape)]
+    if not bool(matrix.any()):
+        raise NameMismatchError(
+            f"character: found the shapes {', '.join(list(shapes)[:5])}, ..., of which no example "
+            f"({', '.join(list(names)[:5])}, ...) moves any, expected ARKit's names; see torchface retarget"
+        )
+    return matrix
+
+
+def head_angles(names: Sequence[str]) -> Tensor:
+    """Yaw and roll of the head in degrees that a weight of 1 of each example means, (N,2)."""
+    known = {one.name: (one.yaw, one.roll) for one in paper_expressions()}
+    return torch.tensor([known.get(name, (0.0, 0.0)) for name in names])

@@ -1,0 +1,81 @@
+"""Two ways to solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchface.capture.webcam.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
+from torchface.capture.webcam.landmark_equations import LandmarkEquations, Unknowns
+from torchface.capture.webcam.landmark_objectives import LandmarkObjective, SquaredDistances
+
+
+class ExampleMethod(Protocol):
+    """Finds weights in [0,1], and the placement, from the equations of landmarks."""
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns: ...
+
+
+@dataclass(frozen=True)
+class AllAtOnce:
+    """All shapes from all landmarks in one problem.
+
+    Args:
+        objective: what is minimised.
+
+    Source: realtime_facial_animation 5.2.2, listings 3 and 4.
+    """
+
+    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
+        """Weights of N shapes, whatever their regions (N,)."""
+        return self.objective.minimise(equations, initial)
+
+
+@dataclass(frozen=True)
+class Regional:
+    """Shapes of the head first; then those of brows, eyes and mouth, each from its region's landmarks alone.
+
+    The head's are solved from nose and corners of the eyes, which expressions move least. What they and the neutral
+    make is the base of the expressions. The paper's code took a base that held the expression of the frame before as
+    well, so that it was counted twice, and gave ``suck`` to the brows; both are mended.
+
+    Args:
+        objective: what is minimised in each of the two steps.
+
+    Source: realtime_facial_animation 5.2.2, listings 5 and 6.
+    """
+
+    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
+        """Weights of N shapes in their regions (N,)."""
+        basis = equations.basis
+        of_head = torch.tensor([region == HEAD for region in regions], device=basis.device)
+        head, others = of_head.nonzero()[:, 0], (~of_head).nonzero()[:, 0]
+        rows = torch.zeros(len(basis), dtype=torch.bool, device=basis.device)
+        rows[list(HEAD_LANDMARKS)] = True
+        # Where a hand hides nose and eyes the whole face must do.
+        shown = (equations.seen & rows).sum(1, keepdim=True) >= len(HEAD_LANDMARKS) // 2
+        first = equations.with_basis(basis[..., head]).among(torch.where(shown, rows, True))
+        if len(head):
+            placed = self.objective.minimise(first, None if initial is None else initial[:, head])
+        else:  # the placement alone
+            placed = first.least_squares(first.share).unknowns(first.offset.new_zeros(len(first.offset), 0))
+        rest = equations.moved(basis[..., head], placed).with_basis(_regional(basis, regions)[..., others])
+        expression = self.objective.minimise(rest, None if initial is None else initial[:, others])
+        order = torch.cat([head, others]).argsort()
+        return Unknowns(torch.cat([placed.weights, expression.weights], dim=1)[:, order], placed.free)
+
+
+def _regional(basis: Tensor, regions: tuple[str, ...]) -> Tensor:
+    """The basis (68,2,N) with each shape of a region moving that region's landmarks alone."""
+    kept = torch.zeros(len(basis), len(regions), dtype=torch.bool, device=basis.device)
+    for column, region in enumerate(regions):
+        if region != HEAD:
+            kept[list(REGION_LANDMARKS[region]), column] = True
+    return torch.where(kept[:, None], basis, 0.0)
