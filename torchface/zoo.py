@@ -21,6 +21,7 @@ from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_n
 from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
@@ -33,6 +34,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "appearance": AppearanceModel,
     "dynamics_prior": DynamicsPrior,
     "expression_regression": ExpressionRegression,
+    "eye_network": EyeNetwork,
     "face_boxes": BoxNetwork,
     "head": HeadModel,
     "landmark_network": LandmarkNetwork,

@@ -23,7 +23,7 @@ from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""
-_METHOD = "face pictures/2"
+_METHOD = "face pictures/3"
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
@@ -93,7 +93,7 @@ def read_pictures(paths: list[Path]) -> FacePictures:
 def _render_part(part: tuple[Path, int, int, Path | None]) -> None:
     path, number, seed, ict = part
     torch.set_num_threads(1)
-    pictures = draw_pictures(*_kinds(ict), PART * number, PART, seed)
+    pictures = draw_pictures(*head_kinds(ict), PART * number, PART, seed)
     tensors = {
         name: torch.stack([getattr(picture, name) for picture in pictures]) for name in ("rgba", "landmarks", "visible")
     }
@@ -101,7 +101,8 @@ def _render_part(part: tuple[Path, int, int, Path | None]) -> None:
 
 
 @lru_cache(maxsize=2)
-def _kinds(ict: Path | None) -> tuple[tuple[HeadKind, ...], tuple[float, ...]]:
+def head_kinds(ict: Path | None) -> tuple[tuple[HeadKind, ...], tuple[float, ...]]:
+    """Kinds of heads and how often each is drawn: embedded performers alone, or with ICT-FaceKit's, four in five."""
     if ict is None:
         return (performer_kind(),), (1.0,)
     return (people_kind(load_ict_facekit(ict), load_identity_modes(ict)), performer_kind()), (_PEOPLE, 1 - _PEOPLE)

@@ -12,10 +12,12 @@ from torchface.capture.priors import DynamicsPrior
 from torchface.capture.video import VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
+from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
 from torchface.onnx.expression_graph import export_expression_regression
+from torchface.onnx.eye_network_graph import export_eye_network
 from torchface.onnx.face_box_graph import export_box_network
 from torchface.onnx.head_decoder_graph import export_head_decoder
 from torchface.onnx.landmark_network_graph import export_landmark_network
@@ -32,7 +34,7 @@ def export_model(
 
     Args:
         model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkNetwork``,
-            ``BoxNetwork``, ``LandmarkTrees``, ``DynamicsPrior``, ``MarkerSolver`` or ``VideoSolver``.
+            ``EyeNetwork``, ``BoxNetwork``, ``LandmarkTrees``, ``DynamicsPrior``, ``MarkerSolver`` or ``VideoSolver``.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -47,6 +49,8 @@ def export_model(
         return export_landmark_bank(model, path, facts)
     if isinstance(model, LandmarkNetwork):
         return export_landmark_network(model, path, facts)
+    if isinstance(model, EyeNetwork):
+        return export_eye_network(model, path, facts)
     if isinstance(model, BoxNetwork):
         return export_box_network(model, path, facts)
     if isinstance(model, LandmarkTrees):
@@ -59,5 +63,5 @@ def export_model(
         return write_video_solver(model, path, facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver or VideoSolver"
+        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver or VideoSolver"
     )

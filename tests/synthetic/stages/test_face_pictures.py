@@ -3,8 +3,9 @@
 import torch
 
 from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.face_pictures.face_picture import SIZE, _closed, draw_pictures
+from torchface.synthetic.stages.face_pictures.face_picture import SIZE, draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
+from torchface.synthetic.stages.face_pictures.people import closed_lids
 from torchface.synthetic.stages.face_pictures.picture_geometry import as_annotated
 
 
@@ -28,7 +29,7 @@ def test_lids_of_a_blink_meet_on_every_head() -> None:
     weights[[ARKIT.index("eyeBlinkLeft"), ARKIT.index("eyeBlinkRight")]] = 1.0
     for seed in range(3):
         head = kind.draw(torch.Generator().manual_seed(seed))
-        marks = _closed(kind, head, weights)[kind.landmarks]
+        marks = closed_lids(kind, head, weights)[kind.landmarks]
         opened = torch.stack([marks[a, 1] - marks[b, 1] for a, b in ((37, 41), (38, 40), (43, 47), (44, 46))])
         assert float(opened.mean().abs()) < 0.6  # millimetres
 

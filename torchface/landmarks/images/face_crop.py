@@ -49,30 +49,31 @@ def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MAR
     return torch.cat([turn, ((size - 1) / 2 - turn @ middle)[:, None]], 1)
 
 
-def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
-    """The square of an image that a transform shows; beyond the border the border's pixels go on.
+def cut_crop(image: Tensor, transform: Tensor, width: int, height: int | None = None) -> Tensor:
+    """The rectangle of an image that a transform shows; beyond the border the border's pixels go on.
 
     Where the face is larger than the crop it is made smaller by averaging first, so that no pixels are skipped.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
         transform: (2,3), see :func:`crop_transform`.
-        size: pixels a side.
+        width, height: pixels of the crop; a square of that width if there is no height.
 
     Returns:
-        uint8 (3,S,S), red first; a grey image gives three alike.
+        uint8 (3,h,w), red first; a grey image gives three alike.
 
     Raises:
         ShapeError: no such image.
     """
     check_image(image)
-    height, width = image.shape[-2:]
-    last = size - 0.5
-    corners = from_crop(torch.tensor([[-0.5, -0.5], [last, -0.5], [-0.5, last], [last, last]]), transform)
+    rows, columns = image.shape[-2:]
+    size = (width, width if height is None else height)
+    right, bottom = size[0] - 0.5, size[1] - 0.5
+    corners = from_crop(torch.tensor([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]), transform)
     left, top = (corners.amin(0) - 2).floor().clamp(min=0).long().tolist()
     right, bottom = ((corners.amax(0) + 2).ceil().long() + 1).tolist()
-    left, top = min(left, width - 1), min(top, height - 1)
-    right, bottom = min(max(right, left + 1), width), min(max(bottom, top + 1), height)
+    left, top = min(left, columns - 1), min(top, rows - 1)
+    right, bottom = min(max(right, left + 1), columns), min(max(bottom, top + 1), rows)
     # Whole pixels are averaged, which OpenCV does ten times as fast as shares of them; the rest is left to the warp.
     step = max(1, round(1 / float(transform[:, :2].det().abs().sqrt())))
     high, wide = max(1, (bottom - top) // step) * step, max(1, (right - left) // step) * step
@@ -86,7 +87,7 @@ def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
     # From the pixels of the piece, that may be a smaller copy, to the image's, and from there to the crop's.
     back = np.array([[1 / ratio[0], 0, left - 0.5 + 0.5 / ratio[0]], [0, 1 / ratio[1], top - 0.5 + 0.5 / ratio[1]]])
     way = transform.double().numpy() @ np.concatenate([back, [[0.0, 0.0, 1.0]]])
-    crop = cv2.warpAffine(pixels, way, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    crop = cv2.warpAffine(pixels, way, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return torch.from_numpy(crop).permute(2, 0, 1)
 
 

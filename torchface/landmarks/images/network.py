@@ -77,18 +77,16 @@ class LandmarkNetwork(nn.Module):
         self.size, self.margin = size, margin
         self.channels, self.blocks, self.decoder = tuple(channels), tuple(blocks), decoder
         half, quarter, eighth, sixteenth = channels
-        self.stem = nn.Sequential(_convolution(3, half, 2), _convolution(half, quarter, 2))
+        self.stem = nn.Sequential(convolution(3, half, 2), convolution(half, quarter, 2))
         self.quarter = nn.Sequential(*[ResidualBlock(quarter) for _ in range(blocks[0])])
-        self.eighth = nn.Sequential(
-            _convolution(quarter, eighth, 2), *[ResidualBlock(eighth) for _ in range(blocks[1])]
-        )
+        self.eighth = nn.Sequential(convolution(quarter, eighth, 2), *[ResidualBlock(eighth) for _ in range(blocks[1])])
         self.sixteenth = nn.Sequential(
-            _convolution(eighth, sixteenth, 2), *[ResidualBlock(sixteenth) for _ in range(blocks[2])]
+            convolution(eighth, sixteenth, 2), *[ResidualBlock(sixteenth) for _ in range(blocks[2])]
         )
         self.context = nn.Linear(sixteenth, sixteenth)
-        self.up_eighth, self.mix_eighth = nn.Conv2d(sixteenth, eighth, 1), _convolution(eighth, eighth)
+        self.up_eighth, self.mix_eighth = nn.Conv2d(sixteenth, eighth, 1), convolution(eighth, eighth)
         self.up_quarter, self.skip_quarter = nn.Conv2d(eighth, decoder, 1), nn.Conv2d(quarter, decoder, 1)
-        self.mix_quarter = _convolution(decoder, decoder)
+        self.mix_quarter = convolution(decoder, decoder)
         self.heat = nn.Conv2d(decoder, COUNT, 1)
         self.local = nn.Parameter(torch.zeros(COUNT, decoder, 2))
         self.local_bias = nn.Parameter(torch.zeros(COUNT, 2))
@@ -126,8 +124,8 @@ class LandmarkNetwork(nn.Module):
         deep = self.sixteenth(eighth)
         pooled = deep.mean((2, 3))
         deep = deep + self.context(pooled)[:, :, None, None]
-        eighth = self.mix_eighth(_doubled(self.up_eighth(deep)) + eighth)
-        features = self.mix_quarter(_doubled(self.up_quarter(eighth)) + self.skip_quarter(quarter))
+        eighth = self.mix_eighth(doubled(self.up_eighth(deep)) + eighth)
+        features = self.mix_quarter(doubled(self.up_quarter(eighth)) + self.skip_quarter(quarter))
         return self.heat(features), features, self.presence(pooled)[:, 0]
 
     def read(self, heat: Tensor, features: Tensor, presence: Tensor) -> NetworkLandmarks:
@@ -154,18 +152,20 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.first = _convolution(channels, channels)
+        self.first = convolution(channels, channels)
         self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), nn.BatchNorm2d(channels))
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.relu(x + self.second(self.first(x)))
 
 
-def _convolution(before: int, after: int, stride: int = 1) -> nn.Sequential:
+def convolution(before: int, after: int, stride: int = 1) -> nn.Sequential:
+    """A convolution of 3 x 3, normalised and rectified."""
     return nn.Sequential(
         nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU(inplace=True)
     )
 
 
-def _doubled(x: Tensor) -> Tensor:
+def doubled(x: Tensor) -> Tensor:
+    """Maps (B,C,H,W) at twice the resolution."""
     return nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -85,12 +85,15 @@ def vertex_marks() -> Tensor:
 
 def noise(points: Tensor, millimetres: float, seed: int) -> Tensor:
     """Smooth random values (N,) in about [-1,1] that change over a length; the same at the same point everywhere."""
-    generator = torch.Generator().manual_seed(seed)
-    lattice = torch.rand(1, 1, 32, 32, 32, generator=generator) * 2 - 1
     place = points / millimetres / 32
     wrapped = (place - place.floor()) * 2 - 1
     grid = wrapped.view(1, 1, 1, -1, 3)
-    return torch.nn.functional.grid_sample(lattice, grid, padding_mode="border", align_corners=True)[0, 0, 0, 0]
+    return torch.nn.functional.grid_sample(_lattice(seed), grid, padding_mode="border", align_corners=True)[0, 0, 0, 0]
+
+
+@lru_cache(maxsize=32)
+def _lattice(seed: int) -> Tensor:
+    return torch.rand(1, 1, 32, 32, 32, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
 def blob(points: Tensor, centre: tuple[float, float, float], width: tuple[float, float, float]) -> Tensor:

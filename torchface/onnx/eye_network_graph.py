@@ -1,0 +1,125 @@
+"""An eye network as ONNX: crops of eyes to lids, irises, their deviation, and whether eyes are open, shut, hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import onnx
+import torch
+from torch import nn
+
+from torchface import __version__
+from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, POINTS, STRIDE, EyeNetwork
+from torchface.onnx.checked_export import ExportReport, write_checked
+from torchface.onnx.network_nodes import HalfBuilder, convolution, doubled, folded, layers
+
+_OUTPUTS: dict[str, tuple[int, ...]] = {
+    "landmarks": (6, 2), "iris": (2,), "deviation": (POINTS,), "openness": (), "closed": (), "visibility": ()
+}  # fmt: skip
+_PARITY = {"landmarks": 0.1, "iris": 0.1, "deviation": 0.1, "openness": 0.01, "closed": 0.01, "visibility": 0.01}
+_UNITS = {name: "pixels" if name in ("landmarks", "iris", "deviation") else "of 1" for name in _OUTPUTS}
+
+
+def export_eye_network(model: EyeNetwork, path: str | Path, facts: Mapping[str, object] | None = None) -> ExportReport:
+    """Writes an eye network as ONNX, its weights in half precision, and checks it.
+
+    The graph takes ``eyes`` (B,3,h,w) in [0,1], red first: crops as ``eye_transforms`` cuts them, left eyes mirrored.
+    It gives ``landmarks`` (B,6,2), ``iris`` (B,2) and ``deviation`` (B,7), pixels of the crop, ``openness`` (B,), and
+    ``closed`` and ``visibility`` (B,) in [0,1].
+
+    Args:
+        model: what to export.
+        path: the file to write.
+        facts: further metadata, such as licence and data.
+
+    Raises:
+        ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
+    """
+    model = model.eval()
+    generator = torch.Generator().manual_seed(0)
+    cases = []
+    for batch in (1, 2):
+        coarse = torch.rand(batch, 3, model.height // 8, model.width // 8, generator=generator)
+        crops = torch.nn.functional.interpolate(coarse, (model.height, model.width), mode="bilinear")
+        with torch.no_grad():
+            cases.append(({"eyes": crops}, model(crops)._asdict()))
+    return write_checked(eye_network_model(model, facts), path, cases, _PARITY, _UNITS)
+
+
+def eye_network_model(model: EyeNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
+    """The graph, its batch normalisations folded into the convolutions before them, built node by node."""
+    build = HalfBuilder()
+    eye_nodes(build, model, "eyes", {name: name for name in _OUTPUTS})
+    return build.model(
+        "eye_network",
+        {"eyes": ("batch", 3, model.height, model.width)},
+        {name: ("batch", *shape) for name, shape in _OUTPUTS.items()},
+        {
+            "task": "eye_network",
+            "eyes": "red, green, blue, 0 to 1; left eyes mirrored",
+            "landmarks": "outer corner, two of the upper lid, inner corner, two of the lower lid",
+            "units": "pixels of the crop",
+            "version": __version__,
+            **(facts or {}),
+        },
+    )
+
+
+def eye_nodes(build: HalfBuilder, model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
+    """The network's nodes in a graph that is being built.
+
+    Args:
+        build: collects them.
+        model: the network.
+        eyes: the value that holds crops, (B,3,h,w) in [0,1].
+        outputs: what the values of the network's findings shall be called, by their names in ``EyeFindings``.
+    """
+    net = folded(model, EyeNetwork.from_config(model.config))
+    op, quarters = build.op, nn.Conv2d(net.context.in_features, net.context.out_features, 1)
+
+    def constant(name: str, value: torch.Tensor | float | tuple[int, ...]) -> str:
+        return build.constant(f"eye_{name}", value)
+
+    half = layers(build, net.stem, op("Sub", op("Mul", eyes, constant("two", 2.0)), constant("one", 1.0)))
+    quarter = layers(build, net.quarter, half)
+    deep = layers(build, net.eighth, quarter)
+    pooled = op("GlobalAveragePool", deep)
+    quarters.weight.data, quarters.bias.data = net.context.weight.data[:, :, None, None], net.context.bias.data  # type: ignore[union-attr]
+    deep = op("Add", deep, convolution(build, quarters, pooled))
+    quarter = layers(
+        build, net.mix_quarter, op("Add", doubled(build, convolution(build, net.up_quarter, deep)), quarter)
+    )
+    features = layers(build, net.mix_half, op("Add", doubled(build, convolution(build, net.up_half, quarter)), half))
+    heat = op("Reshape", convolution(build, net.heat, features), constant("rows", (0, POINTS, -1)))
+    share = op("Softmax", heat, axis=-1)
+    places = net.places(torch.zeros(1, 1, model.height // STRIDE, model.width // STRIDE))
+    points = op("MatMul", share, constant("places", places))
+    last = constant("last", (-1,))
+    squared = op("MatMul", share, constant("squares", places.square()))
+    spread = op("ReduceSum", op("Sub", squared, op("Mul", points, points)), last, keepdims=0)
+    spread = op("Log", op("Add", op("Max", spread, constant("zero", 0.0)), constant("unit", 1.0)))
+    cells = op("Reshape", features, constant("cells", (0, net.channels[0], -1)))
+    under = op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1]))
+    told = op("ReduceSum", op("Mul", under, build.weight(net.local)), last, keepdims=0)
+    told = op("Add", told, constant("bias", net.local_bias))
+    deviation = op("Exp", op("Add", told, op("Mul", spread, constant("fourth", 0.25))))
+    limits = [constant(f"limit{i}", value) for i, value in enumerate(DEVIATION_RANGE)]
+    op("Clip", deviation, *limits, output=outputs["deviation"])
+    split = [constant(f"row{i}", (i,)) for i in (0, 6, 7)]
+    axis = constant("axis", (1,))
+    op("Slice", points, split[0], split[1], axis, output=outputs["landmarks"])
+    flat = constant("flat", (0, -1))
+    op("Reshape", op("Slice", points, split[1], split[2], axis), flat, output=outputs["iris"])
+    known = op("Concat", op("Reshape", pooled, flat), op("Reshape", under, flat), axis=1)
+    first, second = net.told[0], net.told[2]
+    assert isinstance(first, nn.Linear)
+    assert isinstance(second, nn.Linear)
+    inner = op("Add", op("MatMul", known, build.weight(first.weight.T)), constant("inner", first.bias))
+    answers = op("MatMul", op("Relu", inner), build.weight(second.weight.T))
+    answers = op("Add", answers, constant("answers", second.bias))
+    whole = constant("whole", (-1,))
+    for row, name in enumerate(("openness", "closed", "visibility")):
+        bounds = [constant(f"answer{end}", (end,)) for end in (row, row + 1)]
+        answer = op("Reshape", op("Slice", answers, *bounds, axis), whole)
+        op("Identity" if name == "openness" else "Sigmoid", answer, output=outputs[name])

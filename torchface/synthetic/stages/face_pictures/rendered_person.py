@@ -1,0 +1,188 @@
+"""What a camera sees of someone: the colour of each pixel under lamps, and how far away it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.color_space import to_linear, to_srgb
+from torchface.geometry.cameras.pinhole import Camera
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.rendering.gaussian_blur import gaussian_blur
+from torchface.rendering.raycast import RayCaster, openness
+from torchface.synthetic.stages.backdrops import uniform
+from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, GUMS, SKIN, TEETH
+from torchface.synthetic.stages.face_pictures.people import Person
+from torchface.synthetic.stages.face_pictures.picture_geometry import CURTAIN, Surface
+from torchface.synthetic.stages.face_pictures.skin_paint import hair_color, surface_color
+
+_WHITE = 0.75  # of the brightest light that an eye's white may have
+_FEW = 8  # pixels of eyeballs
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedPerson:
+    """What a camera sees.
+
+    Args:
+        image: colours with a fourth channel that is 1 on the person, 0 on what is behind, (H,W,4) sRGB.
+        distance: (H,W) millimetres, infinite where there is nothing.
+        material: (H,W), -1 where there is nothing.
+    """
+
+    image: Tensor
+    distance: Tensor
+    material: Tensor
+
+
+def render_person(person: Person, scene: Surface, camera: Camera, generator: torch.Generator) -> RenderedPerson:
+    """Shows someone to a camera.
+
+    Args:
+        person: whose head it is.
+        scene: all that can be seen.
+        camera: from where.
+        generator: of the lamps and the exposure.
+    """
+    height, width = camera.height, camera.width
+    origins, ways = camera.rays()
+    origins, ways = origins.reshape(-1, 3), ways.reshape(-1, 3)
+    caster = RayCaster(scene.vertices, scene.faces)
+    hits = caster.cast(origins, ways)
+    seen = hits.triangle >= 0
+    triangle, barycentric, ways = hits.triangle[seen], hits.barycentric[seen].double(), ways[seen]
+    points = origins[seen] + hits.distance[seen, None] * ways
+    color, gloss = _surface_color(person, scene, triangle, barycentric, points)
+    normals = _normals(scene, triangle, barycentric, ways)
+    material = scene.material[triangle]
+    free = openness(caster, points + 0.3 * normals, normals, generator, 2, 45.0)
+    free = _smooth(free, seen.view(height, width))
+    light = _lit(caster, camera, points, normals, ways, material, to_linear(color), gloss, free, generator)
+    face = (material == SKIN).float()
+    exposure = uniform(0.07, 0.42, generator) / float((light.mean(1) * face).sum() / face.sum().clamp(min=1))
+    whites = light[material == EYEBALL].mean(1)
+    if len(whites) > _FEW:  # dark skin is not shown so light that the eyes are white patches
+        exposure = min(exposure, _WHITE / float(whites.quantile(0.8)))
+    shown = to_srgb((light * exposure).clamp(0, 1))
+    image = torch.zeros(height * width, 4)
+    image[seen] = torch.cat([shown.float(), torch.ones(len(shown), 1)], dim=1)
+    materials = torch.full((height * width,), -1)
+    materials[seen] = material
+    return RenderedPerson(
+        image.view(height, width, 4), hits.distance.view(height, width), materials.view(height, width)
+    )
+
+
+def _surface_color(
+    person: Person, scene: Surface, triangle: Tensor, barycentric: Tensor, points: Tensor
+) -> tuple[Tensor, Tensor]:
+    """sRGB colours (R,3) of points, and how much light they mirror (R,)."""
+    kind, looks = person.kind, person.looks
+    material = scene.material[triangle]
+    color = looks.clothes.expand(len(points), 3).clone()
+    pattern = 0.5 + 0.5 * torch.sin(points[:, :2].float() @ torch.tensor([[0.0, 0.35], [0.6, 0.1]])[looks.seed % 2])
+    color = color * (1 - (0.35 if looks.seed % 3 == 0 else 0.0) * pattern[:, None])
+    gloss = torch.zeros(len(points))
+    of_head = material < CURTAIN
+    corners = scene.faces[triangle]
+    made = of_head & (corners < len(kind.canonical)).all(1)
+    rows, weights = corners[made], barycentric[made].float()
+    table = torch.cat([kind.canonical.float(), kind.marks, scene.hair[:, None]], dim=1)
+    values = (table[rows] * weights[..., None]).sum(1)
+    canonical, marks, hair = values[:, :3], values[:, 3:11], values[:, 11]
+    skin = surface_color(canonical, marks, material[made], looks, kind.brow_lift)
+    hair = torch.where(material[made] == SKIN, hair, 0.0)
+    skin = torch.lerp(skin, hair_color(canonical, looks), (0.98 * hair)[:, None])
+    color[made] = skin
+    shine = torch.full((len(skin),), looks.gloss) * (1 - hair) + 0.06 * hair
+    shine[(material[made] == TEETH) | (material[made] == GUMS)] = 0.25
+    shine[material[made] == EYEBALL] = 0.9
+    shine = torch.where((marks[:, 0] > 0.5) & (material[made] == SKIN), 1.8 * shine + 0.02, shine)
+    gloss[made] = shine
+    hanging = material == CURTAIN
+    color[hanging] = hair_color(points[hanging].float(), looks)
+    gloss[hanging] = 0.06
+    color[of_head & ~made] = torch.tensor([0.86, 0.82, 0.75])
+    return color.clamp(0.005, 0.99), gloss
+
+
+def _normals(scene: Surface, triangle: Tensor, barycentric: Tensor, ways: Tensor) -> Tensor:
+    smooth = vertex_normals(scene.vertices, scene.faces)
+    normals = (smooth[scene.faces[triangle]] * barycentric[..., None]).sum(1)
+    normals = torch.nn.functional.normalize(normals, dim=-1)
+    return torch.where((normals * ways).sum(-1, keepdim=True) > 0, -normals, normals)
+
+
+def _lit(
+    caster: RayCaster,
+    camera: Camera,
+    points: Tensor,
+    normals: Tensor,
+    ways: Tensor,
+    material: Tensor,
+    albedo: Tensor,
+    gloss: Tensor,
+    free: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and a sky."""
+    right, down, _ = camera.rotation.double()
+    toward_camera = -camera.rotation[2].double()
+    starts = points + 0.3 * normals
+    sky = torch.nn.functional.normalize(torch.randn(3, generator=generator).double() - 0.8 * down, dim=0)
+    even = uniform(0.15, 1.0, generator) * (1 + uniform(0, 0.9, generator) * (normals @ sky))
+    even = even * free
+    light = even[:, None].float() * _tint(generator, 0.12)
+    mirrored = torch.zeros(len(points), 3)
+    sharp = torch.where((material == EYEBALL), 220.0, uniform(8, 45, generator)).double()
+    for number in range(int(uniform(0.5, 3.6, generator))):
+        x, y = torch.randn(2, generator=generator).tolist()
+        toward = x * right - (0.4 + y) * down + uniform(-0.2, 1.6, generator) * toward_camera
+        toward = torch.nn.functional.normalize(toward, dim=0)
+        strength = uniform(0.15, 1.1, generator) * (1.0 if number == 0 else 0.5)
+        soft = uniform(0.0, 0.5, generator)
+        falls = ((normals @ toward + soft) / (1 + soft)).clamp(min=0)
+        if uniform(0, 1, generator) < 0.6:
+            dark = caster.occluded(starts, toward.expand_as(starts))
+            falls = falls * torch.where(dark, uniform(0.0, 0.5, generator), 1.0)
+        tint = _tint(generator, 0.2)
+        light = light + strength * falls[:, None].float() * tint
+        half = torch.nn.functional.normalize(toward - ways, dim=-1)
+        shine = (normals * half).sum(-1).clamp(min=0) ** sharp * (falls > 0)
+        mirrored = mirrored + strength * shine[:, None].float() * tint
+    # Blood under the skin softens and reddens where light ends.
+    return albedo.float() * light + gloss[:, None] * mirrored * 0.6
+
+
+def _tint(generator: torch.Generator, spread: float) -> Tensor:
+    warm = spread * float(torch.randn((), generator=generator).clamp(-2, 2))
+    return torch.tensor([1 + warm, 1.0, 1 - warm]) * (1 + 0.03 * torch.randn(3, generator=generator))
+
+
+def _smooth(values: Tensor, seen: Tensor) -> Tensor:
+    """Values (R,) of the pixels that are seen (H,W), blurred over the picture: a few rays a point are noisy."""
+    both = torch.zeros(2, *seen.shape)
+    both[0, seen], both[1, seen] = values.float(), 1.0
+    blurred = gaussian_blur(both[None], 1.2)[0][:, seen]
+    return (blurred[0] / blurred[1].clamp(min=1e-3)).double()
+
+
+def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Tensor, behind: Tensor | float) -> Tensor:
+    """Which points of a head nothing stands before, (N,) bool.
+
+    Args:
+        distance: of what each pixel shows, (H,W) millimetres.
+        camera: that sees it.
+        points: (N,3) millimetres.
+        pixels: where they are drawn, (N,2); it need not be where they are.
+        behind: how far each may lie behind what is seen, (N,) millimetres.
+    """
+    depth = (points - camera.centre).norm(dim=1)
+    x, y = pixels[:, 0].round().long(), pixels[:, 1].round().long()
+    x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
+    patch = distance[None, None]
+    near = -torch.nn.functional.max_pool2d(-patch, 3, 1, 1)[0, 0]
+    far = torch.nn.functional.max_pool2d(torch.where(torch.isfinite(patch), patch, 1e9), 3, 1, 1)[0, 0]
+    return torch.isfinite(near[y, x]) & (far[y, x] > depth - behind)
