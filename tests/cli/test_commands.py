@@ -1,5 +1,6 @@
 """Commands do on disk what the library does in memory, and say clearly what is wrong."""
 
+import re
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -188,6 +189,7 @@ def test_every_command_explains_itself_and_its_arguments(capsys: pytest.CaptureF
         assert ended.value.code == 0
         told = capsys.readouterr().out
         assert len(told) > 500, words
+        assert not re.search(r"\bNone\b", told), words  # Python's word, not the user's
 
 
 def test_help_is_a_short_line_a_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,7 @@ from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
 from torchface.cli.pick import pick
+from torchface.cli.plain_options import plain_options
 from torchface.cli.progress import PlainConsole
 from torchface.cli.register import register
 from torchface.cli.render import render
@@ -75,13 +76,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(0 if words else 2)
     with plain_errors():
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
-            tyro.cli(export_model, prog="torchface export", args=words[1:])
+            tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
         elif words[:1] == ["export"]:
-            tyro.extras.subcommand_cli_from_dict(EXPORTS, prog="torchface export", description=_EXPORT, args=words[1:])
+            exports = {name: plain_options(export) for name, export in EXPORTS.items()}
+            tyro.extras.subcommand_cli_from_dict(exports, prog="torchface export", description=_EXPORT, args=words[1:])
         else:
-            tyro.extras.subcommand_cli_from_dict(
-                COMMANDS | {"export": _export_help}, prog="torchface", description=DESCRIPTION, args=words
-            )
+            commands = {name: plain_options(command) for name, command in COMMANDS.items()}
+            commands["export"] = _export_help
+            tyro.extras.subcommand_cli_from_dict(commands, prog="torchface", description=DESCRIPTION, args=words)
 
 
 def _overview() -> None:

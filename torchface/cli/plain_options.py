@@ -1,0 +1,36 @@
+"""Options as people read them in help: what they take in plain words, and nothing of a default that is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from inspect import signature
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from tyro.conf import arg
+
+_WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
+
+
+def plain_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, whose help says ``PATH`` instead of ``{None}|PATH (default: None)``."""
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in signature(command).parameters.items():
+        kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
+        named = any(getattr(note, "metavar", None) is not None for note in notes)
+        changes: dict[str, Any] = {"help_behavior_hint": ""} if parameter.default is None else {}
+        if not named and (word := _WORDS.get(_given(kind))):
+            changes["metavar"] = word
+        if changes:
+            hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
+    command.__annotations__ = hints
+    return command
+
+
+def _given(kind: Any) -> Any:
+    """What an option takes where it is given."""
+    if get_origin(kind) not in (Union, UnionType):
+        return kind
+    given = [one for one in get_args(kind) if one is not NoneType]
+    return given[0] if len(given) == 1 else None
