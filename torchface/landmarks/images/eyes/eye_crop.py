@@ -87,4 +87,4 @@ def cut_eyes(image: Tensor, transforms: Tensor, width: int = CROP_WIDTH, height:
     Raises:
         ShapeError: no such image.
     """
-    return torch.stack([cut_crop(image, one, width, height) for one in transforms])
+    return torch.stack([cut_crop(image, one.double(), width, height) for one in transforms])
