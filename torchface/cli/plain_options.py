@@ -6,7 +6,7 @@ from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
@@ -20,7 +20,7 @@ def plain_options(command: Callable[..., None]) -> Callable[..., None]:
         kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
         named = any(getattr(note, "metavar", None) is not None for note in notes)
         changes: dict[str, Any] = {"help_behavior_hint": ""} if parameter.default is None else {}
-        if not named and (word := _WORDS.get(_given(kind))):
+        if not named and (word := _word(kind)):
             changes["metavar"] = word
         if changes:
             hints[name] = Annotated[(kind, *notes, arg(**changes))]  # type: ignore[misc]
@@ -28,9 +28,15 @@ def plain_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def _given(kind: Any) -> Any:
-    """What an option takes where it is given."""
-    if get_origin(kind) not in (Union, UnionType):
-        return kind
-    given = [one for one in get_args(kind) if one is not NoneType]
-    return given[0] if len(given) == 1 else None
+def _word(kind: Any) -> str | None:
+    """What an option takes where it is given, if there is one word for it."""
+    given = [kind]
+    if get_origin(kind) in (Union, UnionType):
+        given = [one for one in get_args(kind) if one is not NoneType]
+    if len(given) != 1:
+        return None
+    if get_origin(given[0]) is Literal:
+        return "{" + ",".join(map(str, get_args(given[0]))) + "}"
+    if get_origin(given[0]) in (list, tuple) and (word := _WORDS.get(get_args(given[0])[0])):
+        return f"[{word} ...]"
+    return _WORDS.get(given[0])
