@@ -12,7 +12,8 @@ from torch import nn
 from torchface import __version__
 from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, POINTS, STRIDE, EyeNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.network_nodes import HalfBuilder, convolution, doubled, folded, layers
+from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.network_nodes import convolution, doubled, folded, layers
 
 _OUTPUTS: dict[str, tuple[int, ...]] = {
     "landmarks": (6, 2), "iris": (2,), "deviation": (POINTS,), "openness": (), "closed": (), "visibility": ()
@@ -49,7 +50,7 @@ def export_eye_network(model: EyeNetwork, path: str | Path, facts: Mapping[str, 
 
 def eye_network_model(model: EyeNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
     """The graph, its batch normalisations folded into the convolutions before them, built node by node."""
-    build = HalfBuilder()
+    build = GraphBuilder()
     eye_nodes(build, model, "eyes", {name: name for name in _OUTPUTS})
     return build.model(
         "eye_network",
@@ -66,7 +67,7 @@ def eye_network_model(model: EyeNetwork, facts: Mapping[str, object] | None = No
     )
 
 
-def eye_nodes(build: HalfBuilder, model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
+def eye_nodes(build: model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
     """The network's nodes in a graph that is being built.
 
     Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
-from torch import Tensor
+from torch import Tensor, nn
 
 OPSET = 17
 IR_VERSION = 8
@@ -38,6 +39,32 @@ class GraphBuilder:
         self._root._constants[name] = numpy_helper.from_array(np.ascontiguousarray(array), name)
         return name
 
+    def weight(self, value: Tensor) -> str:
+        """A constant of a network: float16 in the file, float32 in the graph; ONNX Runtime widens it when it loads."""
+        half = np.ascontiguousarray(value.detach().cpu().numpy().astype(np.float16))
+        return self.op("Cast", self._once(half), to=onnx.TensorProto.FLOAT)
+
+    def scalar(self, name: str, value: int) -> str:
+        """An int64 constant without axes."""
+        self._root._constants[name] = numpy_helper.from_array(np.array(value, np.int64), name)
+        return name
+
+    def unnamed(self, value: Tensor) -> str:
+        """A float32 constant under a name of its own; the same numbers are kept once."""
+        return self._once(np.ascontiguousarray(value.detach().cpu().numpy().astype(np.float32)))
+
+    def _once(self, array: np.ndarray) -> str:
+        name = f"{array.dtype} {'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+        self._root._constants[name] = numpy_helper.from_array(array, name)
+        return name
+
+    def convolution(self, part: nn.Conv2d, value: str, weight: str) -> str:
+        """The node of a convolution with a bias, whose weight is a value of the graph."""
+        assert part.bias is not None
+        pads = [int(one) for one in (*part.padding, *part.padding)]
+        bias = self.unnamed(part.bias)
+        return self.op("Conv", value, weight, bias, pads=pads, strides=list(part.stride), group=part.groups)
+
     def op(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
         """Adds a node with one output and returns the output's name."""
         if output is None:
@@ -46,17 +73,17 @@ class GraphBuilder:
         self._nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
 
-    def first_of_two(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Adds a node with two outputs and returns the name of the first."""
+    def two_of(self, kind: str, *inputs: str, **attributes: Any) -> tuple[str, str]:
+        """Adds a node with two outputs and returns their names."""
         first, second = f"v{self._root._count}", f"v{self._root._count + 1}"
         self._root._count += 2
         self._nodes.append(helper.make_node(kind, list(inputs), [first, second], **attributes))
-        return first
+        return first, second
 
-    def branch(self, output: str) -> onnx.GraphProto:
-        """The nodes as a branch of an ``If`` with one float output."""
-        info = helper.make_tensor_value_info(output, onnx.TensorProto.FLOAT, None)
-        return helper.make_graph(self._nodes, "branch", [], [info])
+    def branch(self, *outputs: str) -> onnx.GraphProto:
+        """The nodes as a branch of an ``If`` with float outputs."""
+        infos = [helper.make_tensor_value_info(output, onnx.TensorProto.FLOAT, None) for output in outputs]
+        return helper.make_graph(self._nodes, "branch", [], infos)
 
     def model(
         self,
@@ -64,16 +91,28 @@ class GraphBuilder:
         inputs: dict[str, Sequence[int | str]],
         outputs: dict[str, Sequence[int | str]],
         metadata: dict[str, Any],
+        opset: int = OPSET,
+        types: dict[str, int] | None = None,
     ) -> onnx.ModelProto:
-        """The checked model; metadata values that are not text become JSON."""
+        """The checked model.
+
+        Args:
+            name: of the graph.
+            inputs, outputs: their shapes.
+            metadata: values that are not text become JSON.
+            opset: version of the operators.
+            types: of inputs and outputs that are not float32.
+        """
 
         def infos(values: dict[str, Sequence[int | str]]) -> list[onnx.ValueInfoProto]:
+            kinds = types or {}
             return [
-                helper.make_tensor_value_info(key, onnx.TensorProto.FLOAT, list(shape)) for key, shape in values.items()
+                helper.make_tensor_value_info(key, kinds.get(key, onnx.TensorProto.FLOAT), list(shape))
+                for key, shape in values.items()
             ]
 
         graph = helper.make_graph(self._nodes, name, infos(inputs), infos(outputs), list(self._constants.values()))
-        model = helper.make_model(graph, producer_name="torchface", opset_imports=[helper.make_opsetid("", OPSET)])
+        model = helper.make_model(graph, producer_name="torchface", opset_imports=[helper.make_opsetid("", opset)])
         model.ir_version = IR_VERSION
         helper.set_model_props(
             model, {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}

@@ -12,7 +12,8 @@ from torch import nn
 from torchface import __version__
 from torchface.landmarks.images.network import DEVIATION_RANGE, LandmarkNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.network_nodes import HalfBuilder, convolution, doubled, folded, layers
+from torchface.onnx.graph_builder import GraphBuilder
+from torchface.onnx.network_nodes import convolution, doubled, folded, layers
 
 _PARITY = {"landmarks": 0.1, "deviation": 0.1, "visibility": 0.01, "presence": 0.01}
 _UNITS = {"landmarks": "pixels", "deviation": "pixels", "visibility": "of 1", "presence": "of 1"}
@@ -47,46 +48,13 @@ def export_landmark_network(
 
 
 def landmark_network_model(model: LandmarkNetwork, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
-    """The graph, its batch normalisations folded into the convolutions before them.
+    """The graph.
 
     Built node by node: it takes milliseconds, where ``torch.export`` takes seconds, so that every start of a tracker
     can afford it.
     """
-    net, build = folded(model, LandmarkNetwork.from_config(model.config)), HalfBuilder()
-    op, constant = build.op, build.constant
-    centred = op("Sub", op("Mul", "image", constant("two", 2.0)), constant("one", 1.0))
-    quarter = layers(build, net.quarter, layers(build, net.stem, centred))
-    eighth = layers(build, net.eighth, quarter)
-    deep = layers(build, net.sixteenth, eighth)
-    pooled = op("GlobalAveragePool", deep)
-    context = nn.Conv2d(net.context.in_features, net.context.out_features, 1)
-    context.weight.data, context.bias.data = net.context.weight.data[:, :, None, None], net.context.bias.data  # type: ignore[union-attr]
-    deep = op("Add", deep, convolution(build, context, pooled))
-    eighth = op("Add", doubled(build, convolution(build, net.up_eighth, deep)), eighth)
-    eighth = layers(build, net.mix_eighth, eighth)
-    below = doubled(build, convolution(build, net.up_quarter, eighth))
-    features = layers(build, net.mix_quarter, op("Add", below, convolution(build, net.skip_quarter, quarter)))
-    heat = op("Reshape", convolution(build, net.heat, features), constant("rows", (0, 68, -1)))
-    share = op("Softmax", heat, axis=-1)
-    places = net.places(torch.zeros(1, 1, model.size // 4, model.size // 4))
-    landmarks = op("MatMul", share, constant("places", places), output="landmarks")
-    squared = op("MatMul", share, constant("squares", places.square()))
-    spread = op("ReduceSum", op("Sub", squared, op("Mul", landmarks, landmarks)), constant("last", (-1,)), keepdims=0)
-    spread = op("Add", op("Max", spread, constant("zero", 0.0)), "one")
-    cells = op("Reshape", features, constant("channels", (0, net.decoder, -1)))
-    under = op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1]))
-    told = [
-        op("Add", op("ReduceSum", op("Mul", under, build.weight(net.local[..., i])), "last", keepdims=0),
-           constant(f"bias{i}", net.local_bias[:, i]))
-        for i in range(2)
-    ]  # fmt: skip
-    deviation = op("Exp", op("Add", told[0], op("Mul", op("Log", spread), constant("quarter", 0.25))))
-    least, most = (constant(f"limit{i}", value) for i, value in enumerate(DEVIATION_RANGE))
-    op("Clip", deviation, least, most, output="deviation")
-    op("Sigmoid", told[1], output="visibility")
-    flat = op("Reshape", pooled, constant("flat", (0, -1)))
-    logit = op("Add", op("MatMul", flat, build.weight(net.presence.weight.T)), constant("there", net.presence.bias))
-    op("Reshape", op("Sigmoid", logit), constant("faces", (-1,)), output="presence")
+    build = GraphBuilder()
+    landmark_network_nodes(build, model, "image")
     return build.model(
         "landmark_network",
         {"image": ("batch", 3, model.size, model.size)},
@@ -106,3 +74,55 @@ def landmark_network_model(model: LandmarkNetwork, facts: Mapping[str, object] |
             **(facts or {}),
         },
     )
+
+
+def landmark_network_nodes(
+    build: GraphBuilder, model: LandmarkNetwork, image: str, prefix: str = ""
+) -> tuple[str, str, str, str]:
+    """The nodes of the network, batch normalisations folded into the convolutions before them.
+
+    Args:
+        build: the graph that they become part of.
+        model: the network.
+        image: crops (B,3,S,S) in [0,1], red first.
+        prefix: of the names of what they give.
+
+    Returns:
+        Names of landmarks, deviation, visibility and presence.
+    """
+    net = folded(model, LandmarkNetwork.from_config(model.config))
+    op, constant = build.op, build.constant
+    centred = op("Sub", op("Mul", image, constant("two", 2.0)), constant("one", 1.0))
+    quarter = layers(build, net.quarter, layers(build, net.stem, centred))
+    eighth = layers(build, net.eighth, quarter)
+    deep = layers(build, net.sixteenth, eighth)
+    pooled = op("GlobalAveragePool", deep)
+    context = nn.Conv2d(net.context.in_features, net.context.out_features, 1)
+    context.weight.data, context.bias.data = net.context.weight.data[:, :, None, None], net.context.bias.data  # type: ignore[union-attr]
+    deep = op("Add", deep, convolution(build, context, pooled))
+    eighth = op("Add", doubled(build, convolution(build, net.up_eighth, deep)), eighth)
+    eighth = layers(build, net.mix_eighth, eighth)
+    below = doubled(build, convolution(build, net.up_quarter, eighth))
+    features = layers(build, net.mix_quarter, op("Add", below, convolution(build, net.skip_quarter, quarter)))
+    heat = op("Reshape", convolution(build, net.heat, features), constant("rows", (0, 68, -1)))
+    share = op("Softmax", heat, axis=-1)
+    places = net.places(torch.zeros(1, 1, model.size // 4, model.size // 4))
+    landmarks = op("MatMul", share, constant("places", places), output=f"{prefix}landmarks")
+    squared = op("MatMul", share, constant("squares", places.square()))
+    spread = op("ReduceSum", op("Sub", squared, op("Mul", landmarks, landmarks)), constant("last", (-1,)), keepdims=0)
+    spread = op("Add", op("Max", spread, constant("zero", 0.0)), "one")
+    cells = op("Reshape", features, constant("channels", (0, net.decoder, -1)))
+    under = op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1]))
+    told = [
+        op("Add", op("ReduceSum", op("Mul", under, build.weight(net.local[..., i])), "last", keepdims=0),
+           constant(f"bias{i}", net.local_bias[:, i]))
+        for i in range(2)
+    ]  # fmt: skip
+    deviation = op("Exp", op("Add", told[0], op("Mul", op("Log", spread), constant("quarter", 0.25))))
+    least, most = (constant(f"limit{i}", value) for i, value in enumerate(DEVIATION_RANGE))
+    op("Clip", deviation, least, most, output=f"{prefix}deviation")
+    op("Sigmoid", told[1], output=f"{prefix}visibility")
+    flat = op("Reshape", pooled, constant("flat", (0, -1)))
+    logit = op("Add", op("MatMul", flat, build.weight(net.presence.weight.T)), constant("there", net.presence.bias))
+    op("Reshape", op("Sigmoid", logit), constant("faces", (-1,)), output=f"{prefix}presence")
+    return f"{prefix}landmarks", f"{prefix}deviation", f"{prefix}visibility", f"{prefix}presence"

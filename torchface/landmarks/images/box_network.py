@@ -14,10 +14,16 @@ from torchface.errors import ShapeError, ValueRangeError
 STRIDE = 8
 """Pixels a cell of the maps."""
 
-_TYPICAL_SIDE = 48.0  # pixels; what a network that has learned nothing takes a face for
+TYPICAL_SIDE = 48.0
+"""Pixels: what a network that has learned nothing takes a face for."""
+
 _SMALLEST = 64  # pixels a side of an image
 _FEWEST_CELLS = (_SMALLEST // STRIDE) ** 2
-_LOG_SIDES = 5.0  # how far the logarithm of a side may lie from the typical one's
+LOG_SIDES = 5.0
+"""How far the logarithm of a side may lie from the typical one's."""
+
+BESIDE_A_PEAK = 1e-3
+"""What a cell's score counts beside a likelier one."""
 
 
 class FaceMaps(NamedTuple):
@@ -70,14 +76,14 @@ class BoxNetwork(nn.Module):
         self.channels, self.blocks, self.faces = tuple(channels), tuple(blocks), faces
         first, second, third, fourth = self.channels
         self.stem = nn.Sequential(_convolution(3, first, 4, 4), nn.ReLU())
-        self.level_4 = nn.Sequential(*[_Separable(first, first, 3) for _ in range(blocks[0])])
+        self.level_4 = nn.Sequential(*[SeparableConvolution(first, first, 3) for _ in range(blocks[0])])
         self.level_8 = _level(first, second, blocks[1], 3)
         self.level_16 = _level(second, third, blocks[2], 5)
         self.level_32 = _level(third, fourth, blocks[3], 5)
         self.from_32 = _convolution(fourth, third, 1)
-        self.mixed_16 = _Separable(third, third, 5)
+        self.mixed_16 = SeparableConvolution(third, third, 5)
         self.from_16 = _convolution(third, second, 1)
-        self.mixed_8 = nn.Sequential(_Separable(second, second, 3), _Separable(second, 2 * second, 3))
+        self.mixed_8 = nn.Sequential(SeparableConvolution(second, second, 3), SeparableConvolution(second, 2 * second, 3))
         self.said = nn.Conv2d(2 * second, 6, 1)
         assert self.said.bias is not None
         with torch.no_grad():
@@ -120,14 +126,14 @@ class BoxNetwork(nn.Module):
         centre, geometry = self.maps(images)
         likely = centre.sigmoid()
         # Cells beside a peak keep a thousandth: among equal ones the order would be anybody's.
-        peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, 1e-3)
+        peaks = likely * torch.where(max_pool2d(likely, 3, 1, 1) == likely, 1.0, BESIDE_A_PEAK)
         column = geometry[:, :1] + torch.arange(peaks.shape[3]).to(peaks)
         row = geometry[:, 1:2] + torch.arange(peaks.shape[2]).to(peaks)[:, None]
         said = torch.cat([column, row, geometry[:, 2:]], 1).flatten(2)
         scores, cells = peaks.flatten(1).topk(self.faces, dim=1)
         own = said.gather(2, cells[:, None].expand(-1, 5, -1)).transpose(1, 2)
         middle = STRIDE * (own[..., :2] + 0.5) - 0.5
-        side = _TYPICAL_SIDE * own[..., 2:3].clamp(-_LOG_SIDES, _LOG_SIDES).exp()
+        side = TYPICAL_SIDE * own[..., 2:3].clamp(-LOG_SIDES, LOG_SIDES).exp()
         angle = own[..., 3:] / own[..., 3:].square().sum(-1, keepdim=True).clamp(min=1e-12).sqrt()
         return torch.cat([middle, side, scores[..., None], angle], -1)
 
@@ -140,11 +146,11 @@ def face_geometry(faces: Tensor, cells: Tensor) -> Tensor:
         cells: column and row, (...,2).
     """
     middle = (faces[..., :2] + 0.5) / STRIDE - 0.5 - cells
-    side = (faces[..., 2:3] / _TYPICAL_SIDE).log()
+    side = (faces[..., 2:3] / TYPICAL_SIDE).log()
     return torch.cat([middle, side, faces[..., 3:].cos(), faces[..., 3:].sin()], -1)
 
 
-class _Separable(nn.Module):
+class SeparableConvolution(nn.Module):
     """A depthwise and a pointwise convolution, with a shortcut where the form stays."""
 
     def __init__(self, inside: int, outside: int, size: int, stride: int = 1) -> None:
@@ -161,8 +167,8 @@ class _Separable(nn.Module):
 
 def _level(inside: int, outside: int, count: int, size: int) -> nn.Sequential:
     """Half the resolution, then as many convolutions in all."""
-    first = _Separable(inside, outside, size, 2)
-    return nn.Sequential(first, *[_Separable(outside, outside, size) for _ in range(count - 1)])
+    first = SeparableConvolution(inside, outside, size, 2)
+    return nn.Sequential(first, *[SeparableConvolution(outside, outside, size) for _ in range(count - 1)])
 
 
 def _convolution(inside: int, outside: int, size: int, stride: int = 1, groups: int = 1) -> nn.Sequential:

@@ -13,8 +13,12 @@ _RUNS = ((0, 16), (17, 26), (27, 27), (28, 28), (29, 29), (30, 30), (31, 35))
 _PAIRS = ((36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46))
 _LIPS = ((48, 54), (55, 59), (60, 64), (65, 67))
 _RIGHT_EYE, _LEFT_EYE, _MOUTH = slice(36, 42), slice(42, 48), slice(48, 68)
-_SIDE = 1.6
-_ABOVE, _ASIDE = 0.037, 0.0
+SIDE_OF_EXTENT = 1.6
+"""A box's side, of the extent of brows, nose, eyes and mouth."""
+
+MIDDLE_ABOVE = 0.037
+"""How far the box's middle lies above their mean, in sides of the box."""
+
 
 
 def _mirror() -> tuple[int, ...]:
@@ -77,8 +81,8 @@ def box_around(landmarks: Tensor, tilt: float = 0.0) -> Tensor:
     low = torch.where(seen, inner, torch.inf).amin(-2)
     high = torch.where(seen, inner, -torch.inf).amax(-2)
     middle = torch.where(seen, inner, 0).sum(-2) / seen.sum(-2)
-    side = _SIDE * ((high - low).square().sum(-1, keepdim=True) / 2).sqrt()
-    centre = middle + side * middle.new_tensor([_ASIDE, -_ABOVE])
+    side = SIDE_OF_EXTENT * ((high - low).square().sum(-1, keepdim=True) / 2).sqrt()
+    centre = middle + side * middle.new_tensor([0.0, -MIDDLE_ABOVE])
     if tilt:
         centre = centre @ upright
     box = torch.cat([centre - side / 2, side, side], dim=-1)

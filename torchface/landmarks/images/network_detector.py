@@ -41,7 +41,7 @@ class NetworkDetector:
             )
         self.network = network
         self.least_score, self.longest = least_score, longest
-        self._fused = _without_normalisation(network)
+        self._fused = without_normalisation(network)
 
     @torch.inference_mode()
     def __call__(self, image: Tensor) -> FaceBoxes:
@@ -96,7 +96,7 @@ def _one_each(boxes: Tensor) -> Tensor:
     return torch.tensor(kept, dtype=torch.long)
 
 
-def _without_normalisation(network: BoxNetwork) -> nn.Module:
+def without_normalisation(network: BoxNetwork) -> nn.Module:
     """A copy that computes the same with batch normalisation folded into the convolutions before it."""
     fused = copy.deepcopy(network).eval()
     for module in fused.modules():

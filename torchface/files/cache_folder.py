@@ -1,0 +1,33 @@
+"""Where lies what can be made again: graphs and pages, each made once."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from torchface.files.whole_files import make_folder
+
+
+def cache_folder(kind: str) -> Path:
+    """The folder for what is kept of one kind, made if it is not there; whoever deletes it loses time alone.
+
+    It lies in ``$TORCHFACE_CACHE`` if that is set, else where the system has a user's caches.
+
+    Args:
+        kind: a plain name, such as ``app``.
+
+    Raises:
+        FileFormatError: it cannot be made.
+    """
+    return make_folder(_root() / kind)
+
+
+def _root() -> Path:
+    if own := os.environ.get("TORCHFACE_CACHE"):
+        return Path(own)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "torchface" / "cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "torchface"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchface"

@@ -1,0 +1,198 @@
+"""What is read of one face in a webcam's pictures, frame after frame, as values of a graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.network import COUNT, LandmarkNetwork
+from torchface.onnx.graph_values import Value, ValueGraph
+from torchface.onnx.landmark_network_graph import landmark_network_nodes
+from torchface.onnx.webcam.face_place import overlap_of, place_around, plausible, relation, side, sought
+from torchface.onnx.webcam.face_search import FOUND, SearchSettings, search
+from torchface.onnx.webcam.picture_pieces import cut_square, from_square, picture_size
+
+STATE = 15
+"""Numbers that a reader hands on."""
+
+_SEEN = 4 * COUNT + 1  # landmarks, deviation, visibility, presence
+_FAR, _LOOSE = 0.75, 0.25  # shared share of two places
+_LONGEST = 0.5  # seconds: after a longer break the face may be anywhere
+_ANYWHERE = torch.tensor([32.0, 32.0, 64.0, 1.0, 0.0])  # a place, where there is none to look at
+_SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
+_LONG = 1e3  # seconds
+_RIGHT, _LEFT = 36, 42
+_SHUT, _STEEP = 0.13, 12.0  # openness of an eye half shut, and how steeply that is said
+
+
+@dataclass(frozen=True)
+class ReaderSettings:
+    """When a face counts as found and as lost.
+
+    Args:
+        new: presence from which what the box network finds is a face.
+        sure: presence from which nothing is asked about a face that is followed.
+        likely: presence from which it is kept though the box network sees none.
+        least: presence under which it is lost at once.
+        doubt: seconds of presence below ``sure`` after which the box network is asked, again and again.
+        patience: seconds for which a lost face is waited for at its place before another of several is taken.
+        eager: seconds after a face was lost in which every frame is searched.
+        pause: seconds between searches afterwards.
+        smallest: pixels a side of the box round a face, at least.
+        search: where faces are looked for.
+    """
+
+    new: float = 0.6
+    sure: float = 0.9
+    likely: float = 0.5
+    least: float = 0.1
+    doubt: float = 0.25
+    patience: float = 0.3
+    eager: float = 2.0
+    pause: float = 0.1
+    smallest: float = 12.0
+    search: SearchSettings = field(default_factory=SearchSettings)
+
+
+@dataclass(frozen=True)
+class ReadFace:
+    """A :class:`~torchface.landmarks.images.face_reading.FaceReading` as values of a graph, and what the next takes.
+
+    Args:
+        landmarks: (68,2) pixels of the picture; NaN without a face.
+        deviation: (68,) pixels.
+        visibility: (68,); 0 without a face.
+        presence: (1,); 0 without a face.
+        iris: (2,2) pixels; NaN without a face.
+        openness, closed, eye_visibility: (2,), the person's right eye first.
+        state: (STATE,), what the reader of the next picture takes.
+    """
+
+    landmarks: Value
+    deviation: Value
+    visibility: Value
+    presence: Value
+    iris: Value
+    openness: Value
+    closed: Value
+    eye_visibility: Value
+    state: Value
+
+
+def read_face(
+    graph: ValueGraph,
+    image: Value,
+    interval: Value,
+    state: Value,
+    boxes: BoxNetwork,
+    landmarks: LandmarkNetwork,
+    settings: ReaderSettings,
+) -> ReadFace:
+    """One face in the next picture.
+
+    A face is looked for in the square round where it was in the picture before, turned as it was and as it lay to the
+    landmarks when it was found: one that moved far is looked at once more. Without one the box network looks for it.
+
+    Args:
+        graph: that the nodes become part of.
+        image: uint8 (H,W,C), 3 channels or 4, red first.
+        interval: seconds since the picture before, (1,), finite and positive.
+        state: what the reader of the picture before left, (STATE,); zeros before the first.
+        boxes, landmarks: find them.
+        settings: when a face counts as found and as lost.
+    """
+    place, anchor = state.rows(0, 5), state.rows(5, 8)
+    following, missing, doubt, since, attempt = (state.rows(at, at + 1) for at in range(8, 13))
+    size = picture_size(image)
+    same = size.equals(state.rows(13, 15)).number().reduced("ReduceMin", 0, keep=True)
+    # Another picture size is another camera: its face may be anywhere.
+    place = place * same
+    followed = (following > 0.5) & (same > 0.5) & (interval <= _LONGEST)
+    asked = followed & (doubt >= settings.doubt) & (since >= settings.doubt)
+    lost_now = ~followed & ((missing <= settings.eager) | (since >= settings.pause))
+    nothing = graph.as_value(torch.zeros(FOUND))
+    searched = asked | lost_now
+    found = graph.either(
+        searched,
+        lambda: search(image, boxes, settings.search, place, missing < settings.patience, attempt),
+        lambda: nothing,
+    )
+    there = found.rows(5, 6) > 0.5
+    begin = graph.where(followed, sought(place, anchor), found.rows(0, 5))
+    ready = plausible(begin, size, settings.smallest) & (followed | there)
+    first = graph.where(ready, begin, _ANYWHERE)
+    # The network runs on every picture, as ONNX Runtime makes it half as fast inside of a branch.
+    seen = _look(graph, image, first, landmarks)
+    moved = place_around(seen.rows(0, 2 * COUNT).shaped(COUNT, 2))
+    shared = overlap_of(graph.where(followed, place, first), moved)
+    # Boxes of the box network fit loosely, but what lies beside them is not their face.
+    again = graph.where(followed, (shared < _FAR).number(), (shared >= _LOOSE).number()) > 0.5
+    again = again & ready & plausible(moved, size, settings.smallest)
+    looked = graph.where(again, graph.where(followed, sought(moved, anchor), moved), first)
+    seen = graph.either(again, lambda: _look(graph, image, looked, landmarks), lambda: seen)
+    marks, presence = seen.rows(0, 2 * COUNT).shaped(COUNT, 2), seen.rows(4 * COUNT, _SEEN)
+    own = place_around(marks)
+    growth = side(own) / side(place).most(1.0)
+    kept = (presence >= settings.likely) | ~asked | (found.rows(6, 7) > 0.5)
+    kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
+    good = (followed & kept) | (~followed & (presence >= settings.new))
+    good = good & ready & plausible(own, size, settings.smallest)
+    clear = (presence >= settings.sure) | (found.rows(6, 7) > 0.5)
+    refused = lost_now & there & ~good
+    after = graph.cat(
+        graph.where(good, own, place),
+        graph.where(followed, anchor, graph.where(good, relation(own, looked), anchor)),
+        good.number(),
+        graph.where(good, 0.0, (missing + interval).least(_LONG)),
+        graph.where(good & ~clear, doubt + interval, 0.0),
+        graph.where(searched, 0.0, (since + interval).least(_LONG)),
+        graph.where(refused, attempt + 1.0, 0.0),
+        size,
+    )
+    shown = graph.where(good.shaped(1, 1), marks, float("nan"))
+    right, left = (_eye(shown.rows(first, first + 6)) for first in (_RIGHT, _LEFT))
+    openness = graph.cat(right.openness, left.openness)
+    share = good.number()
+    return ReadFace(
+        shown,
+        seen.rows(2 * COUNT, 3 * COUNT),
+        seen.rows(3 * COUNT, 4 * COUNT) * share,
+        presence * share,
+        graph.cat(right.middle, left.middle).shaped(2, 2),
+        openness,
+        ((_SHUT - openness) * _STEEP + 0.5).least(1.0).most(0.0),
+        graph.cat(share, share),
+        after,
+    )
+
+
+def _look(graph: ValueGraph, image: Value, place: Value, network: LandmarkNetwork) -> Value:
+    """What the network finds in the square round a place: landmarks, deviation, visibility, presence in one row."""
+    square = cut_square(image, place, network.size, network.margin)
+    names = landmark_network_nodes(graph.build, network, square.name, f"{square.name}_")
+    marks, deviation, visibility, presence = (graph.value(name) for name in names)
+    marks = from_square(marks.shaped(COUNT, 2), place, network.size, network.margin)
+    deviation = deviation.shaped(COUNT) * side(place) * (network.margin / network.size)
+    return graph.cat(marks.shaped(2 * COUNT), deviation, visibility.shaped(COUNT), presence)
+
+
+@dataclass(frozen=True)
+class _Eye:
+    """The middle (2,) of one eye's landmarks, and the distance of its lids over that of its corners (1,)."""
+
+    middle: Value
+    openness: Value
+
+
+def _eye(ring: Value) -> _Eye:
+    """From its six landmarks (6,2)."""
+    graph = ring.graph
+
+    def distance(first: int, second: int) -> Value:
+        apart = ring.rows(first, first + 1) - ring.rows(second, second + 1)
+        return graph.op("Sqrt", (apart * apart).reduced("ReduceSum", 1))
+
+    lids = (distance(1, 5) + distance(2, 4)) * 0.5
+    return _Eye(ring.reduced("ReduceMean", 0), lids / distance(0, 3).most(1e-6))
