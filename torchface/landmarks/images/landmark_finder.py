@@ -14,7 +14,9 @@ from torchface.errors import ShapeError, ValueRangeError
 COUNT = 68
 """iBUG's landmarks, that every finder gives."""
 
-_HALF = 0.02
+HALF_CONFIDENCE = 0.02
+"""The deviation, in sides of the face's box, of a confidence of one half."""
+
 _HIDDEN, _SEEN = 0.7, 0.95
 _LIPS, _CHIN = slice(48, 68), slice(4, 13)
 _GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
@@ -51,7 +53,7 @@ class LandmarkFinder(Protocol):
 
 def confidence_of(deviation: Tensor) -> Tensor:
     r""":math:`1 / (1 + (s/0.02)^2)` of deviations s in sides of the face's box: one half at 0.02."""
-    return 1 / (1 + (deviation / _HALF).square())
+    return 1 / (1 + (deviation / HALF_CONFIDENCE).square())
 
 
 def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.landmark_finder import HALF_CONFIDENCE
 from torchface.landmarks.images.network import COUNT, LandmarkNetwork
 from torchface.onnx.graph_values import Value, ValueGraph
 from torchface.onnx.landmark_network_graph import landmark_network_nodes
@@ -33,10 +34,11 @@ class ReaderSettings:
 
     Args:
         new: presence from which what the box network finds is a face.
+        vague: mean confidence of the landmarks under which it is none, and under which one that is followed is doubted.
         sure: presence from which nothing is asked about a face that is followed.
         likely: presence from which it is kept though the box network sees none.
         least: presence under which it is lost at once.
-        doubt: seconds of presence below ``sure`` after which the box network is asked, again and again.
+        doubt: seconds of doubt, such as of presence below ``sure``, after which the box network is asked, again and again.
         patience: seconds for which a lost face is waited for at its place before another of several is taken.
         eager: seconds after a face was lost in which every frame is searched.
         pause: seconds between searches afterwards.
@@ -45,6 +47,7 @@ class ReaderSettings:
     """
 
     new: float = 0.6
+    vague: float = 0.5
     sure: float = 0.9
     likely: float = 0.5
     least: float = 0.1
@@ -135,11 +138,14 @@ def read_face(
     marks, presence = seen.rows(0, 2 * COUNT).shaped(COUNT, 2), seen.rows(4 * COUNT, _SEEN)
     own = place_around(marks)
     growth = side(own) / side(place).most(1.0)
-    kept = (presence >= settings.likely) | ~asked | (found.rows(6, 7) > 0.5)
+    confident = _confidence(seen.rows(2 * COUNT, 3 * COUNT), own)
+    vague = confident < settings.vague
+    confirmed = found.rows(6, 7) > 0.5
+    kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
     kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
-    good = (followed & kept) | (~followed & (presence >= settings.new))
+    good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
     good = good & ready & plausible(own, size, settings.smallest)
-    clear = (presence >= settings.sure) | (found.rows(6, 7) > 0.5)
+    clear = ((presence >= settings.sure) & ~vague) | confirmed
     refused = lost_now & there & ~good
     after = graph.cat(
         graph.where(good, own, place),
@@ -176,6 +182,12 @@ def _look(graph: ValueGraph, image: Value, place: Value, network: LandmarkNetwor
     marks = from_square(marks.shaped(COUNT, 2), place, network.size, network.margin)
     deviation = deviation.shaped(COUNT) * side(place) * (network.margin / network.size)
     return graph.cat(marks.shaped(2 * COUNT), deviation, visibility.shaped(COUNT), presence)
+
+
+def _confidence(deviation: Value, place: Value) -> Value:
+    """The mean (1,) of :func:`~torchface.landmarks.images.landmark_finder.confidence_of` deviations (68,) in pixels."""
+    share = deviation / (side(place).most(1.0) * HALF_CONFIDENCE)
+    return (1.0 / (share * share + 1.0)).reduced("ReduceMean", 0, keep=True)
 
 
 @dataclass(frozen=True)
