@@ -67,7 +67,7 @@ def eye_network_model(model: EyeNetwork, facts: Mapping[str, object] | None = No
     )
 
 
-def eye_nodes(build: model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
+def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mapping[str, str]) -> None:
     """The network's nodes in a graph that is being built.
 
     Args:

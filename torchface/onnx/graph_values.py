@@ -41,7 +41,9 @@ class ValueGraph:
         """A node's only output; numbers are float32, sequences int64."""
         return Value(self, self.build.op(kind, *(self.as_value(one).name for one in inputs), **attributes))
 
-    def two_of(self, kind: str, *inputs: Value | Tensor | float | Sequence[int], **attributes: Any) -> tuple[Value, Value]:
+    def two_of(
+        self, kind: str, *inputs: Value | Tensor | float | Sequence[int], **attributes: Any
+    ) -> tuple[Value, Value]:
         """A node's two outputs."""
         first, second = self.build.two_of(kind, *(self.as_value(one).name for one in inputs), **attributes)
         return Value(self, first), Value(self, second)

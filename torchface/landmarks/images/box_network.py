@@ -83,7 +83,9 @@ class BoxNetwork(nn.Module):
         self.from_32 = _convolution(fourth, third, 1)
         self.mixed_16 = SeparableConvolution(third, third, 5)
         self.from_16 = _convolution(third, second, 1)
-        self.mixed_8 = nn.Sequential(SeparableConvolution(second, second, 3), SeparableConvolution(second, 2 * second, 3))
+        self.mixed_8 = nn.Sequential(
+            SeparableConvolution(second, second, 3), SeparableConvolution(second, 2 * second, 3)
+        )
         self.said = nn.Conv2d(2 * second, 6, 1)
         assert self.said.bias is not None
         with torch.no_grad():

@@ -20,7 +20,6 @@ MIDDLE_ABOVE = 0.037
 """How far the box's middle lies above their mean, in sides of the box."""
 
 
-
 def _mirror() -> tuple[int, ...]:
     twins = {row: first + last - row for first, last in _RUNS + _LIPS for row in range(first, last + 1)}
     twins |= dict(_PAIRS) | {right: left for left, right in _PAIRS}
