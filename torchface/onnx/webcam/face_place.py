@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 
 from torchface.landmarks.images.ibug_68 import INNER, MIDDLE_ABOVE, SIDE_OF_EXTENT
-from torchface.onnx.graph_values import Value, ValueGraph
+from torchface.onnx.graph_values import Value
 
 SIZE = 5
 
@@ -86,7 +86,6 @@ def overlap_of(place: Value, other: Value) -> Value:
 
 def plausible(place: Value, size: Value, smallest: float) -> Value:
     """Whether a face can have this place in a picture of a size (2,), width and height; (1,) bool."""
-    graph: ValueGraph = place.graph
     inside = (middle(place) >= 0.0) & (middle(place) < size)
     both = inside.number().reduced("ReduceMin", 0, keep=True) > 0.5
     return both & (side(place) >= smallest) & (side(place) <= size.reduced("ReduceMax", 0, keep=True) * 1.5)

@@ -38,7 +38,7 @@ class ReaderSettings:
         sure: presence from which nothing is asked about a face that is followed.
         likely: presence from which it is kept though the box network sees none.
         least: presence under which it is lost at once.
-        doubt: seconds of doubt, such as of presence below ``sure``, after which the box network is asked, again and again.
+        doubt: seconds of presence below ``sure`` and the like after which the box network is asked, again and again.
         patience: seconds for which a lost face is waited for at its place before another of several is taken.
         eager: seconds after a face was lost in which every frame is searched.
         pause: seconds between searches afterwards.

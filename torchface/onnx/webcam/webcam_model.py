@@ -46,8 +46,8 @@ class WebcamParts:
         landmarks: finds landmarks in a face.
         solver: the graph that solves weights. Its inputs are ``READING``'s names with their shapes, ``presence`` (),
             ``size`` (2,), width and height of the picture, ``interval`` () and ``controls`` (5,), finite and in their
-            ranges, and ``state`` (S,), zeros to start; its outputs ``SOLVED``'s names and ``next_state`` (S,). Those that
-            it has no use for may be missing among its inputs.
+            ranges, and ``state`` (S,), zeros to start; inputs that it has no use for may be missing. Its outputs are
+            ``SOLVED``'s names and ``next_state`` (S,).
         settings: when a face counts as found and as lost.
     """
 
