@@ -198,6 +198,19 @@ def test_frames_without_a_face_are_bridged(small: BlendshapeRig) -> None:
     assert (whole.weights - weights)[gap].abs().mean() < (causal.weights - weights)[gap].abs().mean()
 
 
+def test_landmarks_that_are_not_trusted_are_no_face(small: BlendshapeRig) -> None:
+    """A filter carries landmarks on for some frames after a face was lost, when nothing is sure of them."""
+    found = film(small, acted(8), *poses(8))
+    sure = torch.ones(8, 68)
+    sure[3:6] = 0.0
+    solver = VideoSolver(small, None, K)
+    carried = solver(found, confidence=sure)
+    found[3:6] = torch.nan
+    lost = solver(found)
+    assert carried.solved.tolist() == lost.solved.tolist() == [t not in (3, 4, 5) for t in range(8)]
+    torch.testing.assert_close(carried.weights, lost.weights)
+
+
 def test_a_strong_prior_has_its_way(small: BlendshapeRig) -> None:
     """The more a prior counts, the closer to its peak; where it counts for nothing, it changes nothing."""
     samples = 0.3 + 0.02 * torch.randn(200, len(SEEN), generator=torch.Generator().manual_seed(0))

@@ -113,7 +113,7 @@ class VideoSolver(VideoSolverParts):
         Frames before the first face have its state.
         """
         count = self._check(landmarks, rotation, translation, confidence)
-        enough = torch.isfinite(landmarks).all(-1).sum(1) >= _MIN_LANDMARKS
+        enough = (self.landmark_trust(landmarks, confidence) > 0).sum(1) >= _MIN_LANDMARKS
         if not bool(enough.any()):
             raise ValueRangeError(
                 f"landmarks: found fewer than {_MIN_LANDMARKS} in each of {count} frames, expected a face in some"
@@ -163,10 +163,12 @@ class VideoSolver(VideoSolverParts):
         found = landmarks[None].double()
         rotation, translation, confidence = (None if x is None else x.double() for x in given)
         seen = torch.isfinite(found).all(-1)
-        enough = int(seen.sum()) >= _MIN_LANDMARKS
+        # Filtered landmarks go on for some frames after a face was lost, with a confidence of 0.
+        trusted = int((self.landmark_trust(found, confidence) > 0).sum())
+        enough = trusted >= _MIN_LANDMARKS
         if state.head is None and not enough:
             raise ValueRangeError(
-                f"landmarks: found {int(seen.sum())} in the first frame, expected at least {_MIN_LANDMARKS} to start"
+                f"landmarks: found {trusted} in the first frame, expected at least {_MIN_LANDMARKS} to start"
             )
         if rotation is None or translation is None or not _finite(rotation, translation):
             rotation, translation = self._pose_of(state, found, confidence, enough)

@@ -57,7 +57,7 @@ class ActorSolver:
         # What is hidden is a guess, that a filter would carry on into the frames after.
         shown = torch.where(trust[:, None] > 0, seen.landmarks, torch.nan)
         landmarks = self._filter.step(undistort(shown, self._calibration))
-        enough = int(torch.isfinite(landmarks).all(1).sum()) >= _MIN_LANDMARKS
+        enough = int((torch.isfinite(landmarks).all(1) & (trust > 0)).sum()) >= _MIN_LANDMARKS
         if self._state is None and not enough:
             return LiveFrame(torch.zeros(len(self.names)), torch.full((3, 3), torch.nan), seen.landmarks)
         before = self._state or self._solver.start()
