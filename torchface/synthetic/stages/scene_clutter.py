@@ -49,10 +49,20 @@ def clutter(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     return image
 
 
-def draw_hand(image: np.ndarray, middle: np.ndarray, size: float, rng: np.random.Generator) -> None:
-    """A hand with its arm, as long as ``size`` pixels without it, somewhere on ``middle``; painted into the image."""
+def draw_hand(
+    image: np.ndarray, middle: np.ndarray, size: float, rng: np.random.Generator, turn: float | None = None
+) -> None:
+    """A hand with its arm, as long as ``size`` pixels without it, somewhere on ``middle``; painted into the image.
+
+    Args:
+        image: uint8 (H,W,3).
+        middle: where, (2,) pixels.
+        size: pixels.
+        rng: of its colour and form.
+        turn: radians by which the fingers' direction is turned clockwise from pointing right; any if absent.
+    """
     skin = np.array(random_color(rng, 1.0))
-    turn = rng.uniform(0, 2 * np.pi)
+    turn = rng.uniform(0, 2 * np.pi) if turn is None else turn
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     palm = middle + rng.normal(0, 0.1, 2) * size
     _capsule(image, palm, palm - along * size * rng.uniform(0.8, 3), 0.34 * size, skin * rng.uniform(0.6, 1.0))

@@ -54,7 +54,7 @@ def perform(frames: int, generator: torch.Generator, fps: float = 60.0) -> Take:
     count = 0
     while start < duration:  # an event at a time: each draws its own timing
         rise, hold, fall, strength = uniform(0.15, 0.5), uniform(0.1, 0.9), uniform(0.25, 0.7), uniform(0.5, 1.0)
-        envelope = strength * _ramp(seconds, start, rise, hold, fall)
+        envelope = strength * raised_cosine(seconds, start, rise, hold, fall)
         for name, weight in kinds[order[count % len(order)]].items():
             weights[:, row[name]] = torch.maximum(weights[:, row[name]], weight * uniform(0.8, 1.0) * envelope)
         start += rise + hold + uniform(0.0, 0.6)
@@ -64,7 +64,7 @@ def perform(frames: int, generator: torch.Generator, fps: float = 60.0) -> Take:
         weights[:, row[name]] = torch.maximum(weights[:, row[name]], curve)
     start = uniform(0.2, 1.5)
     while start < duration:
-        blink = _ramp(seconds, start, 0.08, 0.02, 0.16)
+        blink = raised_cosine(seconds, start, 0.08, 0.02, 0.16)
         for side in ("Left", "Right"):
             weights[:, row[f"eyeBlink{side}"]] = torch.maximum(weights[:, row[f"eyeBlink{side}"]], blink)
         start += uniform(1.5, 4.5)
@@ -72,7 +72,8 @@ def perform(frames: int, generator: torch.Generator, fps: float = 60.0) -> Take:
     return Take(fps, weights=Track(ARKIT, weights.clamp(0, 1)[..., None]))
 
 
-def _ramp(seconds: Tensor, start: float, rise: float, hold: float, fall: float) -> Tensor:
+def raised_cosine(seconds: Tensor, start: float, rise: float, hold: float, fall: float) -> Tensor:
+    """A curve (T,) that rises from 0 to 1 from ``start`` on, stays there, and falls again, smoothly."""
     up = ((seconds - start) / rise).clamp(0, 1)
     down = ((seconds - start - rise - hold) / fall).clamp(0, 1)
     return 0.5 * (1 - torch.cos(math.pi * up)) * 0.5 * (1 + torch.cos(math.pi * down))

@@ -30,14 +30,23 @@ class RenderedPerson:
         image: colours with a fourth channel that is 1 on the person, 0 on what is behind, (H,W,4) sRGB.
         distance: (H,W) millimetres, infinite where there is nothing.
         material: (H,W), -1 where there is nothing.
+        exposure: what the light was multiplied by.
     """
 
     image: Tensor
     distance: Tensor
     material: Tensor
+    exposure: float
 
 
-def render_person(person: Person, scene: Surface, camera: Camera, generator: torch.Generator) -> RenderedPerson:
+def render_person(
+    person: Person,
+    scene: Surface,
+    camera: Camera,
+    generator: torch.Generator,
+    rays: torch.Generator | None = None,
+    exposure: float | None = None,
+) -> RenderedPerson:
     """Shows someone to a camera.
 
     Args:
@@ -45,6 +54,9 @@ def render_person(person: Person, scene: Surface, camera: Camera, generator: tor
         scene: all that can be seen.
         camera: from where.
         generator: of the lamps and the exposure.
+        rays: of the few rays a point that tell open places from hollow ones; ``generator`` if absent. With one of their
+            own the lamps are the same however much of the picture someone fills.
+        exposure: another picture's; if absent it is drawn, for how light the skin and the eyes' whites are.
     """
     height, width = camera.height, camera.width
     origins, ways = camera.rays()
@@ -57,22 +69,26 @@ def render_person(person: Person, scene: Surface, camera: Camera, generator: tor
     color, gloss = _surface_color(person, scene, triangle, barycentric, points)
     normals = _normals(scene, triangle, barycentric, ways)
     material = scene.material[triangle]
-    free = openness(caster, points + 0.3 * normals, normals, generator, 2, 45.0)
+    free = openness(caster, points + 0.3 * normals, normals, rays or generator, 2, 45.0)
     free = _smooth(free, seen.view(height, width))
     light = _lit(caster, camera, points, normals, ways, material, to_linear(color), gloss, free, generator)
-    face = (material == SKIN).float()
-    exposure = uniform(0.07, 0.42, generator) / float((light.mean(1) * face).sum() / face.sum().clamp(min=1))
-    whites = light[material == EYEBALL].mean(1)
-    if len(whites) > _FEW:  # dark skin is not shown so light that the eyes are white patches
-        exposure = min(exposure, _WHITE / float(whites.quantile(0.8)))
+    if exposure is None:
+        exposure = _exposure(light.mean(1), material, uniform(0.07, 0.42, generator))
     shown = to_srgb((light * exposure).clamp(0, 1))
     image = torch.zeros(height * width, 4)
     image[seen] = torch.cat([shown.float(), torch.ones(len(shown), 1)], dim=1)
     materials = torch.full((height * width,), -1)
     materials[seen] = material
-    return RenderedPerson(
-        image.view(height, width, 4), hits.distance.view(height, width), materials.view(height, width)
-    )
+    distance = hits.distance.view(height, width)
+    return RenderedPerson(image.view(height, width, 4), distance, materials.view(height, width), exposure)
+
+
+def _exposure(light: Tensor, material: Tensor, skin: float) -> float:
+    """What light (R,) is multiplied by to show skin as light as this in the mean, and no eyes as white patches."""
+    face = (material == SKIN).float()
+    exposure = skin / float((light * face).sum() / face.sum().clamp(min=1))
+    whites = light[material == EYEBALL]
+    return min(exposure, _WHITE / float(whites.quantile(0.8))) if len(whites) > _FEW else exposure
 
 
 def _surface_color(

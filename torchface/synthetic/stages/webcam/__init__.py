@@ -1,0 +1,1 @@
+"""Videos of synthetic people who sit before a webcam, with the truth about every frame."""

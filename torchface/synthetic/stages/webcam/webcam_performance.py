@@ -1,0 +1,161 @@
+"""What someone before a webcam does: faces from a take, a head that never rests, turning away, a hand at the mouth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.shape_names import ARKIT
+from torchface.synthetic.stages.face_pictures.turned_eyes import FULL_GAZE
+from torchface.synthetic.stages.weight_curves import perform, raised_cosine
+
+_MOUTH = ("jaw", "mouth")
+_AWAY = 105.0  # degrees that a head turns away: no face is left to be seen
+_TURNING, _TURNED = 0.5, 0.7  # seconds on the way there or back, and away
+_RAISING, _RAISED = 0.25, 0.9  # seconds that a hand takes to the mouth, and stays there
+_BLINK = (0.08, 0.03, 0.16)  # seconds to close, closed, to open
+
+
+@dataclass(frozen=True)
+class SittingSettings:
+    """How someone sits before the camera.
+
+    Args:
+        distance: from the camera to the head, millimetres.
+        aside: of the head's middle from the optical axis, right and down, millimetres.
+        roll: of the camera, degrees.
+        yaw, pitch, tilt: standard deviations of the head's motion, degrees.
+        drift: of its place, millimetres.
+    """
+
+    distance: float = 560.0
+    aside: tuple[float, float] = (0.0, 0.0)
+    roll: float = 0.0
+    yaw: float = 9.0
+    pitch: float = 5.0
+    tilt: float = 4.0
+    drift: float = 14.0
+
+    def __post_init__(self) -> None:
+        if not (200 <= self.distance <= 5000):
+            raise ValueRangeError(f"distance: found {self.distance}, expected 200 to 5000 millimetres")
+
+
+@dataclass(frozen=True, eq=False)
+class WebcamPerformance:
+    """Frames of someone before a webcam.
+
+    Args:
+        fps: frames a second.
+        weights: of ARKit's shapes, (T,52) in [0,1].
+        rotation: from the head to the camera, (T,3,3).
+        translation: of the head's origin in the camera's coordinates, (T,3), millimetres.
+        hand: how far a hand has been raised to the mouth, (T,) in [0,1]; 0 where there is none.
+    """
+
+    fps: float
+    weights: Tensor
+    rotation: Tensor
+    translation: Tensor
+    hand: Tensor
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+
+def sitting(
+    weights: Tensor,
+    fps: float,
+    generator: torch.Generator,
+    settings: SittingSettings = SittingSettings(),
+    away: float | None = None,
+    hand: float | None = None,
+) -> WebcamPerformance:
+    """Someone whose head turns and sways slowly about the neck while the face goes through a take.
+
+    Args:
+        weights: of ARKit's shapes, (T,52).
+        fps: frames a second.
+        generator: of the head's motion.
+        settings: where and how they sit.
+        away: second at which they begin to turn away; they look back after that.
+        hand: second at which a hand begins to rise to the mouth.
+
+    Raises:
+        ShapeError: the weights are not (T,52).
+    """
+    if weights.ndim != 2 or weights.shape[1] != len(ARKIT):
+        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(ARKIT)})")
+    count = len(weights)
+    seconds = torch.arange(count, dtype=torch.float64) / fps
+    wander = _wander(seconds, 6, generator)
+    angles = wander[:, :3] * torch.tensor([settings.yaw, settings.pitch, settings.tilt])
+    angles[:, 2] += settings.roll
+    if away is not None:
+        side = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
+        angles[:, 0] += side * _AWAY * raised_cosine(seconds, away, _TURNING, _TURNED, _TURNING)
+    yaw, pitch, roll = torch.deg2rad(angles).unbind(1)
+    none = torch.zeros_like(yaw)
+    head = (
+        rotation_matrix(torch.stack([none, yaw, none], 1))
+        @ rotation_matrix(torch.stack([pitch, none, none], 1))
+        @ rotation_matrix(torch.stack([none, none, roll], 1))
+    )
+    rotation = head.new_tensor([1.0, -1.0, -1.0]).diag() @ head
+    place = settings.drift * wander[:, 3:] + wander.new_tensor([*settings.aside, settings.distance])
+    pivot = wander.new_tensor([0.0, -60.0, 0.0])  # a neck, below and behind the face
+    translation = place - (rotation @ pivot) + pivot * wander.new_tensor([1.0, -1.0, -1.0])
+    raised = none if hand is None else raised_cosine(seconds, hand, _RAISING, _RAISED, _RAISING)
+    return WebcamPerformance(fps, weights.clamp(0, 1), rotation, translation, raised)
+
+
+def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: float, end: float) -> Tensor:
+    """Weights (T,52) with a mouth that talks, smiles and opens between two seconds.
+
+    Args:
+        weights: of a take whose mouth rests.
+        fps: frames a second.
+        generator: of what the mouth does.
+        start, end: seconds.
+    """
+    mouth = torch.tensor([name.startswith(_MOUTH) for name in ARKIT])
+    made = perform(len(weights), generator, fps).weights
+    assert made is not None
+    seconds = torch.arange(len(weights), dtype=torch.float64) / fps
+    share = raised_cosine(seconds, start, 0.4, max(end - start - 0.8, 0.0), 0.4).float()[:, None]
+    return torch.where(mouth, torch.maximum(weights, share * made.values[..., 0]), weights)
+
+
+def with_blinks(weights: Tensor, fps: float, seconds: tuple[float, ...]) -> Tensor:
+    """Weights (T,52) with full blinks that begin at some seconds."""
+    time = torch.arange(len(weights), dtype=torch.float64) / fps
+    lids = [ARKIT.index(f"eyeBlink{side}") for side in ("Left", "Right")]
+    blinking = weights.clone()
+    for start in seconds:
+        shut = raised_cosine(time, start, *_BLINK).to(weights)[:, None]
+        blinking[:, lids] = torch.maximum(blinking[:, lids], shut)
+    return blinking
+
+
+def gaze_of(weights: Tensor) -> Tensor:
+    """Where eyes look that have ARKit's weights (...,52), (...,2,2) radians; see ``turned_eyes.gaze_weights``."""
+    rows = []
+    for side, left, right in (("Right", "In", "Out"), ("Left", "Out", "In")):
+        way = {name: weights[..., ARKIT.index(f"eyeLook{name}{side}")] for name in ("In", "Out", "Up", "Down")}
+        across, up = way[left] - way[right], way["Up"] - way["Down"]
+        rows.append(torch.stack([across * math.radians(FULL_GAZE[0]), up * math.radians(FULL_GAZE[1])], -1))
+    return torch.stack(rows, -2)
+
+
+def _wander(seconds: Tensor, tracks: int, generator: torch.Generator, waves: int = 5) -> Tensor:
+    """Smooth random curves (T,K) of about unit size, between 0.08 and 0.6 Hz."""
+    draw = torch.rand(2, waves, tracks, generator=generator, dtype=torch.float64)
+    rate = 0.08 * (0.6 / 0.08) ** draw[0]
+    size = (0.08 / rate) ** 0.35
+    phase = 2 * math.pi * (rate * seconds[:, None, None] + draw[1])
+    return (size * phase.sin()).sum(1) * math.sqrt(2 / waves)
