@@ -1,0 +1,146 @@
+"""Somebody unknown before a webcam: weights against the truth, of every solver from the same readings of the face.
+
+Heads of ICT-FaceKit and embedded performers that nothing learned from, rendered as a webcam shows them and driven by
+the two test takes; see ``webcam_clips``. Two clips of four seconds by default; with ``TORCHFACE_WEBCAM_CLIPS=all`` the
+four of nine seconds, which take ten minutes to render and are kept in ``out/webcam_clips``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from webcam_clips import FPS, KEPT, SCENES, SHORT, Clip, webcam_clip
+from webcam_measures import (
+    LIDS,
+    REGIONS,
+    SIGNALS,
+    BlinkCount,
+    blinks,
+    follows,
+    gaze_error,
+    lag,
+    recovery,
+    tremor,
+    vertex_error,
+    weight_error,
+)
+from webcam_solvers import SOLVERS, Solved, read_faces
+
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
+
+pytestmark = pytest.mark.real
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """A clip and what the networks read of it."""
+
+    name: str
+    clip: Clip
+    readings: list[FaceReading]
+    trust: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A solver's figures over all clips; see ``webcam_measures``."""
+
+    weights: dict[str, float]
+    vertices: float
+    follows: dict[str, tuple[float, float]]
+    lag: float
+    tremor: float
+    blinks: BlinkCount
+    gaze: float
+    recovery: list[float]
+    milliseconds: float
+
+
+@pytest.fixture(scope="module")
+def filmed(data: Path) -> list[Filmed]:
+    torch.set_num_threads(1)
+    scenes = SCENES if os.environ.get("TORCHFACE_WEBCAM_CLIPS") == "all" else SHORT
+    shots = []
+    for name, scene in scenes.items():
+        clip = webcam_clip(scene, data)
+        shots.append(Filmed(name, clip, *read_faces(clip.frames(), KEPT)))
+    return shots
+
+
+@pytest.fixture(scope="module")
+def rows(filmed: list[Filmed]) -> dict[str, Row]:
+    return {name: measured(filmed, [solve(shot.readings, shot.trust, FPS) for shot in filmed])
+            for name, solve in SOLVERS.items()}  # fmt: skip
+
+
+def measured(filmed: list[Filmed], solved: list[Solved]) -> Row:
+    """Means over clips of everything; blinks and recoveries are counted over all."""
+    weights: dict[str, list[float]] = {name: [] for name in REGIONS}
+    signals: dict[str, list[tuple[float, float]]] = {name: [] for name in SIGNALS}
+    vertices, lags, tremors, gazes, times = [], [], [], [], []
+    count, again = BlinkCount(0, 0, 0, 0), list[float]()
+    for shot, found in zip(filmed, solved, strict=True):
+        true, seen = shot.clip.performance.weights, shot.clip.truth.present
+        for name, shapes in REGIONS.items():
+            weights[name].append(weight_error(found.weights, true, shapes, seen))
+        for name in SIGNALS:
+            signals[name].append(follows(found.weights, true, name, seen))
+        vertices.append(vertex_error(shot.clip.person, found.weights, true, seen))
+        lags.append(lag(found.weights, true, seen))
+        tremors.append(tremor(found.weights, true, seen))
+        opened = seen[:, None] & (true[:, LIDS] < 0.5)
+        gazes.append(gaze_error(found.gaze, gaze_of(true), opened))
+        count = count + blinks(found.weights, true, seen)
+        again += recovery(found.weights, true, seen)
+        times.append(found.milliseconds)
+    return Row(
+        {name: _mean(values) for name, values in weights.items()},
+        _mean(vertices),
+        {name: (_mean([v[0] for v in values]), _mean([v[1] for v in values])) for name, values in signals.items()},
+        _mean(lags), _mean(tremors), count, _mean(gazes), again, _mean(times),
+    )  # fmt: skip
+
+
+def _mean(values: list[float]) -> float:
+    kept = [value for value in values if math.isfinite(value)]
+    return sum(kept) / len(kept) if kept else math.nan
+
+
+def test_readings(filmed: list[Filmed]) -> None:
+    """What the solvers are given: how far off the found landmarks are, and whether faces are lost and found again."""
+    print(f"\n{'clip':16s}{'frames':>7s}{'faces':>7s}{'found':>7s}{'where none':>11s}{'off, of the eyes':>18s}")
+    for shot in filmed:
+        truth = shot.clip.truth
+        marks = torch.stack([reading.landmarks for reading in shot.readings])
+        found = torch.isfinite(marks).flatten(1).all(1)
+        eyes = (truth.landmarks[:, 36] - truth.landmarks[:, 45]).norm(dim=1)
+        off = (marks - truth.landmarks).norm(dim=2) / eyes[:, None]
+        share = float(off[(found & truth.present)[:, None] & truth.visible].mean())
+        wrong = int((found & ~truth.present).sum())
+        print(f"{shot.name:16s}{len(found):7d}{int(truth.present.sum()):7d}{int((found & truth.present).sum()):7d}"
+              f"{wrong:11d}{share:18.1%}")  # fmt: skip
+        assert share < 0.05
+        assert int((found & truth.present).sum()) > 0.9 * int(truth.present.sum())
+
+
+def test_weights(rows: dict[str, Row]) -> None:
+    """The table."""
+    print(f"\n{'':26s}{'weights':>8s}{'eyes':>7s}{'brows':>7s}{'mouth':>7s}{'vert mm':>9s}{'lag':>6s}{'tremor':>8s}"
+          f"{'blinks':>8s}{'false':>7s}{'gaze':>7s}{'back':>6s}{'ms':>7s}")  # fmt: skip
+    for name, row in rows.items():
+        error, count = row.weights, row.blinks
+        back = f"{_mean(row.recovery):.0f}" if row.recovery else "-"
+        print(f"{name:26s}{error['all']:8.3f}{error['eyes']:7.3f}{error['brows']:7.3f}{error['mouth']:7.3f}"
+              f"{row.vertices:9.2f}{row.lag:6.1f}{row.tremor:8.4f}{count.found:5d}/{count.true:<2d}{count.false:7d}"
+              f"{row.gaze:6.1f}°{back:>6s}{row.milliseconds:7.2f}")  # fmt: skip
+    print("weights: root mean square over shapes that move; lag and back (after a face was lost) in frames of 1/30 s")
+    print(f"\n{'correlation, slope':26s}" + "".join(f"{name:>16s}" for name in SIGNALS))
+    for name, row in rows.items():
+        print(f"{name:26s}" + "".join(f"{c:8.2f}, {s:5.2f} " for c, s in row.follows.values()))
