@@ -5,7 +5,7 @@ RUN := $(VENV)/bin/python
 export OMP_WAIT_POLICY ?= PASSIVE
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test bench fuzz lint clean
+.PHONY: demo test bench fuzz lint app clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes"
@@ -40,5 +40,9 @@ lint: $(VENV)/.installed-lint
 demo: $(STAMP)
 	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")
 
+# The browser app's page, for a wheel whose users need no Node; `torchface export app` builds it by itself elsewhere.
+app:
+	cd export/web && npm ci --ignore-scripts --no-audit --no-fund && npx vite build --emptyOutDir --outDir ../../torchface/_app/dist
+
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out torchface/_app

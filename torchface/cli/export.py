@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from torchface.cli.export_app import export_app
 from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 if TYPE_CHECKING:
@@ -166,4 +167,5 @@ EXPORTS: dict[str, Callable[..., None]] = {
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
     "video-solver": video_solver,
+    "app": export_app,
 }

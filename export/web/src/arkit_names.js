@@ -1,0 +1,39 @@
+// ARKit's 52 blendshapes in Live Link Face's order, which is the graph's, and what other rigs call the same shapes.
+
+const both = (...names) => names.flatMap((name) => [`${name}Left`, `${name}Right`]);
+const eye = (side) =>
+  ["Blink", "LookDown", "LookIn", "LookOut", "LookUp", "Squint", "Wide"].map((name) => `eye${name}${side}`);
+
+export const ARKIT = Object.freeze([
+  ...eye("Left"), ...eye("Right"),
+  "jawForward", "jawRight", "jawLeft", "jawOpen",
+  "mouthClose", "mouthFunnel", "mouthPucker", "mouthRight", "mouthLeft",
+  ...both("mouthSmile", "mouthFrown", "mouthDimple", "mouthStretch"),
+  "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper",
+  ...both("mouthPress", "mouthLowerDown", "mouthUpperUp", "browDown"),
+  "browInnerUp", ...both("browOuterUp"), "cheekPuff", ...both("cheekSquint", "noseSneer"), "tongueOut",
+]);
+
+/** One spelling for a shape: `EyeBlinkLeft`, `eyeBlink_L` and `eyeblinkleft` are the same. */
+const canonical = (name) =>
+  name.replace(/_(L|R)$/, (_, side) => (side === "L" ? "Left" : "Right")).toLowerCase();
+
+const ROW = new Map(ARKIT.map((name, row) => [canonical(name), row]));
+
+/**
+ * What a shape takes of ARKit's weights, as torchface's `shape_names.mapping`: a whole shape drives both halves of a
+ * split one, two halves give the whole their mean.
+ *
+ * @returns {[number, number][]} rows of ARKIT and their factors; none for a shape that ARKit does not know.
+ */
+export function sourcesOf(name) {
+  const wanted = canonical(name);
+  if (ROW.has(wanted)) return [[ROW.get(wanted), 1]];
+  const halves = [`${wanted}left`, `${wanted}right`];
+  if (halves.every((half) => ROW.has(half))) return halves.map((half) => [ROW.get(half), 0.5]);
+  const whole = wanted.replace(/(left|right)$/, "");
+  return whole !== wanted && ROW.has(whole) ? [[ROW.get(whole), 1]] : [];
+}
+
+/** The weight of a shape with these sources, of ARKit's weights. */
+export const weightOf = (sources, weights) => sources.reduce((sum, [row, factor]) => sum + factor * weights[row], 0);

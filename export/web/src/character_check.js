@@ -1,0 +1,74 @@
+// Whether a .glb can be moved by a face: looked at before three.js takes memory for it, and said in plain words.
+
+import { sourcesOf } from "./arkit_names.js";
+import { CharacterError, readGlb } from "./glb_container.js";
+
+export const LARGEST_FILE = 100 * 2 ** 20; // bytes
+const MOST_NUMBERS = 2 ** 27; // of all morph targets together, half a gigabyte once they are unpacked
+const UNREADABLE = {
+  KHR_draco_mesh_compression: "Draco",
+  EXT_meshopt_compression: "meshopt",
+  KHR_texture_basisu: "Basis Universal",
+};
+const SHOWN = 8;
+
+/** Refuses what is too large to be read, by its size alone. */
+export function checkSize(size) {
+  if (size > LARGEST_FILE)
+    throw new CharacterError(
+      `The file has ${Math.round(size / 2 ** 20)} MB; the page takes up to ${LARGEST_FILE / 2 ** 20} MB. ` +
+        "Export it with fewer vertices or smaller textures.",
+    );
+}
+
+/**
+ * The meshes of a .glb that have shapes, and which of these the face drives.
+ *
+ * @param {ArrayBuffer} bytes the whole file.
+ * @returns {{document: object, binary: Uint8Array, meshes: Map<number, Shape[]>, driven: string[], unknown: string[]}}
+ *   of each mesh its shapes in the file's order, each `{name, sources}`; names each once.
+ */
+export function checkCharacter(bytes) {
+  checkSize(bytes.byteLength);
+  const { document, binary } = readGlb(bytes);
+  const packed = (document.extensionsRequired ?? []).filter((name) => name in UNREADABLE);
+  if (packed.length > 0)
+    throw new CharacterError(`The file is compressed with ${UNREADABLE[packed[0]]}. Export it without compression.`);
+  const outside = (document.images ?? []).some(({ uri }) => uri !== undefined && !uri.startsWith("data:"));
+  if (outside || (document.buffers ?? []).some(({ uri }) => uri !== undefined))
+    throw new CharacterError("The character's data lie in other files. Export it as one .glb with everything inside.");
+  const meshes = new Map();
+  let numbers = 0;
+  for (const [index, mesh] of (document.meshes ?? []).entries()) {
+    const counts = (mesh.primitives ?? []).map((one) => one.targets?.length ?? 0);
+    if (!counts[0]) continue;
+    const names = mesh.extras?.targetNames ?? [];
+    meshes.set(index, Array.from({ length: counts[0] }, (_, i) => shape(String(names[i] ?? `shape ${i}`))));
+    for (const primitive of mesh.primitives)
+      for (const target of primitive.targets ?? [])
+        for (const accessor of Object.values(target)) numbers += 3 * (document.accessors?.[accessor]?.count ?? 0);
+  }
+  if (meshes.size === 0)
+    throw new CharacterError(
+      "The character has no morph targets (blendshapes), so a face cannot move it. Export it with its shape keys.",
+    );
+  if (!(numbers <= MOST_NUMBERS))
+    throw new CharacterError("The character's shapes are too large for this page. Export it with fewer vertices.");
+  const all = [...new Map([...meshes.values()].flat().map((one) => [one.name, one])).values()];
+  const driven = all.filter((one) => one.sources.length > 0).map((one) => one.name);
+  const unknown = all.filter((one) => one.sources.length === 0).map((one) => one.name);
+  if (driven.length === 0)
+    throw new CharacterError(
+      `None of the character's ${unknown.length} shapes has a name that ARKit knows, such as jawOpen. ` +
+        `Found: ${listed(unknown)}. Rename them, or bring them over with torchface transfer --names arkit.`,
+    );
+  return { document, binary, meshes, driven, unknown };
+}
+
+const shape = (name) => ({ name, sources: sourcesOf(name) });
+
+/** The first few names, and how many more there are. */
+export function listed(names) {
+  const rest = names.length - SHOWN;
+  return names.slice(0, SHOWN).join(", ") + (rest > 0 ? ` and ${rest} more` : "");
+}

@@ -1,0 +1,82 @@
+// What the worker does: pictures in, weights out, through one graph whose state goes from frame to frame.
+
+const FIRST_INTERVAL = 1 / 30; // seconds, of a frame that none came before
+const LONGEST_INTERVAL = 10; // seconds: after a longer pause all that time smooths is forgotten anyway
+const POSE = 0, GAIN = 1, SMOOTHING = 2, RESET = 3;
+
+/**
+ * Answers the page's messages.
+ *
+ * - `{load: {graph, mjs, wasm, threads}}` with addresses, is answered by `{ready: {engine, threads}}`;
+ * - `{frame: {number, time, picture, pose, gain, smoothing, reset}}`, a picture of any size that is given away, its time
+ *   in milliseconds, by `{solved: {number, time, interval, ..., milliseconds, width, height}}`;
+ * - whatever fails by `{failed: words}`.
+ *
+ * @param {object} ort of onnxruntime-web.
+ * @param {string} engine its execution provider.
+ */
+export function answerFrames(ort, engine) {
+  const canvas = new OffscreenCanvas(1, 1);
+  const context = canvas.getContext("2d", { willReadFrequently: true, alpha: false });
+  let session = null, state = null, before = null;
+
+  async function load({ graph, mjs, wasm, threads }) {
+    ort.env.wasm.wasmPaths = { mjs, wasm };
+    ort.env.wasm.numThreads = threads;
+    ort.env.logLevel = "error";
+    const answer = await fetch(graph);
+    if (!answer.ok) throw new Error(`${new URL(graph).pathname} was not found (status ${answer.status})`);
+    session = await ort.InferenceSession.create(new Uint8Array(await answer.arrayBuffer()), {
+      executionProviders: [engine],
+      graphOptimizationLevel: "all",
+    });
+    const size = session.inputMetadata.find((input) => input.name === "state").shape[0];
+    state = new ort.Tensor("float32", new Float32Array(size), [size]);
+    return { ready: { engine, threads: ort.env.wasm.numThreads } };
+  }
+
+  async function solve({ number, time, picture, pose, gain, smoothing, reset }) {
+    const started = performance.now();
+    const { width, height, pixels } = read(picture);
+    const interval = before === null ? FIRST_INTERVAL : Math.min((time - before) / 1000, LONGEST_INTERVAL);
+    before = time;
+    const controls = new Float32Array(5);
+    controls[POSE] = pose;
+    controls[GAIN] = gain;
+    controls[SMOOTHING] = smoothing;
+    controls[RESET] = reset ? 1 : 0;
+    const found = await session.run({
+      image: new ort.Tensor("uint8", pixels, [height, width, 4]),
+      interval: new ort.Tensor("float32", new Float32Array([interval]), []),
+      controls: new ort.Tensor("float32", controls, [5]),
+      state,
+    });
+    state = found.next_state;
+    const numbers = (name) => Float32Array.from(found[name].data);
+    return {
+      solved: {
+        number, time, interval, width, height,
+        weights: numbers("weights"), rotation: numbers("rotation"), translation: numbers("translation"),
+        gaze: numbers("gaze"), landmarks: numbers("landmarks"), iris: numbers("iris"),
+        presence: found.presence.data[0], calibrated: found.calibrated.data[0],
+        milliseconds: performance.now() - started,
+      },
+    };
+  }
+
+  function read(picture) {
+    const width = picture.displayWidth ?? picture.width, height = picture.displayHeight ?? picture.height;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    context.drawImage(picture, 0, 0);
+    picture.close();
+    return { width, height, pixels: new Uint8Array(context.getImageData(0, 0, width, height).data.buffer) };
+  }
+
+  self.onmessage = async ({ data }) => {
+    try {
+      self.postMessage(data.load ? await load(data.load) : await solve(data.frame));
+    } catch (error) {
+      self.postMessage({ failed: String(error?.message ?? error) });
+    }
+  };
+}

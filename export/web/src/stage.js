@@ -1,0 +1,67 @@
+// Where the character stands: camera and lights that suit any .glb, drawn when something has changed.
+
+import * as THREE from "three";
+
+const FIELD = 24; // degrees; a portrait lens
+const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
+
+export class Stage {
+  #renderer;
+  #scene = new THREE.Scene();
+  #camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
+  #character = null;
+  #asked = false;
+
+  /** @param {HTMLCanvasElement} canvas whose size the page's layout says; throws where there is no WebGL. */
+  constructor(canvas) {
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.#renderer.toneMapping = THREE.NeutralToneMapping;
+    const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);
+    key.position.set(-0.6, 0.8, 1);
+    rim.position.set(0.9, 0.5, -0.6);
+    this.#scene.add(key, rim, new THREE.HemisphereLight(0xffffff, 0x9a8476, 1.5));
+    new ResizeObserver(() => this.#fit()).observe(canvas);
+  }
+
+  /** Puts a character in the place of the one before, which is let go. */
+  show(character) {
+    this.#character?.dispose();
+    this.#character = character;
+    this.#scene.add(character.root);
+    this.#fit();
+  }
+
+  pose(solved) {
+    this.#character?.pose(solved);
+    this.draw();
+  }
+
+  /** Draws with the screen's next picture. */
+  draw() {
+    if (this.#asked) return;
+    this.#asked = true;
+    requestAnimationFrame(() => {
+      this.#asked = false;
+      this.#renderer.render(this.#scene, this.#camera);
+    });
+  }
+
+  #fit() {
+    const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
+    if (width === 0 || height === 0) return;
+    this.#renderer.setPixelRatio(Math.min(MOST_PIXELS, window.devicePixelRatio));
+    this.#renderer.setSize(width, height, false);
+    this.#camera.aspect = width / height;
+    if (this.#character !== null) {
+      const size = this.#character.box.getSize(new THREE.Vector3());
+      const middle = this.#character.box.getCenter(new THREE.Vector3());
+      const half = Math.tan((FIELD * Math.PI) / 360);
+      const distance = (1.15 * Math.max(size.y, size.x / this.#camera.aspect)) / (2 * half) + size.z / 2;
+      this.#camera.position.copy(middle).add(new THREE.Vector3(0, 0, distance));
+      this.#camera.lookAt(middle);
+      [this.#camera.near, this.#camera.far] = [distance / 50, distance * 20];
+    }
+    this.#camera.updateProjectionMatrix();
+    this.draw();
+  }
+}

@@ -1,0 +1,41 @@
+// A recording: weights and rotations of each frame, at the camera's own times.
+
+export const LONGEST = 3600; // seconds; about 40 MB
+
+export class Take {
+  frames = [];
+  #start = null;
+
+  /**
+   * Adds a frame.
+   *
+   * @param {number} time of the camera's picture, milliseconds of the page's clock; a time that does not rise is dropped.
+   * @param {{weights: Float32Array, rotation: Float32Array, gaze: Float32Array}} solved what the graph says.
+   */
+  add(time, { weights, rotation, gaze }) {
+    this.#start ??= time;
+    const seconds = Math.fround((time - this.#start) / 1000); // as it stands in a .glb, where times must rise
+    if (this.frames.length > 0 && seconds <= this.frames.at(-1).seconds) return;
+    this.frames.push({ seconds, weights: weights.slice(), rotation: rotation.slice(), gaze: gaze.slice() });
+  }
+
+  get seconds() {
+    return this.frames.map((frame) => frame.seconds);
+  }
+
+  get duration() {
+    return this.frames.at(-1)?.seconds ?? 0;
+  }
+
+  get full() {
+    return this.duration >= LONGEST;
+  }
+
+  /** Frames a second: the usual rate that the median interval is nearest to. */
+  get rate() {
+    const steps = this.seconds.slice(1).map((time, i) => time - this.frames[i].seconds);
+    if (steps.length === 0) return 30;
+    const median = steps.sort((a, b) => a - b)[steps.length >> 1];
+    return [15, 20, 24, 25, 30, 50, 60].reduce((a, b) => (Math.abs(b * median - 1) < Math.abs(a * median - 1) ? b : a));
+  }
+}

@@ -1,0 +1,28 @@
+// What the page says: problems, what it is doing, and what only a screen reader needs to hear.
+
+const element = (id) => document.getElementById(id);
+
+export function showProblem(error) {
+  element("problem").firstElementChild.textContent = error.message ?? String(error);
+  element("problem").hidden = false;
+}
+
+export function hideProblem() {
+  element("problem").hidden = true;
+}
+
+/** What the camera's side is doing; said again only when it changes. */
+export function showStatus(words) {
+  if (element("status").textContent !== words) element("status").textContent = words;
+}
+
+export function showCharacterLine(words) {
+  element("character-line").textContent = words;
+}
+
+/** For screen readers: what those who see have before their eyes. */
+export function speak(words) {
+  element("spoken").textContent = words;
+}
+
+element("problem").lastElementChild.addEventListener("click", hideProblem);

@@ -1,0 +1,378 @@
+"""The app in a real Chromium whose camera is a film: what it records, what it says, and that nothing leaves it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from app_browser import Page, Server, chromium, elsewhere, film_camera, static_host, until
+from film import planted_film, write_y4m
+from planted_graph import STATE, write_planted_graph
+from rig_samples import quad_sheet
+from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
+
+from torchface import BlendshapeRig
+from torchface.errors import MissingExtraError
+from torchface.io import load_rig, load_take, save_mesh, save_rig
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.weights.live_link_csv import load_live_link
+from torchface.shape_names import ARKIT
+from torchface.workflows.browser_app import export_app
+from torchface.workflows.track.head_rotations import head_angles
+
+pytestmark = pytest.mark.browser
+WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
+FRAMES = 90
+BROWSERS_OWN = ("google.com", "googleapis.com", "gstatic.com", "duckduckgo.com")
+"""Where Chromium calls by itself, whatever page is open."""
+
+
+def sheet(names: tuple[str, ...]) -> BlendshapeRig:
+    mesh = quad_sheet()
+    generator = torch.Generator().manual_seed(0)
+    return BlendshapeRig(mesh, torch.randn(len(names), len(mesh.vertices), 3, generator=generator), names)
+
+
+@pytest.fixture(scope="module")
+def character(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig of eight of ARKit's shapes, in another order and spelling, and one that ARKit does not know."""
+    path = tmp_path_factory.mktemp("character") / "sheet.glb"
+    names = ("jawOpen", "mouthSmile_L", "mouthSmile_R", "browInnerUp_L", "browInnerUp_R", "EyeBlinkLeft", "antenna")
+    save_rig(sheet(names), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def app(character: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The app's folder, with a graph that reads planted weights off the picture."""
+    folder = tmp_path_factory.mktemp("app")
+    write_planted_graph(folder / "planted.onnx")
+    try:
+        export_app(folder / "app", folder / "planted.onnx", character)
+    except MissingExtraError as error:
+        pytest.skip(f"the page cannot be built here: {error}")
+    return folder / "app"
+
+
+@dataclass
+class Open:
+    page: Page
+    host: Server
+    outside: Server
+
+
+@pytest.fixture(scope="module")
+def opened(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
+    """The app in Chromium; the film has no face in its second half."""
+    folder = tmp_path_factory.mktemp("camera")
+    write_y4m(folder / "film.y4m", planted_film(FRAMES, range(FRAMES // 2, FRAMES)))
+    switches = film_camera(folder / "film.y4m")
+    with (
+        static_host(app) as host,
+        elsewhere() as outside,
+        chromium(folder / "profile", *switches, f"--proxy-server={outside.url}") as driver,
+    ):
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
+        allow_camera(driver, "granted")
+        driver.get(f"{host.url}/index.html")
+        page = Page(driver)
+        until(lambda: page.text("character-line"))
+        yield Open(page, host, outside)
+
+
+def allow_camera(driver: Any, setting: str) -> None:
+    driver.execute_cdp_cmd("Browser.setPermission", {"permission": {"name": "camera"}, "setting": setting})
+
+
+def watched(page: Page, what: str) -> Any:
+    return page.driver.execute_script(f"return JSON.parse(JSON.stringify({what}))")
+
+
+def blob(page: Page, button: str) -> bytes:
+    """What a button downloads."""
+    page.click(button)
+    script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
+    return base64.b64decode(page.driver.execute_async_script(script))
+
+
+@dataclass
+class Recorded:
+    """What the page was shown and answered, and what it recorded of that."""
+
+    sent: list[dict]
+    solved: list[dict]
+    csv: Path
+    glb: Path
+
+    @property
+    def recorded(self) -> list[dict]:
+        """The answers that the recording holds, found by their weights."""
+        take = load_live_link(self.csv)
+        assert take.weights is not None
+        first_row = take.weights.values[0, :, 0].numpy()
+        first = next(i for i, one in enumerate(self.solved) if np.abs(one["weights"] - first_row).max() < 1e-6)
+        return self.solved[first : first + len(take)]
+
+
+@pytest.fixture(scope="module")
+def recorded(opened: Open, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    page, folder = opened.page, tmp_path_factory.mktemp("recorded")
+    page.driver.execute_script("watched.keep = true")
+    page.start()
+    page.click("record")
+    until(lambda: page.driver.execute_script("return watched.solved.length") >= 10)
+    page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
+    page.driver.execute_script("watched.keep = false")
+    script = """
+    const done = arguments[0];
+    const withText = async (one) => ({...one, pixels: one.pixels && await watched.text(one.pixels)});
+    Promise.all(watched.sent.map(withText)).then(done);
+    """
+    sent = [one for one in page.driver.execute_async_script(script) if one["pixels"]]
+    solved = page.driver.execute_script(
+        "return watched.solved.map(s => ({...s, weights: [...s.weights], rotation: [...s.rotation]}))"
+    )
+    (folder / "take.csv").write_bytes(blob(page, "csv"))
+    (folder / "take.glb").write_bytes(blob(page, "glb"))
+    return Recorded(sent, solved, folder / "take.csv", folder / "take.glb")
+
+
+def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorded: Recorded) -> None:
+    """On the very pixels and intervals that the page gave its worker."""
+    session = onnxruntime.InferenceSession(app / "webcam.onnx")
+    state = np.zeros(STATE, np.float32)
+    for sent, solved in zip(recorded.sent, recorded.solved, strict=False):
+        pixels = np.frombuffer(base64.b64decode(sent["pixels"]), np.uint8)
+        inputs = {
+            "image": pixels.reshape(sent["height"], sent["width"], 4),
+            "interval": np.array(solved["interval"], np.float32),
+            "controls": np.array([sent["pose"], sent["gain"], sent["smoothing"], sent["reset"], 0], np.float32),
+            "state": state,
+        }
+        weights, state = session.run(["weights", "next_state"], inputs)
+        np.testing.assert_allclose(solved["weights"], weights, rtol=0, atol=1e-5)
+    rows = load_take(recorded.csv).weights
+    assert rows is not None
+    answers = np.array([one["weights"] for one in recorded.recorded])
+    np.testing.assert_allclose(rows.values[..., 0], answers, rtol=0, atol=1e-7)
+    assert len(answers) > 5
+    assert answers.std(0).min() > 0.01  # the film moves every shape
+
+
+def test_the_csv_has_the_cameras_times_and_the_heads_rotation(recorded: Recorded) -> None:
+    take = load_live_link(recorded.csv)
+    assert take.timecode is not None
+    steps = np.array([one["interval"] for one in recorded.recorded[1:]])
+    base = min((15, 20, 24, 25, 30, 50, 60), key=lambda rate: abs(rate * np.median(steps) - 1))
+    clocks = [[float(part) for part in text.split(":")] for text in take.timecode]
+    seconds = np.array([3600 * h + 60 * m + s + frame / base for h, m, s, frame in clocks])
+    np.testing.assert_allclose(np.diff(seconds), steps, rtol=0, atol=1e-3)
+    rotations = torch.tensor([one["rotation"] for one in recorded.recorded], dtype=torch.float64).reshape(-1, 3, 3)
+    columns = take.extras["columns"]
+    found = torch.stack([columns[f"Head{axis}"] for axis in ("Yaw", "Pitch", "Roll")], dim=1)
+    torch.testing.assert_close(found, head_angles(rotations), rtol=0, atol=1e-6)
+    assert found[:, 0].std() > 0.05
+    # Planted: both eyes 0.1 to the person's left and 0.05 up, which the app's recordings have as negative.
+    assert (columns["LeftEyeYaw"] + 0.1).abs().max() < 1e-6
+    assert (columns["RightEyePitch"] + 0.05).abs().max() < 1e-6
+
+
+def test_the_glb_has_the_recording_as_its_animation(character: Path, recorded: Recorded) -> None:
+    take, told = read_gltf_weights(recorded.glb), load_live_link(recorded.csv)
+    rig, before = load_rig(recorded.glb), load_rig(character)
+    torch.testing.assert_close(rig.deltas, before.deltas)
+    assert take is not None
+    assert take.weights is not None
+    assert told.weights is not None
+    assert take.weights.names == rig.names == before.names
+    column = {name: i for i, name in enumerate(ARKIT)}
+    source = {"mouthSmile_L": "mouthSmileLeft", "mouthSmile_R": "mouthSmileRight", "EyeBlinkLeft": "eyeBlinkLeft"}
+    for i, name in enumerate(rig.names):
+        values = take.weights.values[:, i, 0]
+        if name == "antenna":
+            assert not values.any()
+            continue
+        arkit = source.get(name, name.removesuffix("_L").removesuffix("_R"))
+        torch.testing.assert_close(values, told.weights.values[:, column[arkit], 0], rtol=0, atol=1e-6)
+
+
+def test_khronos_validator_finds_nothing_in_the_glb(recorded: Recorded, node: str) -> None:  # noqa: F811
+    assert_valid(node, recorded.glb)
+
+
+def test_only_files_of_the_page_were_asked_for(opened: Open, recorded: Recorded) -> None:
+    assert {method for method, _ in opened.host.requests} == {"GET"}
+    paths = {path for _, path in opened.host.requests}
+    assert {"/index.html", "/webcam.onnx", "/character.glb"} <= paths
+    assert all(path.startswith(("/index.html", "/assets/", "/webcam.onnx", "/character.glb")) for path in paths)
+    strangers = [path for _, path in opened.outside.requests if not any(own in path for own in BROWSERS_OWN)]
+    assert strangers == []
+
+
+FETCH = "fetch('http://elsewhere.test/{}', {{mode: 'no-cors'}}).then(() => 'answered', () => 'refused')"
+
+
+def test_the_policy_lets_nothing_out_neither_from_the_page_nor_from_its_worker(
+    opened: Open, recorded: Recorded
+) -> None:
+    driver = opened.page.driver
+
+    def asked(code: str) -> str:
+        return driver.execute_async_script(f"const done = arguments[0]; ({code}).then(done)")
+
+    in_worker = """new Promise(done => {
+        const code = `${FETCH}.then(answer => postMessage(answer))`;
+        const worker = new Worker(URL.createObjectURL(new Blob([code], {type: "text/javascript"})), {type: "module"});
+        worker.onmessage = ({data}) => done(data); worker.onerror = () => done("refused");
+    })"""
+    assert asked(FETCH.format("page")) == "refused"
+    assert asked(in_worker.replace("${FETCH}", FETCH.format("worker"))) == "refused"
+    posted = "fetch('http://elsewhere.test/post', {method: 'POST', mode: 'no-cors', body: 'x'})"
+    assert asked(posted + ".then(() => 'answered', () => 'refused')") == "refused"
+    driver.execute_script("navigator.sendBeacon('http://elsewhere.test/beacon', 'x')")
+    driver.execute_script("new Image().src = 'http://elsewhere.test/picture'")
+    driver.execute_async_script("setTimeout(arguments[0], 200)")
+    assert not [path for _, path in opened.outside.requests if "elsewhere.test" in path]
+    # The app's own worker is of that kind: one loaded from an address would not be under the page's policy.
+    assert all(address.startswith("blob:") for address in watched(opened.page, "watched.workers"))
+
+
+@pytest.fixture(scope="module")
+def bare(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
+    """A Chromium without a camera."""
+    folder = tmp_path_factory.mktemp("bare")
+    (app / "no_policy.html").write_text("<title>no policy</title>")
+    with (
+        static_host(app) as host,
+        elsewhere() as outside,
+        chromium(folder / "profile", f"--proxy-server={outside.url}") as driver,
+    ):
+        yield Open(Page(driver), host, outside)
+
+
+def test_without_the_policy_the_same_request_is_seen(bare: Open) -> None:
+    """So the proxy would have seen those that the policy refused."""
+    bare.page.driver.get(f"{bare.host.url}/no_policy.html")
+    code = f"const done = arguments[0]; {FETCH.format('control')}.then(done)"
+    assert bare.page.driver.execute_async_script(code) == "answered"
+    assert ("GET", "http://elsewhere.test/control") in bare.outside.requests
+
+
+def test_a_missing_camera_is_explained(bare: Open) -> None:
+    bare.page.driver.get(f"{bare.host.url}/index.html")
+    bare.page.click("start")
+    assert until(lambda: bare.page.problem).startswith("No camera was found")
+    assert bare.page.text("start") == "Start camera"
+
+
+def test_a_refused_camera_is_explained_and_may_be_allowed_then(opened: Open, recorded: Recorded) -> None:
+    page = opened.page
+    allow_camera(page.driver, "denied")
+    page.click("start")
+    assert "may not use the camera" in until(lambda: page.problem)
+    allow_camera(page.driver, "granted")
+    page.start()
+    assert page.problem == ""
+
+
+def test_a_face_is_lost_and_found(opened: Open, recorded: Recorded) -> None:
+    page = opened.page
+    page.start()
+    until(lambda: page.text("status").startswith("No face is seen"))
+    until(lambda: page.text("status") == "Your face is followed.")
+
+
+def test_a_hidden_tab_pauses_and_goes_on_when_it_is_shown(opened: Open, recorded: Recorded) -> None:
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    count = "return watched.solved.length"
+    driver.minimize_window()
+    until(lambda: page.text("status").startswith("Paused"))
+    before = driver.execute_script(count)
+    driver.execute_async_script("setTimeout(arguments[0], 600)")
+    assert driver.execute_script(count) <= before + 1  # the one that was under way
+    driver.set_window_size(800, 700)
+    until(lambda: driver.execute_script(count) > before + 3)
+    until(lambda: not page.text("status").startswith("Paused"))
+
+
+def test_controls_reach_the_graph(opened: Open, recorded: Recorded) -> None:
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    count = driver.execute_script("return watched.sent.length")
+    page.click("reset")
+    slide = (
+        "const e = document.getElementById(arguments[0]); e.value = arguments[1]; e.dispatchEvent(new Event('input'))"
+    )
+    driver.execute_script(slide, "gain", 1.5)
+    driver.execute_script(slide, "smoothing", 0)
+    until(lambda: driver.execute_script("return watched.sent.length") > count + 4)
+    sent = watched(page, f"watched.sent.slice({count})")
+    assert sum(one["reset"] for one in sent) == 1
+    assert (sent[-1]["gain"], sent[-1]["smoothing"]) == (1.5, 0)
+    assert page.text("gain-value") == "1.5"
+
+
+def test_calibration_is_spoken_and_left_with_escape(opened: Open, recorded: Recorded) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    count = driver.execute_script("return watched.sent.length")
+    page.click("calibrate")
+    assert page.text("prompt-words") == "1 of 5: Look into the camera with a resting face."
+    assert page.text("spoken") == "Look into the camera with a resting face."
+    assert driver.switch_to.active_element.get_attribute("id") == "prompt-stop"
+    until(lambda: 1 in [one["pose"] for one in watched(page, f"watched.sent.slice({count})")])
+    driver.switch_to.active_element.send_keys(Keys.ESCAPE)
+    assert not driver.find_element("id", "prompt").is_displayed()
+    assert driver.switch_to.active_element.get_attribute("id") == "calibrate"
+
+
+def test_every_control_has_a_name_for_screen_readers(opened: Open) -> None:
+    tree = opened.page.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    kinds = ("button", "slider", "switch", "image", "link", "progressbar")
+    controls = [(one["role"]["value"], one["name"]["value"]) for one in tree if one["role"]["value"] in kinds]
+    assert len(controls) >= 12
+    assert all(name for _, name in controls), controls
+
+
+def broken(folder: Path) -> dict[str, tuple[Path, str]]:
+    """Files that no face can move, and what the page says."""
+    good = folder / "good.glb"
+    save_rig(sheet(("jawOpen", "mouthClose")), good)
+    data = good.read_bytes()
+    save_mesh(quad_sheet(), folder / "still.glb")
+    save_rig(sheet(("alpha", "beta")), folder / "strange.glb")
+    (folder / "text.glb").write_text("not a character")
+    (folder / "cut.glb").write_bytes(data[: len(data) // 2])
+    with (folder / "huge.glb").open("wb") as file:
+        file.truncate(200 * 2**20)
+    return {
+        "still": (folder / "still.glb", "no morph targets"),
+        "strange": (folder / "strange.glb", "Found: alpha, beta"),
+        "text": (folder / "text.glb", "no .glb file"),
+        "cut": (folder / "cut.glb", "cut short"),
+        "huge": (folder / "huge.glb", "200 MB"),
+    }
+
+
+def test_a_character_that_cannot_be_used_is_explained_and_the_one_before_stays(opened: Open, tmp_path: Path) -> None:
+    page = opened.page
+    before = page.text("character-line")
+    chooser = page.driver.find_element("id", "file")
+    for name, (path, words) in broken(tmp_path).items():
+        chooser.send_keys(str(path))
+        said = until(lambda path=path: page.problem if path.name in page.problem else "")
+        assert words in said, name
+        assert page.text("character-line") == before
+    chooser.send_keys(str(tmp_path / "good.glb"))
+    until(lambda: page.text("character-line") == "good.glb: your face moves 2 of its 2 shapes")
+    assert page.problem == ""

@@ -1,0 +1,31 @@
+// Runs in the page before its own scripts: keeps what goes to the worker and what comes back, and what is downloaded.
+window.watched = { sent: [], solved: [], workers: [], blobs: [] };
+{
+  const post = Worker.prototype.postMessage, made = URL.createObjectURL, Original = window.Worker;
+  window.Worker = class extends Original {
+    constructor(address, options) {
+      super(address, options);
+      watched.workers.push(String(address));
+      this.addEventListener("message", ({ data }) => data.solved && watched.solved.push(data.solved));
+    }
+  };
+  Worker.prototype.postMessage = function (message, given) {
+    if (message.frame) {
+      const { picture, ...rest } = message.frame;
+      const context = new OffscreenCanvas(picture.width, picture.height).getContext("2d", { willReadFrequently: true });
+      context.drawImage(picture, 0, 0);
+      const image = context.getImageData(0, 0, picture.width, picture.height);
+      watched.sent.push({ ...rest, width: picture.width, height: picture.height, pixels: watched.keep ? image.data : null });
+    }
+    return post.call(this, message, given);
+  };
+  URL.createObjectURL = (blob) => (watched.blobs.push(blob), made.call(URL, blob));
+  watched.text = async (bytes) => {
+    const address = await new Promise((done) => {
+      const reader = new FileReader();
+      reader.onload = () => done(reader.result);
+      reader.readAsDataURL(new Blob([bytes]));
+    });
+    return address.slice(address.indexOf(",") + 1);
+  };
+}

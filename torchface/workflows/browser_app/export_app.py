@@ -1,0 +1,125 @@
+"""The app in the browser as a folder: page, solver, character and licences."""
+
+from __future__ import annotations
+
+import gzip
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from torchface.errors import FileFormatError, NameMismatchError
+from torchface.files.job_lock import job_lock
+from torchface.files.whole_files import all_or_none, check_writable, delete_file, make_folder, read_file, write_file
+from torchface.io import load_rig, save_rig
+from torchface.progress import Progress, silent
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+from torchface.synthetic import performer
+from torchface.workflows.browser_app.built_page import built_page
+from torchface.workflows.browser_app.webcam_graph_check import check_webcam_graph
+
+CHARACTER, GRAPH, PAGE = "character.glb", "webcam.onnx", "index.html"
+_ASSETS = (".js", ".css", ".wasm")
+LARGEST_CHARACTER = 100 * 2**20
+"""Bytes; what the page itself takes (``export/web/src/character_check.js``)."""
+
+
+@dataclass(frozen=True)
+class AppReport:
+    """What was written.
+
+    Args:
+        sizes: bytes of each file by its path inside the folder.
+        packed: the same as gzip has them, which is what a host that compresses sends.
+        driven: the character's shapes that a face moves.
+        still: its other shapes.
+    """
+
+    sizes: dict[str, int]
+    packed: dict[str, int]
+    driven: tuple[str, ...]
+    still: tuple[str, ...]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Sizes by kind of file, and which shapes move."""
+        kinds = {
+            "page (HTML, JavaScript, CSS)": (".html", ".js", ".css", ".txt", ""),
+            "ONNX Runtime (WebAssembly)": (".wasm",),
+            "solver": (".onnx",),
+            "character": (".glb",),
+        }
+        rows = [
+            (kind, self._size([name for name in self.sizes if Path(name).suffix in of])) for kind, of in kinds.items()
+        ]
+        rows.append(("in all", self._size(list(self.sizes))))
+        rows.append(("shapes that a face moves", f"{len(self.driven)} of {len(self.driven) + len(self.still)}"))
+        return rows
+
+    def _size(self, names: list[str]) -> str:
+        plain, packed = (sum(sizes[name] for name in names) / 2**20 for sizes in (self.sizes, self.packed))
+        return f"{plain:.2f} MB, {packed:.2f} MB with gzip"
+
+
+def export_app(
+    out: str | Path, webcam: str | Path, character: str | Path | None = None, progress: Progress | None = None
+) -> AppReport:
+    """Writes a folder that any static host serves: a page in which a webcam moves a character, on the user's machine.
+
+    Args:
+        out: the folder; files of an earlier app in it are replaced.
+        webcam: the graph from picture to weights, as ``torchface export webcam`` writes it.
+        character: a ``.glb``, which is taken as it is, or another rig, with shapes that ARKit knows; the embedded
+            performer if absent.
+        progress: called with each step.
+
+    Raises:
+        FileFormatError: the character or the graph cannot be read, the character is too large, or the folder holds
+            something else.
+        NameMismatchError: no shape of the character has a name that ARKit knows.
+        MissingExtraError: the page has to be built, and Node is missing or failed.
+    """
+    out, progress = Path(out), progress or silent
+    check_writable(folder=out)
+    _check_folder(out)
+    check_webcam_graph(webcam)
+    progress("reading the character")
+    rig = performer() if character is None else load_rig(character)
+    driven, still = _shapes(rig, character)
+    files = {GRAPH: read_file(webcam), CHARACTER: _glb(rig, character)}
+    page = built_page(progress)
+    files |= {path.relative_to(page).as_posix(): read_file(path) for path in sorted(page.rglob("*")) if path.is_file()}
+    progress("writing the app")
+    with job_lock(out), all_or_none():
+        for name, data in files.items():
+            make_folder((out / name).parent)
+            write_file(out / name, data)
+        for old in (out / "assets").iterdir():  # their names change with their content
+            if old.suffix in _ASSETS and f"assets/{old.name}" not in files:
+                delete_file(old)
+    packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
+    return AppReport({name: len(data) for name, data in files.items()}, packed, driven, still)
+
+
+def _check_folder(out: Path) -> None:
+    if out.is_dir() and any(out.iterdir()) and not ((out / PAGE).is_file() and (out / GRAPH).is_file()):
+        raise FileFormatError(f"{out}: found a folder with other files, expected none, an empty one or an earlier app")
+
+
+def _shapes(rig: BlendshapeRig, character: str | Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    drives = (mapping(ARKIT, rig.names) != 0).any(1).tolist()
+    driven = tuple(name for name, moves in zip(rig.names, drives, strict=True) if moves)
+    still = tuple(name for name, moves in zip(rig.names, drives, strict=True) if not moves)
+    if not driven:
+        raise NameMismatchError(
+            f"{character}: found the shapes {', '.join(still[:8]) or 'none'}, expected names that ARKit knows, such as "
+            "jawOpen; rename them, or bring them over with torchface transfer --names arkit"
+        )
+    return driven, still
+
+
+def _glb(rig: BlendshapeRig, character: str | Path | None) -> bytes:
+    if character is not None and Path(character).suffix.lower() == ".glb":
+        return read_file(character, LARGEST_CHARACTER)
+    with TemporaryDirectory() as folder:
+        save_rig(rig, Path(folder) / CHARACTER)
+        return read_file(Path(folder) / CHARACTER, LARGEST_CHARACTER)
