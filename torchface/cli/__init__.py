@@ -26,6 +26,7 @@ from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
 from torchface.cli.fit import fit
 from torchface.cli.info import info
+from torchface.cli.live import live
 from torchface.cli.pick import pick
 from torchface.cli.plain_options import plain_options
 from torchface.cli.progress import PlainConsole
@@ -47,6 +48,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "attach": attach,
     "solve": solve,
     "track": track,
+    "live": live,
     "retarget": retarget,
     "evaluate": evaluate,
     "calibrate": calibrate,

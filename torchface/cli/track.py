@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.picture_size import picture_size
 from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
 
 
@@ -89,7 +89,7 @@ def track(
         texture,
         overlay,
         fps,
-        _sides(size),
+        None if size is None else picture_size(size),
         offsets,
     )
     if live is not None:
@@ -98,18 +98,6 @@ def track(
     if out is None:
         raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
     _file(video, rig, out, settings, quiet)
-
-
-def _sides(size: str | None) -> tuple[int, int] | None:
-    """Width and height of a text such as 1280x720."""
-    from torchface.errors import ValueRangeError
-
-    if size is None:
-        return None
-    match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", size.strip().lower())
-    if match is None:
-        raise ValueRangeError(f"--size: found {size[:40]!r}, expected WIDTHxHEIGHT in pixels, such as 1280x720")
-    return int(match[1]), int(match[2])
 
 
 def _file(video: Path | None, rig: Path, out: Path, settings: object, quiet: bool) -> None:

@@ -16,6 +16,7 @@ import torch
 from torchface.errors import FileFormatError
 from torchface.io.video import write_video
 from torchface.workflows.live import camera as module
+from torchface.workflows.live import live_frames
 from torchface.workflows.live.camera import Camera, list_cameras
 from torchface.workflows.live.live_frames import PlayedVideo, open_source, planes
 
@@ -140,29 +141,46 @@ def test_cameras_are_listed_by_number() -> None:
     assert all(isinstance(number, int) and isinstance(name, str) for number, name in list_cameras().items())
 
 
-def test_a_video_is_played_in_its_own_time(tmp_path: Path) -> None:
+class Clock:
+    """Time that passes when it is waited for, and no other way."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    given = Clock()
+    monkeypatch.setattr(live_frames, "time", given)
+    return given
+
+
+def test_a_video_is_played_in_its_own_time(tmp_path: Path, clock: Clock) -> None:
     shades = torch.tensor([10, 60, 110, 160, 210], dtype=torch.uint8)
     write_video([shades[:, None, None, None].expand(5, 3, 32, 48).contiguous()], tmp_path / "film.avi", 20.0)
     played = PlayedVideo(tmp_path / "film.avi")
-    began, times, found = time.perf_counter(), [], []
-    for came, frame in played.frames():
-        times.append(came)
-        found.append(int(frame[0, 0, 0]))
-    assert found == shades.tolist()
-    assert np.diff(times) == pytest.approx(0.05, abs=1e-6)
-    assert time.perf_counter() - began >= 0.2
+    found = [(came, int(frame[0, 0, 0])) for came, frame in played.frames()]
+    assert [shade for _, shade in found] == shades.tolist()
+    assert [came for came, _ in found] == pytest.approx([100, 100.05, 100.1, 100.15, 100.2])
+    assert clock.now == pytest.approx(100.2)
     assert played.dropped == 0
 
 
-def test_frames_that_come_while_another_is_solved_are_dropped(tmp_path: Path) -> None:
+def test_frames_that_come_while_another_is_solved_are_dropped(tmp_path: Path, clock: Clock) -> None:
     write_video([torch.zeros(10, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
     played = PlayedVideo(tmp_path / "film.avi")
-    shown = 0
-    for _ in played.frames():
-        shown += 1
-        time.sleep(0.07)
-    assert shown + played.dropped == 10
-    assert played.dropped >= 4
+    times = []
+    for came, _ in played.frames():
+        times.append(came)
+        clock.sleep(0.07)  # three and a half frames long
+    assert len(times) + played.dropped == 10
+    assert times == pytest.approx([100.0, 100.06, 100.12])  # each given at most one frame late
 
 
 def test_planes_are_the_picture() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 _LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is told is within 1 %
 _BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
-_RECENT = 2.0  # seconds
+_RECENT, _MOST_RECENT = 2.0, 256  # seconds, frames
 
 
 class LiveFigures:
@@ -20,7 +20,7 @@ class LiveFigures:
         self.frames = self.found = 0
         self._histogram = np.zeros(_BINS + 1, np.int64)
         self._first = self._last = 0.0
-        self._recent: deque[tuple[float, float]] = deque(maxlen=1000)
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_MOST_RECENT)
 
     def add(self, came: float, gone: float, seen: bool) -> None:
         """Counts a frame that came and was sent on at these times, in seconds."""

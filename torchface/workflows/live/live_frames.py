@@ -56,8 +56,9 @@ class PlayedVideo:
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         """When each frame was due, and the frame, uint8 (H,W,3), red first."""
-        started = time.perf_counter()
+        started: float | None = None
         for number, frame in enumerate(self.video.color_frames()):
+            started = time.perf_counter() if started is None else started  # with the first frame: opening takes a while
             due = started + self._time(number)
             early = due - time.perf_counter()
             if early > 0:

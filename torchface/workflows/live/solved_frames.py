@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -55,12 +56,12 @@ class LiveFrame:
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
     calibrated: float = 1.0
 
-    @property
+    @cached_property
     def seen(self) -> bool:
         """Whether a face is there."""
         return bool(torch.isfinite(self.landmarks).all(1).any())
 
-    @property
+    @cached_property
     def rotations(self) -> Tensor:
         """Live Link Face's nine of head and eyes, radians, (9,) float64; 0 before the first face."""
         head = head_angles(self.rotation.detach().cpu().double()).nan_to_num(0.0)

@@ -1,0 +1,72 @@
+"""A film whose shades are weights, and a solver that reads them: what comes out must be what went in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchface.io.video import VideoFile, write_video
+from torchface.shape_names import ARKIT
+from torchface.workflows.live.solved_frames import LiveControls, LiveFrame
+
+JAW = ARKIT.index("jawOpen")
+SMILE = ARKIT.index("mouthSmileLeft")
+FRONTAL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+
+
+def film(path: Path, jaws: Sequence[float], fps: float = 25.0) -> Path:
+    """A film of one shade a frame: the jaw's weight; black shows no face."""
+    shades = (torch.tensor(jaws) * 200 + 40).round() * (torch.tensor(jaws) >= 0)
+    write_video([shades.to(torch.uint8)[:, None, None, None].expand(-1, 3, 48, 64).contiguous()], path, fps)
+    return path
+
+
+class ShadeSolver:
+    """Jaw by the picture's shade times the gain, smile by smoothing; keeps what it was told."""
+
+    names = ARKIT
+
+    def __init__(self, *_: object) -> None:
+        self.controls: list[LiveControls] = []
+        self.intervals: list[float | None] = []
+        self.posed = 0
+
+    def step(self, picture: np.ndarray, interval: float | None, controls: LiveControls) -> LiveFrame:
+        if len(self.controls) < 330:
+            self.controls.append(controls)
+            self.intervals.append(interval)
+        self.posed += controls.pose > 0
+        shade = float(picture[24, 32].mean())
+        height, width = picture.shape[:2]
+        weights = torch.zeros(52)
+        weights[JAW] = controls.gain * max(0.0, shade - 40) / 200
+        weights[SMILE] = controls.smoothing
+        t = torch.linspace(0, 6.28, 68)
+        around = torch.stack([width / 2 + width / 5 * t.cos(), height / 2 + height / 4 * t.sin()], 1)
+        seen = shade > 20
+        learned = min(1.0, self.posed / 20)
+        landmarks = around if seen else torch.full((68, 2), torch.nan)
+        gaze = torch.tensor([[0.1, 0.2], [0.3, -0.2]])
+        return LiveFrame(weights, FRONTAL, landmarks, around[[0, 34]], gaze, learned)
+
+
+class Endless:
+    """A source of as many frames as wanted, each at its time, without waiting."""
+
+    def __init__(self, count: int, fps: float = 30.0, interrupt: bool = False) -> None:
+        self.video = VideoFile(Path("planted"), fps, 64, 48, count)
+        self.dropped, self.interrupt = 0, interrupt
+
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        began = time.perf_counter()
+        for number in range(self.video.count):
+            yield began + number / self.video.fps, np.full((48, 64, 3), 40 + number % 200, np.uint8)
+        if self.interrupt:
+            raise KeyboardInterrupt
+
+    def close(self) -> None:
+        """Nothing to close."""

@@ -1,0 +1,356 @@
+"""Frames solved, sent, recorded and shown: what was planted comes out, whatever ends the session."""
+
+from __future__ import annotations
+
+import json
+import socket
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from planted_faces import JAW, SMILE, Endless, ShadeSolver, film
+
+from torchface import BlendshapeRig, load_rig, load_take, save_rig
+from torchface.cli import main
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.weights.live_link_stream import decode_frame
+from torchface.shape_names import ARKIT
+from torchface.workflows.live import character as characters
+from torchface.workflows.live import live_webcam, person_solver
+from torchface.workflows.live.character import load_character
+from torchface.workflows.live.face_watch import FaceWatch
+from torchface.workflows.live.frame_log import FrameLog
+from torchface.workflows.live.guided_calibration import STEPS, GuidedCalibration
+from torchface.workflows.live.live_figures import LiveFigures
+from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.live_webcam import LiveSettings, go_live
+from torchface.workflows.live.recordings import Recordings
+from torchface.workflows.live.weight_streams import WeightStreams
+
+
+@pytest.fixture(scope="module")
+def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small character by ARKit's names."""
+    path = tmp_path_factory.mktemp("character") / "dome.glb"
+    save_rig(dome_rig, path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def one_face(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing looks for faces in pictures of one shade."""
+    monkeypatch.setattr(live_webcam, "shipped_detector", lambda: lambda picture: ())
+
+
+def a_session(source: Endless, folder: Path, dome: Path, told: list[str]) -> tuple[LiveSession, Recordings]:
+    recordings = Recordings(folder, load_character(dome), "planted", source.video.fps)
+    streams = WeightStreams((), ARKIT, source.video.fps, told.append)
+    notes = Notes(told.append)
+    return LiveSession(source, ShadeSolver(), streams, recordings, notes, told.append), recordings
+
+
+def test_what_was_performed_is_sent_and_recorded(dome: Path, tmp_path: Path) -> None:
+    jaws = [0.0, 0.25, 0.5, 0.75, 1.0]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        address = f"livelink://127.0.0.1:{receiver.getsockname()[1]}"
+        settings = LiveSettings(
+            str(film(tmp_path / "film.avi", jaws)), dome, None, (address, address), tmp_path / "out", page=False
+        )
+        report, saved = go_live(settings, print, print, ShadeSolver)
+        frames = [decode_frame(receiver.recv(2048)) for _ in range(report.figures.frames)]
+    assert report.figures.frames + report.dropped == len(jaws)
+    assert [(take.folder, take.frames, take.error) for take in saved] == [(tmp_path / "out", len(frames), "")]
+    sent = torch.stack([frame.weights for frame in frames])
+    assert set(sent[:, JAW].tolist()) <= {torch.tensor(jaw).item() for jaw in jaws}
+    assert float(sent[:, JAW].max()) > 0
+    ours = load_take(tmp_path / "out" / "weights.csv").weights
+    unreal = load_take(tmp_path / "out" / "live_link.csv")
+    assert ours is not None
+    assert unreal.weights is not None
+    assert ours.names == load_rig(dome).names  # the character's own names
+    torch.testing.assert_close(ours.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
+    torch.testing.assert_close(unreal.weights.values[..., 0], sent)
+    # Eyes look 0.1 (right) and 0.3 (left) to the person's left: negative yaw, as Live Link Face has it; up is negative.
+    turned = unreal.extras["columns"]
+    assert float(turned["RightEyeYaw"][0]) == pytest.approx(-0.1)
+    assert float(turned["LeftEyeYaw"][0]) == pytest.approx(-0.3)
+    assert float(turned["LeftEyePitch"][0]) == pytest.approx(0.2)
+    assert float(turned["HeadYaw"].abs().max()) == 0
+    played = read_gltf_weights(tmp_path / "out" / "animation.glb")
+    assert played.weights is not None
+    torch.testing.assert_close(played.weights.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["found"] == len(frames)
+
+
+def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
+    times = 1000 + np.array([0, 0.031, 0.07, 0.35, 0.38, 0.42])
+    with FrameLog(tmp_path, ARKIT) as log:
+        for i, came in enumerate(times):
+            log.append(came, torch.full((52,), i / 8), torch.zeros(9))
+        take = log.take(30.0)
+        assert take.fps == pytest.approx(5 / 0.42)
+        seconds = take.uneven_seconds()
+        assert seconds is not None
+        np.testing.assert_allclose(seconds, times - 1000, atol=1e-9)
+    recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
+    recordings.start()
+    for i, came in enumerate(times):
+        frame = ShadeSolver().step(np.full((48, 64, 3), 40 + 20 * i, np.uint8), None, _controls())
+        recordings.add(float(came), frame)
+    recordings.finish()
+    table = np.loadtxt(tmp_path / "out" / "weights.csv", delimiter=",", skiprows=1, usecols=(1,))
+    np.testing.assert_allclose(table, times - 1000, atol=1e-6)
+    keys = read_gltf_weights(tmp_path / "out" / "animation.glb").uneven_seconds()
+    assert keys is not None
+    np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
+
+
+def _controls() -> object:
+    from torchface.workflows.live.solved_frames import LiveControls
+
+    return LiveControls()
+
+
+def test_even_frames_make_an_even_take(tmp_path: Path) -> None:
+    with FrameLog(tmp_path, ARKIT) as log:
+        for i in range(50):
+            log.append(12345.678 + i / 29.97, torch.zeros(52), torch.zeros(9))
+        take = log.take(1.0)
+        assert take.uneven_seconds() is None
+        assert take.fps == 29.97
+    assert list(tmp_path.iterdir()) == []
+    with FrameLog(tmp_path, ARKIT) as log, pytest.raises(ValueRangeError, match="found no frame"):
+        log.take(30.0)
+
+
+def test_an_interrupt_saves_what_was_recorded(dome: Path, tmp_path: Path) -> None:
+    source, told = Endless(40, interrupt=True), list[str]()
+    session, recordings = a_session(source, tmp_path / "out", dome, told)
+    session.record(True)
+    session.run()
+    (take,) = recordings.finish()
+    assert take.frames == 40
+    kept = load_take(tmp_path / "out" / "weights.csv")
+    assert len(kept) == 40
+    assert kept.fps == 30.0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "animation.glb",
+        "live_link.csv",
+        "summary.json",
+        "weights.csv",
+    ]
+
+
+def test_several_recordings_lie_beside_each_other(dome: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    session, recordings = a_session(Endless(5), tmp_path / "out", dome, told)
+    for _ in range(3):
+        assert "recording into" in session.record(True)
+        session.run()
+        session.record(False)
+    assert session.record(False) == "nothing is being recorded"
+    saved = recordings.finish()
+    assert sorted(take.folder.relative_to(tmp_path).as_posix() for take in saved) == [
+        "out",
+        "out/take_2",
+        "out/take_3",
+    ]
+    assert len(load_take(tmp_path / "out" / "take_3" / "weights.csv")) == 5
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_session(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    session, recordings = a_session(Endless(30), tmp_path / "out", dome, told)
+    session.record(True)
+
+    def full(self: FrameLog, *_: object) -> None:
+        raise FileFormatError("out: cannot be written: No space left on device")
+
+    monkeypatch.setattr(FrameLog, "append", full)
+    session.run()
+    assert session.figures.frames == 30
+    assert told == ["the recording ended: out: cannot be written: No space left on device"]
+    assert [take.frames for take in recordings.finish()] == [0]
+
+
+def test_memory_does_not_grow_with_the_frames(dome: Path, tmp_path: Path) -> None:
+    sizes: list[int] = []
+
+    class Weighed(Endless):
+        def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+            for number, frame in enumerate(super().frames()):
+                if number == 300:  # when every window of recent frames is full
+                    tracemalloc.start()
+                if number in (600, 900):
+                    sizes.append(tracemalloc.get_traced_memory()[0])
+                yield frame
+
+    session, recordings = a_session(Weighed(901), tmp_path / "out", dome, [])
+    session.record(True)
+    try:
+        session.run()
+    finally:
+        tracemalloc.stop()
+    assert sizes[1] - sizes[0] < 300 * 20  # bytes; a frame's weights alone have 208
+    assert recordings.finish()[0].frames == 901
+
+
+def test_controls_reach_the_solver_and_reset_does_once(dome: Path, tmp_path: Path) -> None:
+    session, _ = a_session(Endless(3), tmp_path, dome, [])
+    solver = session._solver
+    assert isinstance(solver, ShadeSolver)
+    session.gain, session.smoothing = 1.5, 0.25
+    session.reset()
+    session.run()
+    assert [told.reset for told in solver.controls] == [True, False, False]
+    assert {(told.gain, told.smoothing, told.pose) for told in solver.controls} == {(1.5, 0.25, 0)}
+    assert solver.intervals[0] is None
+    assert solver.intervals[1:] == pytest.approx([1 / 30, 1 / 30], abs=1e-6)
+    view = session.view()
+    assert view is not None
+    assert float(view.weights[SMILE]) == 0.25
+    assert view.seen
+
+
+def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    session, _ = a_session(Endless(320), tmp_path, dome, told)
+    session.calibrate()
+    session.run()
+    assert told == [f"{i + 1} of 5: {words}" for i, words in enumerate(STEPS)] + ["Calibrated: thank you"]
+    solver = session._solver
+    assert isinstance(solver, ShadeSolver)
+    poses = torch.tensor([controls.pose for controls in solver.controls])
+    assert poses[poses > 0].unique_consecutive().tolist() == [1, 2, 3, 4, 5]
+    held = torch.bincount(poses, minlength=6)[1:] / 30
+    assert held.tolist() == pytest.approx([1.3] * 5, abs=0.07)
+    assert (poses[:20] == 0).all()  # time to get into the first
+    assert (poses[302:] == 0).all()
+
+
+def test_the_calibrations_clock_stands_while_no_face_is_seen() -> None:
+    calibration: GuidedCalibration | None = GuidedCalibration(3.0)
+    for _ in range(100):
+        assert calibration is not None
+        calibration = calibration.after(0.1, seen=False)
+    assert calibration == GuidedCalibration(3.0)
+    assert calibration.pose == 2
+    assert GuidedCalibration(9.95).after(0.1, seen=True) is None
+
+
+def test_no_face_darkness_and_several_faces_are_told() -> None:
+    counted: list[tuple[int, ...]] = []
+
+    def count(picture: torch.Tensor) -> int:
+        counted.append(tuple(picture.shape))
+        return 2
+
+    watch = FaceWatch(count)
+    bright, dark = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64, 3), 9, np.uint8)
+    watch.look(bright, False, 0.0)
+    assert watch.words == "No face yet: sit before the camera and look into it"
+    watch.look(dark, False, 0.1)
+    assert watch.words.startswith("Too dark")
+    watch.look(bright, True, 0.2)
+    assert watch._counting is not None
+    watch._counting.join(5)
+    watch.look(bright, True, 0.3)
+    assert watch.words.startswith("2 faces")
+    assert counted == [(3, 48, 64)]  # not at every frame
+    watch.look(bright, False, 0.4)
+    assert watch.words == "No face: the last expression is held, then relaxes"
+
+
+def test_latency_is_told_within_a_hundredth() -> None:
+    figures = LiveFigures()
+    for i in range(1, 1001):
+        figures.add(i / 30, i / 30 + i / 1000, i % 2 == 0)
+    assert figures.latency(0.5) == pytest.approx(500, rel=0.01)
+    assert figures.latency(0.99) == pytest.approx(990, rel=0.01)
+    assert (figures.frames, figures.found) == (1000, 500)
+    assert figures.recent()[1] == pytest.approx(971, rel=0.02)
+
+
+def test_a_mapping_drives_a_character_of_other_names(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    names = ["Mund_auf", "Brauen", "Laecheln_L", "Laecheln_R"]
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "strange.glb")
+    with pytest.raises(Exception, match=r"found the shapes 'Mund_auf'.*--mapping FILE.*\n\[\"Mund_auf\"\]") as told:
+        load_character(tmp_path / "strange.glb")
+    assert type(told.value).__name__ == "NameMismatchError"
+    table = tmp_path / "mapping.toml"
+    table.write_text(str(told.value).split("such as\n")[1] + "\ngain = 0.5\n")  # what the message shows is a table
+    moved = load_character(tmp_path / "strange.glb", table)
+    weights = torch.zeros(5000, 52)
+    weights[:, JAW] = torch.linspace(0, 1, 5000)
+    assert torch.equal(moved.weights(weights)[:, 0], weights[:, JAW] * 0.5)
+    assert "1 of its 4 shapes move" in moved.notes()[0]
+    table.write_text("[Nase]\nsum = {jawOpen = 1.0}\n")
+    with pytest.raises(Exception, match=r"mapping.toml: retarget: found rules for Nase, expected shapes"):
+        load_character(tmp_path / "strange.glb", table)
+    table.write_text("[Mund_auf]\nsum = {jawOpne = 1.0}\n")
+    with pytest.raises(Exception, match=r"mapping.toml: .*names jawOpne, expected shapes of the source"):
+        load_character(tmp_path / "strange.glb", table)
+
+
+def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchface import save_mesh
+
+    save_mesh(dome_rig.neutral, tmp_path / "statue.glb")
+    with pytest.raises(FileFormatError, match=r"statue.glb: found no morph target"):
+        load_character(tmp_path / "statue.glb")
+    save_rig(dome_rig, tmp_path / "dome.glb")
+    whole = (tmp_path / "dome.glb").read_bytes()
+    (tmp_path / "broken.glb").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match=r"broken.glb"):
+        load_character(tmp_path / "broken.glb")
+    monkeypatch.setattr(characters, "_MAX_BYTES", 1000)
+    with pytest.raises(FileFormatError, match=r"dome.glb: found 0 MB, expected at most 0 MB for a character"):
+        load_character(tmp_path / "dome.glb")
+
+
+def test_a_receiver_that_is_not_there_is_told_once_with_the_figure() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as empty:
+        empty.bind(("127.0.0.1", 0))
+        port = empty.getsockname()[1]
+    told: list[str] = []
+    with WeightStreams((f"vmc://127.0.0.1:{port}",), ARKIT, 30.0, told.append) as streams:
+        for _ in range(5):
+            streams.send(torch.zeros(52), torch.zeros(9))
+        (note,) = streams.notes()
+    assert told == [f"vmc://127.0.0.1:{port}: nobody listens there yet; sending goes on"]
+    assert "of 5 frames were not received" in note
+
+
+def test_the_command_plays_records_and_says_what_is_wrong(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(person_solver, "person_solver", ShadeSolver)
+    played = film(tmp_path / "film.avi", [0.5] * 4)
+    out = tmp_path / "out"
+    main(["live", str(played), "--character", str(dome), "--no-page", "--calibrate", "--record", str(out), "--quiet"])
+    said = capsys.readouterr()
+    assert said.out.strip() == str(out)
+    assert "1 of 5: Look into the camera" in said.err
+    assert len(load_take(out / "live_link.csv")) >= 1
+    for words, told in (
+        ((played, "--to", "vmc://no-such-host.invalid"), "whose host is not known"),
+        ((played, "--to", "midi://h:1"), "expected an address such as"),
+        (("99",), "camera 99: cannot be opened"),
+        ((tmp_path / "none.mp4",), "no such file"),
+        ((played, "--size", "wide"), "expected WIDTHxHEIGHT"),
+        ((played, "--seconds", "0"), "seconds"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(["live", *map(str, words), "--no-page", "--character", str(dome)])
+        assert ended.value.code == 2
+        assert told in " ".join(capsys.readouterr().err.split())
+    main(["live", "--list"])

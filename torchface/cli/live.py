@@ -1,0 +1,82 @@
+"""``torchface live``: anybody before a webcam moves a character."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from torchface.cli.picture_size import picture_size
+from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+
+
+def live(
+    camera: Annotated[Positional[str], arg(metavar="CAMERA|VIDEO")] = "0",
+    *,
+    character: Path | None = None,
+    mapping: Path | None = None,
+    calibrate: bool = False,
+    to: UseAppendAction[tuple[str, ...]] = (),
+    record: Path | None = None,
+    page: bool = True,
+    port: int = 8080,
+    size: str = "640x480",
+    seconds: float | None = None,
+    cameras: Annotated[bool, arg(name="list")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Move a character with your face, before a webcam; no scan, no markers, no training.
+
+    A page in the browser shows the character and the camera's picture with what was found in it, and has sliders for
+    gain and smoothing, a guided calibration of ten seconds, and a button to record. It is at 127.0.0.1, no other
+    machine can open it, and no picture leaves this one. Ends with Ctrl+C. The page needs the extra: pip install
+    '.[viewer]' in a checkout; --no-page does without.
+
+    Args:
+        camera: A camera's number, from 0, or a video file that is played in its own time.
+        character: A .glb with morph targets by ARKit's names, or a folder of OBJ files; the embedded performer if
+            absent.
+        mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.
+        calibrate: Begin with the guided calibration; without the page it is asked for in the terminal.
+        to: Where weights are sent to, again for each: livelink://HOST:11111 (Live Link Face, for Unreal),
+            vmc://HOST:39539 (VMC protocol), osc://HOST:PORT/PREFIX (PREFIX/weights/jawOpen and so on).
+        record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
+            animation.glb, summary.json. The page's button records into `recordings` without.
+        page: Open the page in the browser.
+        port: The first port to try for the page.
+        size: WIDTHxHEIGHT to ask the camera for.
+        seconds: After which it ends; until Ctrl+C if absent.
+        cameras: Only list the cameras.
+        quiet: Show no progress.
+    """
+    from torchface.errors import FileFormatError
+    from torchface.workflows.live.camera import list_cameras
+    from torchface.workflows.live.live_webcam import LiveSettings, go_live
+    from torchface.workflows.live.person_solver import person_solver
+
+    if cameras:
+        found = list_cameras()
+        for number, name in found.items():
+            print(f"{number}  {name}".rstrip())
+        if not found:
+            console.print("no camera found; a video file does as well: torchface live film.mp4")
+        return
+    sides = picture_size(size)
+    settings = LiveSettings(camera, character, mapping, to, record, calibrate, page, port, seconds, sides)
+
+    def opened(url: str) -> None:
+        console.print("Open this page; Ctrl+C ends.")
+        print(url, flush=True)
+
+    def say(words: str) -> None:
+        console.print(words, highlight=False, soft_wrap=True)
+
+    with progress_bars(quiet) as progress:
+        report, saved = go_live(settings, say, opened, person_solver, progress)
+    print_lines(report.lines())
+    for take in saved:
+        if take.error:
+            raise FileFormatError(f"the recording of {take.frames} frames is lost: {take.error}")
+        if take.frames:
+            print_path(take.folder)

@@ -1,0 +1,130 @@
+"""Anybody before a webcam moves a character: the whole job from a camera to streams, a page and files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchface.errors import ValueRangeError
+from torchface.files.job_lock import job_lock
+from torchface.io.weights.udp_sending import find_receiver
+from torchface.landmarks.images.network_detector import shipped_detector
+from torchface.number_checks import checked_number
+from torchface.progress import Progress, silent
+from torchface.shape_names import ARKIT
+from torchface.workflows.live.camera import DEFAULT_SIZE
+from torchface.workflows.live.character import load_character
+from torchface.workflows.live.face_watch import FaceWatch
+from torchface.workflows.live.live_figures import LiveReport
+from torchface.workflows.live.live_frames import FrameSource, Say, open_source
+from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.recordings import Recordings, SavedTake
+from torchface.workflows.live.solved_frames import FaceSolver
+from torchface.workflows.live.weight_streams import WeightStreams
+
+RECORDINGS = Path("recordings")
+"""Where the page's button records to, where no folder was named."""
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """What a live session is made of.
+
+    Args:
+        camera: a device's number, or a video file, which is played at its own rate.
+        character: a rig by ARKit's names; the embedded performer if absent.
+        mapping: a table for shapes of other names.
+        addresses: see :func:`torchface.io.weights.weight_senders.open_sender`.
+        record: a folder to record into from the first frame on.
+        calibrate: begin with the guided calibration.
+        page: open the page in the browser.
+        port: the first that the page tries.
+        seconds: after which it ends.
+        size: width and height to ask a camera for.
+    """
+
+    camera: str = "0"
+    character: Path | None = None
+    mapping: Path | None = None
+    addresses: tuple[str, ...] = ()
+    record: Path | None = None
+    calibrate: bool = False
+    page: bool = True
+    port: int = 8080
+    seconds: float | None = None
+    size: tuple[int, int] = DEFAULT_SIZE
+
+
+def go_live(
+    settings: LiveSettings,
+    say: Say,
+    opened: Say,
+    make_solver: Callable[[FrameSource], FaceSolver],
+    progress: Progress | None = None,
+) -> tuple[LiveReport, list[SavedTake]]:
+    """Solves, sends, records and shows what a camera sees, until it ends or is interrupted.
+
+    Args:
+        settings: what with.
+        say: told what the user should know while it runs, and without a page what a calibration asks for.
+        opened: told the page's address.
+        make_solver: gives what solves the frames, by ARKit's names.
+        progress: called with the number of frames.
+
+    Returns:
+        The figures, and what was recorded.
+
+    Raises:
+        ValueRangeError: an address is none, or no frame came.
+        NameMismatchError: the character has no shape of a known name.
+        FileFormatError: a file is broken, or the camera cannot be opened.
+        MissingExtraError: the page's package is not installed.
+    """
+    progress = progress or silent
+    for address in settings.addresses:
+        find_receiver(address)
+    if settings.seconds is not None:
+        checked_number("seconds", settings.seconds, above=True)
+    if settings.page:  # what is missing should be said before a large character is read
+        from torchface.viz.browser.browser_page import import_viser
+
+        import_viser()
+    progress("reading the character")
+    character = load_character(settings.character, settings.mapping)
+    notes = Notes(say)
+    for note in character.notes():
+        notes(note)
+    with ExitStack() as stack:
+        if settings.record is not None:
+            stack.enter_context(job_lock(settings.record))
+        progress("opening the camera")
+        source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size)))
+        progress("loading the solver")
+        solver = make_solver(source)
+        streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
+        place = settings.record or RECORDINGS
+        recordings = Recordings(place, character, source.video.path.name, source.video.fps)
+        watch = FaceWatch(lambda picture: len(shipped_detector()(picture)))
+        prompt: Say = (lambda words: None) if settings.page else say
+        session = LiveSession(source, solver, streams, recordings, notes, prompt, watch)
+        if settings.record is not None:
+            recordings.start()
+        if settings.calibrate:
+            session.calibrate()
+        try:
+            if settings.page:
+                from torchface.viz.browser.live_page import LivePage
+
+                page = LivePage(character.rig, character.weights, session, "live", settings.port)
+                stack.callback(page.stop)
+                opened(page.url)
+            session.run(settings.seconds, progress)
+        finally:
+            if recordings.running:
+                progress("writing the recording")
+            saved = recordings.finish()
+        if session.figures.frames == 0:
+            raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
+        return LiveReport(session.figures, source.dropped, streams.notes()), saved

@@ -1,0 +1,155 @@
+"""What was performed live, kept: weights of the character, Live Link Face CSV, an animation, a summary."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from torchface.errors import TorchfaceError
+from torchface.files.whole_files import all_or_none, make_folder, write_file
+from torchface.io import save_animation
+from torchface.io.weights.live_link_csv import save_live_link
+from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.shape_names import ARKIT
+from torchface.take import Track
+from torchface.workflows.live.character import Character
+from torchface.workflows.live.frame_log import FrameLog
+from torchface.workflows.live.solved_frames import LiveFrame
+
+WEIGHTS, LIVE_LINK, ANIMATION, SUMMARY = "weights.csv", "live_link.csv", "animation.glb", "summary.json"
+_FORMAT = "torchface.live-summary/1"
+_MAX_TAKES = 10_000
+
+
+@dataclass(frozen=True)
+class SavedTake:
+    """One recording on the disk, or why it is not there."""
+
+    folder: Path
+    frames: int
+    error: str = ""
+
+
+class Recordings:
+    """The takes of one session; frames go to the disk as they come, files are made when a take ends.
+
+    Args:
+        folder: of the first take; later ones lie in it as ``take_2`` and so on.
+        character: whose animation is written.
+        source: names the camera or video in the summary.
+        fps: frames a second, where the frames do not say.
+    """
+
+    def __init__(self, folder: Path, character: Character, source: str, fps: float) -> None:
+        self._folder, self._character, self._source, self._fps = folder, character, source, fps
+        self._log: FrameLog | None = None
+        self._place = folder
+        self._began, self._found = 0.0, 0
+        self._saving: list[threading.Thread] = []
+        self.saved: list[SavedTake] = []
+
+    @property
+    def running(self) -> bool:
+        """Whether frames are being kept."""
+        return self._log is not None
+
+    def seconds(self, now: float) -> float:
+        """How long the take that runs is."""
+        return now - self._began if self._log is not None and self._log.count else 0.0
+
+    def start(self) -> Path:
+        """Begins a take and returns its folder.
+
+        Raises:
+            FileFormatError: nothing can be written there.
+        """
+        self._place = self._next()
+        self._log, self._found = FrameLog(make_folder(self._place), ARKIT), 0
+        return self._place
+
+    def add(self, came: float, frame: LiveFrame) -> None:
+        """Keeps a frame, if a take runs.
+
+        Raises:
+            FileFormatError: the disk is full.
+        """
+        if self._log is None:
+            return
+        if self._log.count == 0:
+            self._began = came
+        self._log.append(came, frame.weights, frame.rotations)
+        self._found += frame.seen
+
+    def stop(self) -> None:
+        """Ends the take that runs; its files are made beside what goes on, see :meth:`finish`."""
+        log, self._log = self._log, None
+        if log is None:
+            return
+        thread = threading.Thread(target=self._save, args=(log, self._place, self._found), name="torchface-recording")
+        self._saving.append(thread)
+        thread.start()
+
+    def finish(self) -> list[SavedTake]:
+        """Ends the take that runs and waits for all files; an interrupt meanwhile would lose them and is ignored."""
+        with _no_interrupt():
+            self.stop()
+            for thread in self._saving:
+                thread.join()
+        return self.saved
+
+    def _next(self) -> Path:
+        if not self.saved and not self._saving:
+            return self._folder
+        taken = {take.folder for take in self.saved} | {self._place}
+        numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
+        return next(folder for folder in numbered if folder not in taken and not folder.exists())
+
+    def _save(self, log: FrameLog, folder: Path, found: int) -> None:
+        with log:
+            try:
+                if log.count:
+                    self._write(log, folder, found)
+                self.saved.append(SavedTake(folder, log.count))
+            except (TorchfaceError, OSError) as error:
+                self.saved.append(SavedTake(folder, log.count, str(error)))
+
+    def _write(self, log: FrameLog, folder: Path, found: int) -> None:
+        take = log.take(self._fps)
+        assert take.weights is not None
+        rig = self._character.rig
+        moved = replace(take, weights=Track(rig.names, self._character.weights(take.weights.values[..., 0])[..., None]))
+        seconds = take.uneven_seconds()
+        summary = {
+            "format": _FORMAT,
+            "source": self._source,
+            "character": self._character.name,
+            "frames": len(take),
+            "fps": round(take.fps, 3),
+            "even": seconds is None,
+            "seconds": round((len(take) - 1) / take.fps, 3),
+            "found": found,
+            "files": [WEIGHTS, LIVE_LINK, ANIMATION],
+        }
+        with all_or_none():
+            save_weights_csv(moved, folder / WEIGHTS)
+            save_live_link(take, folder / LIVE_LINK)
+            save_animation(rig, moved, folder / ANIMATION)
+            write_file(folder / SUMMARY, json.dumps(summary, indent=1).encode())
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Interrupts are ignored meanwhile, where this is the thread that gets them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
