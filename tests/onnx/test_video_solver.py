@@ -23,8 +23,9 @@ from torchface.io.camera_files import save_calibration
 from torchface.onnx import VideoGraph, VideoReport, export_video_solver
 from torchface.onnx import video_graph_export as video_export
 from torchface.onnx.exported_model import exported_model
-from torchface.onnx.unrolled_operators import TRANSLATIONS, symmetric_inverse
+from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph_export import synthetic_landmarks
+from torchface.optim.exported_operators import symmetric_inverse
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 

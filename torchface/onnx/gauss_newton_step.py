@@ -9,13 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchface.capture.priors import ShapePrior, StudentDensity
+from torchface.capture.priors.student_groups import StudentGroups
 from torchface.capture.video.face_points import FacePoints
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.video_solver import VideoSolver
-from torchface.errors import ValueRangeError
-from torchface.onnx.unrolled_operators import box_splitting, symmetric_inverse
-from torchface.optim.operator_splitting import RELAXATION
+from torchface.optim.exported_operators import split_box_program
 
 _SLIDING_STEPS = 3
 _SPLITTING_STEPS = 40
@@ -57,7 +55,7 @@ class GaussNewtonStep(nn.Module):
         self.settings, self.shapes = solver.settings, len(solver.names)
         self.strength = 1.0 if solver.prior is None else solver.prior.strength
         points = solver.points
-        precisions, freedoms, sizes = _student_groups(solver.prior, self.shapes, points.rest)
+        groups = StudentGroups.of(solver.prior, self.shapes, points.rest)
         # θ/sin θ in powers of sin²(θ/2): 1, 2/3, 8/15, ...
         series = accumulate((2 * k / (2 * k + 1) for k in range(1, _TERMS)), mul, initial=1.0)
         free = points.rest.new_full((6,), 1e9)
@@ -71,9 +69,9 @@ class GaussNewtonStep(nn.Module):
             "identity": torch.eye(self.shapes + 6).to(points.rest),
             "lower": torch.cat([free.new_zeros(self.shapes), -free]),
             "upper": torch.cat([free.new_ones(self.shapes), free]),
-            "precisions": precisions,
-            "freedoms": freedoms,
-            "sizes": sizes,
+            "precisions": groups.precisions,
+            "freedoms": groups.freedoms,
+            "sizes": groups.sizes,
             "series": points.rest.new_tensor(list(series)),
         }.items():
             self.register_buffer(name, value)
@@ -149,37 +147,16 @@ class GaussNewtonStep(nn.Module):
         """Of the shape prior, the L1 penalty and the ridge: H (N,N), and the gradient (N,) at weights (N,)."""
         H = 2 * self.settings.ridge * self.identity[: self.shapes, : self.shapes]
         if len(self.precisions):
-            distance = (self.precisions @ weights) @ weights
-            factors = (self.freedoms + self.sizes) / (self.freedoms + distance)
-            H = H + self.strength * (factors[:, None, None] * self.precisions).sum(0)
+            H = H + self.strength * StudentGroups(self.precisions, self.freedoms, self.sizes).bound(weights)
         return H, H @ weights + self.settings.sparsity
 
     def _box_program(self, weights: Tensor, H: Tensor, gradient: Tensor, dual: Tensor) -> tuple[Tensor, Tensor]:
         """By what weights and pose should move, (1,N+6), and the scaled dual there, (N+6,)."""
-        here, diagonal = pad(weights, (0, 6)), (H * self.identity).sum(0)
-        offset = -RELAXATION * symmetric_inverse(H + _RHO * diagonal * self.identity)
-        step = -_RHO * diagonal[:, None] * offset - self.identity
-        double_step = 2 * step + (2 - RELAXATION) * self.identity
-        constant = gradient[None] @ offset
-        lower, upper = self.lower - here, self.upper - here
-        v, z = box_splitting(constant, step, double_step, lower, upper, dual[None], _SPLITTING_STEPS)
-        return z, pad((v - z)[0, : self.shapes], (0, 6))
-
-
-def _student_groups(prior: ShapePrior | None, shapes: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the G groups the inverse scale matrices, (G,N,N), degrees of freedom and sizes, (G,)."""
-    parts = [] if prior is None else list(zip(prior.groups, prior.densities, strict=True))
-    precisions, freedoms = like.new_zeros(len(parts), shapes, shapes), like.new_zeros(len(parts))
-    for i, (group, density) in enumerate(parts):
-        if type(prior) is not ShapePrior or not isinstance(density, StudentDensity):
-            raise ValueRangeError(
-                f"video graph: found a {type(prior).__name__} of {type(density).__name__}, expected one of Student's "
-                "distributions, as ShapePrior.fit learns"
-            )
-        rows, factor = torch.tensor(group), density.factor.to(like)
-        precisions[i, rows[:, None], rows] = factor @ factor.T
-        freedoms[i] = density.degrees_of_freedom
-    return precisions, freedoms, like.new_tensor([len(group) for group, _ in parts])
+        here = pad(weights, (0, 6))
+        z, dual = split_box_program(
+            H, gradient, self.lower - here, self.upper - here, dual, self.identity, _RHO, _SPLITTING_STEPS
+        )
+        return z, pad(dual[: self.shapes], (0, 6))
 
 
 def _rotation_between(start: Tensor, end: Tensor, series: Tensor) -> Tensor:

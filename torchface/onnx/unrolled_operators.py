@@ -1,4 +1,4 @@
-"""Operators without an ONNX form: PyTorch runs them by itself, an exported graph as loops written out."""
+"""The ONNX form of ``torchface.optim.exported_operators``: loops written out."""
 
 from __future__ import annotations
 
@@ -6,19 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-
-@torch.library.custom_op("torchface::symmetric_inverse", mutates_args=())
-def symmetric_inverse(matrix: Tensor) -> Tensor:
-    """The inverse (D,D) of a symmetric positive definite matrix (D,D); a matrix that has none raises nothing."""
-    return torch.linalg.inv_ex(matrix).inverse.contiguous()
-
-
-@symmetric_inverse.register_fake
-def _(matrix: Tensor) -> Tensor:
-    return torch.empty_like(matrix)
+from torchface.optim import exported_operators
 
 
 def _sweep_inverse(matrix: Any) -> Any:
@@ -48,32 +37,6 @@ def _sweep_inverse(matrix: Any) -> Any:
     return op.Mul(op.Sub(identity, swept), scales)
 
 
-@torch.library.custom_op("torchface::box_splitting", mutates_args=())
-def box_splitting(
-    constant: Tensor, step: Tensor, double_step: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, steps: int
-) -> tuple[Tensor, Tensor]:
-    """Steps of ``torchface.optim.operator_splitting`` from zero: the last v and the clipped z, (1,N).
-
-    Args:
-        constant: c, (1,N).
-        step: G, (N,N).
-        double_step: 2G + (2 - α) I, (N,N).
-        lower, upper: the box, (N,).
-        dual: the scaled dual to start from, (1,N).
-        steps: how many.
-    """
-    v, z = dual, torch.zeros_like(dual)
-    for _ in range(steps):  # each needs the one before
-        v = torch.addmm(torch.addmm(constant, v, step, alpha=-1.0), z, double_step)
-        z = torch.minimum(torch.maximum(v, lower), upper)
-    return v, z
-
-
-@box_splitting.register_fake
-def _(constant: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(constant), torch.empty_like(constant)
-
-
 def _unrolled_splitting(
     constant: Any, step: Any, double_step: Any, lower: Any, upper: Any, dual: Any, steps: int
 ) -> tuple[Any, Any]:
@@ -86,8 +49,8 @@ def _unrolled_splitting(
 
 
 TRANSLATIONS: Mapping[Callable[..., object], Callable[..., object]] = {
-    torch.ops.torchface.symmetric_inverse.default: _sweep_inverse,
-    torch.ops.torchface.box_splitting.default: _unrolled_splitting,
+    exported_operators.symmetric_inverse._opoverload: _sweep_inverse,
+    exported_operators.box_splitting._opoverload: _unrolled_splitting,
 }
 """For ``exported_model``."""
 

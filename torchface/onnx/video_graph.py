@@ -22,8 +22,9 @@ from torchface.capture.video.solver_components import (
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.onnx.gauss_newton_step import GaussNewtonStep
-from torchface.onnx.unrolled_operators import symmetric_inverse
+from torchface.optim.exported_operators import symmetric_inverse
 
 _MIN_LANDMARKS = 6
 
@@ -130,7 +131,7 @@ class VideoGraph(nn.Module):
         enough = (~unseen).double().sum() > _MIN_LANDMARKS - 0.5
         first = torch.isnan(state["rotation"]).any()
         rotation, translation = self._affine_pose(found, trust)
-        rotation = torch.where(first, rotation, _orthonormal(state["rotation"]))
+        rotation = torch.where(first, rotation, orthonormal(state["rotation"]))
         translation = torch.where(first, translation, state["translation"])
         window = state["weights"][None] if self.dynamics is None else state["window"]
         weights = torch.where(first, 0.0, window[-1]).clamp(0, 1)
@@ -194,17 +195,8 @@ class VideoGraph(nn.Module):
 
     def _affine_pose(self, found: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
         """The pose (3,3), (3,) in which an affine camera sees the rig at rest as landmarks (68,2) are."""
-        rest = self.step.rest[:LANDMARKS]
         rays = torch.nn.functional.pad(found, (0, 1), value=1.0) @ self.to_rays
-        rays = rays[:, :2] / rays[:, 2:]
-        proportion = (trust / trust.sum())[:, None]
-        centre, middle = (proportion * rest).sum(0), (proportion * rays).sum(0)
-        x, q = (rest - centre) * proportion, rays - middle
-        projection = (q.T @ x) @ symmetric_inverse((rest - centre).T @ x)
-        size = projection.square().sum(1).sqrt()
-        rotation = _orthonormal(projection)
-        depth = 2 / (size[0] + size[1])
-        return rotation, depth * torch.nn.functional.pad(middle, (0, 1), value=1.0) - rotation @ centre
+        return affine_pose(self.step.rest[:LANDMARKS], rays[:, :2] / rays[:, 2:], trust)
 
     def _walked(self, head: HeadState, told: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
         """The prediction for this frame from the last one's weights: the mean and its information (N+6,N+6)."""
@@ -242,11 +234,3 @@ def _where(condition: Tensor, one: HeadState, other: HeadState) -> HeadState:
         torch.where(condition, one.rotation, other.rotation),
         torch.where(condition, one.translation, other.translation),
     )
-
-
-def _orthonormal(matrix: Tensor) -> Tensor:
-    """The rotation (3,3) of a matrix' first two rows."""
-    first = matrix[0] / matrix[0].square().sum().sqrt()
-    second = matrix[1] - (first @ matrix[1]) * first
-    second = second / second.square().sum().sqrt()
-    return torch.stack([first, second, torch.linalg.cross(first, second)])

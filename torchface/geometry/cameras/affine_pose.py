@@ -1,0 +1,36 @@
+"""The pose in which an affine camera sees points as they are seen: products alone, where no search can be afforded."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.optim.exported_operators import symmetric_inverse
+
+
+def affine_pose(points: Tensor, rays: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose, (3,3) and (3,) millimetres, in which an affine camera sees points where they are seen.
+
+    Args:
+        points: (L,3), millimetres, not in a plane.
+        rays: where they are seen, (L,2), at depth 1.
+        trust: how much each counts, (L,), not all zero.
+
+    Source: DeMenthon and Davis 1995, the first iteration of POSIT.
+    """
+    proportion = (trust / trust.sum())[:, None]
+    centre, middle = (proportion * points).sum(0), (proportion * rays).sum(0)
+    x, q = (points - centre) * proportion, rays - middle
+    projection = (q.T @ x) @ symmetric_inverse((points - centre).T @ x)
+    size = projection.square().sum(1).sqrt()
+    rotation = orthonormal(projection)
+    depth = 2 / (size[0] + size[1])
+    return rotation, depth * torch.nn.functional.pad(middle, (0, 1), value=1.0) - rotation @ centre
+
+
+def orthonormal(matrix: Tensor) -> Tensor:
+    """The rotation (3,3) of a matrix' first two rows."""
+    first = matrix[0] / matrix[0].square().sum().sqrt()
+    second = matrix[1] - (first @ matrix[1]) * first
+    second = second / second.square().sum().sqrt()
+    return torch.stack([first, second, torch.linalg.cross(first, second)])

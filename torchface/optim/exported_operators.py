@@ -1,0 +1,69 @@
+"""Operators without an ONNX form: PyTorch runs them by itself, exported graphs as loops that are written out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.optim.operator_splitting import RELAXATION
+
+
+@torch.library.custom_op("torchface::symmetric_inverse", mutates_args=())
+def symmetric_inverse(matrix: Tensor) -> Tensor:
+    """The inverse (D,D) of a symmetric positive definite matrix (D,D); a matrix that has none raises nothing."""
+    return torch.linalg.inv_ex(matrix).inverse.contiguous()
+
+
+@symmetric_inverse.register_fake
+def _(matrix: Tensor) -> Tensor:
+    return torch.empty_like(matrix)
+
+
+@torch.library.custom_op("torchface::box_splitting", mutates_args=())
+def box_splitting(
+    constant: Tensor, step: Tensor, double_step: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Steps of ``torchface.optim.operator_splitting`` from zero: the last v and the clipped z, (1,N).
+
+    Args:
+        constant: c, (1,N).
+        step: G, (N,N).
+        double_step: 2G + (2 - α) I, (N,N).
+        lower, upper: the box, (N,).
+        dual: the scaled dual to start from, (1,N).
+        steps: how many.
+    """
+    v, z = dual, torch.zeros_like(dual)
+    for _ in range(steps):  # each needs the one before
+        v = torch.addmm(torch.addmm(constant, v, step, alpha=-1.0), z, double_step)
+        z = torch.minimum(torch.maximum(v, lower), upper)
+    return v, z
+
+
+@box_splitting.register_fake
+def _(constant: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(constant), torch.empty_like(constant)
+
+
+def split_box_program(
+    H: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, identity: Tensor, rho: float, steps: int
+) -> tuple[Tensor, Tensor]:
+    r"""The least of :math:`\tfrac12 x^\top H x + g^\top x` in a box, (1,D), and the scaled dual there, (D,).
+
+    Args:
+        H: positive definite, (D,D).
+        gradient: g, (D,).
+        lower, upper: the box, (D,).
+        dual: the scaled dual to start from, (D,).
+        identity: (D,D).
+        rho: of the metric, a share of H's diagonal.
+        steps: of operator splitting.
+    """
+    diagonal = (H * identity).sum(0)
+    offset = -RELAXATION * symmetric_inverse(H + rho * diagonal * identity)
+    step = -rho * diagonal[:, None] * offset - identity
+    double_step = 2 * step + (2 - RELAXATION) * identity
+    v, z = box_splitting(gradient[None] @ offset, step, double_step, lower, upper, dual[None], steps)
+    return z, (v - z)[0]
