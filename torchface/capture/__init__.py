@@ -13,7 +13,7 @@ from torchface.capture.markers import (
 )
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.video import VideoSolver
-from torchface.capture.webcam import ExampleSolver
+from torchface.capture.webcam import ExampleSolver, WebcamControls, WebcamSolver
 
 __all__ = [
     "ActionUnitClassifier",
@@ -25,6 +25,8 @@ __all__ = [
     "MarkerSolver",
     "ShapePrior",
     "VideoSolver",
+    "WebcamControls",
+    "WebcamSolver",
     "WholeTakeSolver",
     "action_unit_curves",
     "align_take",

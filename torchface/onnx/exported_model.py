@@ -25,6 +25,7 @@ def exported_model(
     metadata: Mapping[str, object],
     sizes: Mapping[str, Sequence[str | None]] | None = None,
     translations: Mapping[Callable[..., object], Callable[..., object]] | None = None,
+    optimize: bool = True,
 ) -> onnx.ModelProto:
     """The checked model of a module.
 
@@ -36,6 +37,8 @@ def exported_model(
         sizes: names of the first axes of inputs, which may then have any size, None for one that keeps the example's;
             the example's is to be 2 or more.
         translations: of operators that PyTorch does not know from ONNX, functions of the operator's arguments.
+        optimize: with the exporter's own search for simpler operators, which takes minutes for thousands of them; ONNX
+            Runtime simplifies graphs as it loads them, too.
     """
     # Loaded here: it takes a second, and solvers that run graphs have no need of it.
     from onnxscript import ir
@@ -59,6 +62,7 @@ def exported_model(
                 opset_version=OPSET,
                 custom_translation_table=dict(translations or {}),
                 dynamo=True,
+                optimize=optimize,
                 verbose=False,
             )
     finally:

@@ -13,6 +13,9 @@ from torchface.capture.webcam.landmark_model import LandmarkModel
 from torchface.capture.webcam.landmark_objectives import Distances, SquaredDistances
 from torchface.capture.webcam.landmark_placement import LandmarkBoxes, SolvedSimilarity
 from torchface.capture.webcam.rig_examples import paper_examples, rig_examples
+from torchface.capture.webcam.webcam_settings import WebcamSettings
+from torchface.capture.webcam.webcam_solver import WebcamSolver
+from torchface.capture.webcam.webcam_state import WebcamControls, WebcamState
 
 __all__ = [
     "AllAtOnce",
@@ -26,6 +29,10 @@ __all__ = [
     "Regional",
     "SolvedSimilarity",
     "SquaredDistances",
+    "WebcamControls",
+    "WebcamSettings",
+    "WebcamSolver",
+    "WebcamState",
     "character_matrix",
     "head_angles",
     "paper_examples",

@@ -1,0 +1,538 @@
+"""A character's weights from one webcam, for anybody who sits before it: the head becomes the person's meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchface.capture.priors import ShapePrior
+from torchface.capture.priors.student_groups import StudentGroups
+from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.landmark_offsets import lid_pairs
+from torchface.capture.video.reprojection import HeadState, Linearised, linearise
+from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
+from torchface.capture.webcam.eye_signals import (
+    CORNERS,
+    LOOKS,
+    eye_signals,
+    look_weights,
+    openness_rows,
+    seen_gaze,
+)
+from torchface.capture.webcam.person_filter import frame_information, lasting_precision
+from torchface.capture.webcam.person_prior import PersonPrior
+from torchface.capture.webcam.webcam_settings import WebcamSettings
+from torchface.capture.webcam.webcam_state import StateLayout, WebcamControls, WebcamState
+from torchface.capture.webcam.weight_filter import one_euro_step
+from torchface.errors import NameMismatchError, ShapeError
+from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
+from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
+from torchface.geometry.rotations import rotation_matrix
+from torchface.landmarks.images.face_reading import FaceReading
+from torchface.optim.exported_operators import split_box_program, symmetric_inverse
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, mapping
+
+_RHO, _SPLITTING_STEPS = 0.05, 40
+_UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
+_ROTATION_UNIT, _TRANSLATION_UNIT = 0.5, 100.0  # radians and millimetres that count as a weight of 1 in the filter
+_LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
+_DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
+_FREE = 1e9
+_ENOUGH = 20.0  # landmarks
+_PRESENT = 0.5
+_NEAR = 0.5  # of the eyes' distance
+_SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
+_HOLD, _RELAX = 0.3, 0.5
+"""For how long a lost face is held, and how long it then takes to rest, seconds."""
+_SETTLED = 0.15  # seconds after which a found face's pose has come to rest
+_UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is known of, and for how long, seconds
+_EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person tell, and for how long, seconds
+_LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
+_LID_MOTION = 3.0
+_MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
+_CONTOUR_TRUST = 0.5
+_GROUPS = (("jawOpen",), ("mouthSmileLeft", "mouthSmileRight"), ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"))
+_LEAST_GAIN, _MOST_GAIN = 0.6, 1.8
+_REACTION, _GAIN_MEMORY, _ASKED = 0.8, 2.0, 0.25  # seconds, and the weight from which a pose counts as held
+_RANGE_TIME = 2.0  # seconds in which a range grows that is left
+
+
+class WebcamSolver(nn.Module):
+    r"""Weights by ARKit's names, pose and gaze from what networks read of a face, for people it has never seen.
+
+    Every frame it minimises ``VideoSolver``'s energy by a fixed number of Gauss and Newton's steps,
+
+    .. math::
+        \min_{0 \le w \le 1,\, R,\, t} \; \tfrac12 \sum_l \frac{c_l}{\sigma^2}
+        \lVert \pi(R (b_l + U_l z + B_l w) + t) - q_l \rVert^2 - \lambda \log p(w) + \beta \sum_i w_i
+        + \tfrac12 \sum_i \frac{(w_i - w^-_i)^2}{v_i} + \tfrac12 \sum_e \frac{(1 + c_e^\top w - o_e)^2}{\sigma_o^2}
+
+    on a head that becomes the person's own: z are D coefficients of how the person's landmarks lie beside the rig's,
+    identity and the finder's habits in one, :math:`z \sim N(0, I)`. They are learned beside it by an information filter
+    that leaves out what expressions and pose explain; after some seconds they are held. Openness o of the eyes counts
+    beside the person's own open and shut eyes, gaze beside where the person looks straight ahead. Weights are divided
+    by how far the person's landmarks go, which a guided calibration tells, and calmed.
+
+    The same module is what ``torchface.onnx.webcam`` exports: no step depends on values but by clamps and choices.
+
+    Args:
+        rig: N shapes with the 68 landmarks annotated; of any person, by ARKit's names.
+        identity_modes: what a standard deviation of each of K ways of being another person adds to the landmarks,
+            (K,68,3), millimetres; see ``HeadModel``.
+        prior: which weights faces have, one of Student's distributions.
+        settings: what terms weigh.
+
+    Raises:
+        ShapeError: the rig has no landmarks, or the modes are others.
+        NameMismatchError: the prior is for other shapes, or the rig has none of ARKit's.
+        ValueRangeError: the prior is none of Student's distributions.
+
+    Source: thesis 4.2.6; Li, Yu, Ye and Bregler 2013 and Bouaziz, Wang and Pauly 2013 for learning while solving.
+    """
+
+    rest: Tensor
+    basis: Tensor
+    rows: Tensor
+    valid: Tensor
+    side: Tensor
+    owner: Tensor
+
+    def __init__(
+        self,
+        rig: BlendshapeRig,
+        identity_modes: Tensor | None = None,
+        prior: ShapePrior | None = None,
+        settings: WebcamSettings | None = None,
+    ) -> None:
+        super().__init__()
+        self.settings = settings or WebcamSettings()
+        self.names: tuple[str, ...] = tuple(rig.names)
+        if rig.neutral.landmarks is None:
+            raise ShapeError("rig: found no landmarks, expected the 68 of iBUG's order; see torchface annotate")
+        if prior is not None:
+            prior.require(rig.names)
+        to_arkit = mapping(rig.names, ARKIT).double()
+        if not bool(to_arkit.any()):
+            raise NameMismatchError(
+                f"rig: found none of ARKit's shapes among {', '.join(rig.names[:5])}, expected some"
+            )
+        points = FacePoints.of(rig, rig.neutral.landmarks)
+        person = PersonPrior.of(identity_modes, self.settings.coefficients)
+        self.layout = StateLayout(len(rig.names), self.settings.coefficients)
+        self.strength = 1.0 if prior is None else prior.strength
+        groups = StudentGroups.of(prior, len(rig.names), points.rest)
+        rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], _arkit_names(rig.names))
+        for name, value in {
+            "rest": points.rest,
+            "basis": points.basis,
+            "rows": points.rows,
+            "valid": points.valid,
+            "side": points.side,
+            "owner": _owners(points),
+            "person_basis": person.basis,
+            "person_remainder": person.remainder,
+            "closing_basis": _closing(person.basis, rig.names)[0],
+            "closing_shapes": _closing(person.basis, rig.names)[1],
+            "precisions": groups.precisions,
+            "freedoms": groups.freedoms,
+            "sizes": groups.sizes,
+            "to_arkit": to_arkit,
+            "tells": _tells(points),
+            "open_rows": rows,
+            "usual_openness": usual,
+            "look_shapes": mapping(LOOKS, rig.names).double(),
+            "gain_shapes": torch.stack([mapping(group, rig.names).double().amax(1) for group in _GROUPS]),
+            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in _arkit_names(rig.names)]),
+            "landmark_weights": torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW)),
+            "identity": torch.eye(max(len(rig.names) + 6, self.settings.coefficients)),
+            "camera": torch.eye(3),
+            "look_eyes": torch.tensor(_LOOK_EYES),
+            "upright": torch.tensor(_UPRIGHT),
+            "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
+            "motion_unit": torch.tensor([_ROTATION_UNIT] * 3 + [_TRANSLATION_UNIT] * 3),
+        }.items():
+            self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=False)
+
+    def start(self) -> WebcamState:
+        """The state before the first frame, all zeros."""
+        return self.layout.start()
+
+    def step(
+        self,
+        state: WebcamState,
+        reading: FaceReading,
+        interval: float,
+        controls: WebcamControls | None = None,
+        size: tuple[int, int] = (640, 480),
+    ) -> WebcamState:
+        """The next frame's state; its ``weights``, ``rotation``, ``translation`` and ``gaze`` are the frame's.
+
+        Args:
+            state: of the frame before; ``start()`` for the first.
+            reading: of the frame; landmarks and irises of NaN where there is no face.
+            interval: seconds since the frame before.
+            controls: what the user asks for.
+            size: width and height of the picture, pixels; the camera is assumed from it.
+        """
+        tensors = [getattr(reading, one.name).detach().float() for one in fields(FaceReading)]
+        pixels = torch.tensor([float(n) for n in size])
+        with torch.inference_mode():
+            given = (
+                *tensors,
+                pixels,
+                torch.tensor(float(interval)),
+                (controls or WebcamControls()).tensor(),
+                state.pack(),
+            )
+            return self.layout.unpack(self(*given).clone())
+
+    def forward(
+        self,
+        landmarks: Tensor,
+        deviation: Tensor,
+        visibility: Tensor,
+        presence: Tensor,
+        iris: Tensor,
+        openness: Tensor,
+        closed: Tensor,
+        eye_visibility: Tensor,
+        size: Tensor,
+        interval: Tensor,
+        controls: Tensor,
+        state: Tensor,
+    ) -> Tensor:
+        """The next state's vector (S,), of a ``FaceReading``, ``step``'s other arguments and the state's vector."""
+        pose, gain, smoothing, reset, freeze = controls.double()
+        before = _double(self.layout.unpack(torch.where(reset > 0, 0.0, _known(state, 0.0))))
+        interval = _known(interval.double(), _SHORTEST).clamp(_SHORTEST, _LONGEST)
+        focal = size.double().max() / (2 * math.tan(math.radians(ASSUMED_FIELD_OF_VIEW) / 2))
+        centre = 0.5 * (size.double() - 1)
+        rays, iris_rays = (landmarks.double() - centre) / focal, (iris.double() - centre) / focal
+        seen = ~torch.isnan(rays).any(1)
+        present = _known(presence.double(), 0.0) * (seen.double().sum() >= _ENOUGH)
+        found = present > _PRESENT
+        trust = self.landmark_weights * seen * _known(visibility.double(), 1.0).clamp(0, 1)
+        # Without a face all counts alike and what comes of it is dropped, so that no number is a NaN.
+        trust = torch.where(found, trust, 1.0)
+        rays = torch.where(seen[:, None] & found, rays, self.rest[:LANDMARKS, :2] * self.upright)
+        spread = _known(deviation.double(), 0.0).clamp(0, 1e3) / focal
+        solved = self._solved(
+            rays, trust, spread, iris_rays, openness, closed, eye_visibility, before, interval, pose, freeze
+        )
+        lost = self._lost(before, interval)
+        after = _chosen(found, solved, lost)
+        return self._shown(after, before, found, present, interval, gain, smoothing).pack()
+
+    def _solved(
+        self,
+        rays: Tensor,
+        trust: Tensor,
+        spread: Tensor,
+        iris: Tensor,
+        openness: Tensor,
+        closed: Tensor,
+        eye_visibility: Tensor,
+        before: WebcamState,
+        interval: Tensor,
+        pose: Tensor,
+        freeze: Tensor,
+    ) -> WebcamState:
+        """The state of a frame with a face, its outputs not yet calmed."""
+        points = self.personal_points(before.person)
+        K = self.camera
+        start_rotation, start_translation = affine_pose(points.rest[:LANDMARKS], rays, trust)
+        kept = before.pose[:9].reshape(3, 3), before.pose[9:]
+        near = (before.shown + before.lost > 0) & self._near(points, kept, rays, trust)
+        rotation = torch.where(near, orthonormal(torch.where(near, kept[0], start_rotation)), start_rotation)
+        translation = torch.where(near, kept[1], start_translation)
+        shown = torch.where(near, before.shown, 0.0) + interval
+        eyes = points.eyes_distance(rotation[None], translation[None], K)[0]
+        depth = (
+            torch.stack([0.5 * (points.rest[a] + points.rest[b]) for a, b in CORNERS]) @ rotation[2] + translation[2]
+        )
+        learns = (freeze <= 0) * (before.learned < self.settings.learning)
+        gaze = seen_gaze(rays, iris, rotation, depth)
+        signals = eye_signals(
+            openness.double(),
+            closed.double(),
+            eye_visibility.double(),
+            gaze,
+            self.usual_openness,
+            self.open_rows @ self.look_shapes,
+            before,
+            interval,
+            pose,
+            (freeze <= 0).double(),
+        )
+
+        counts = torch.where(trust > 0, trust, 0.0)[None]
+        told = relative_trust(counts) @ self.tells
+        hidden = unseen_time(before.hidden[None], told, interval)
+        since = interval + before.lost
+        walked = walk_information((self.settings.motion * self.walk).square(), told, since)[0]
+        mean = before.shapes * faded(hidden, interval)[0]
+        unknown = torch.exp(-before.learned / _FADE)
+        unit = eyes / (points.rest[36] - points.rest[45]).norm()
+        noise = (
+            (self.settings.noise * eyes).square() + (0.5 * spread).square() + self.person_remainder * unit**2
+        ).sqrt()
+        precision = trust.sqrt() / noise
+        gains = self._gains_of(before.gains)
+        upper = self._upper(gains, pose)
+        looking, look_trust = (
+            self.look_shapes @ look_weights(signals.gaze),
+            self.look_shapes @ signals.gaze_trust[self.look_eyes],
+        )
+        head = HeadState(before.shapes.minimum(upper)[None], rotation[None], translation[None])
+        dual = torch.zeros_like(self.identity[0, : len(self.names) + 6])
+        identity = self.identity[: len(self.names) + 6, : len(self.names) + 6]
+        for _ in range(self.settings.steps):  # each begins where the one before ends
+            at = self._linearised(points, head, rays, precision)
+            J, r = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
+            weights = head.weights[0]
+            sure = signals.open_trust / self.settings.openness_noise**2
+            gap = 1 + self.open_rows @ weights - signals.open
+            pull = look_trust / self.settings.gaze_noise**2
+            H = walked.diag() + pull.diag() + (self.open_rows.T * sure) @ self.open_rows
+            prior = self._prior(weights)
+            H = H + prior
+            f = walked * (weights - mean) + pull * (weights - looking) + (sure * gap) @ self.open_rows
+            f = f + prior @ weights + self.settings.sparsity * (1 + _UNKNOWN * unknown)
+            damping = torch.cat([torch.zeros_like(weights), self.damping])
+            motion, dual = split_box_program(
+                J.T @ J + pad(H, (0, 6, 0, 6)) + damping.diag(),
+                r @ J + pad(f, (0, 6)),
+                pad(-weights, (0, 6), value=-_FREE),
+                pad(upper - weights, (0, 6), value=_FREE),
+                dual,
+                identity,
+                _RHO,
+                _SPLITTING_STEPS,
+            )
+            dual = pad(dual[: len(self.names)], (0, 6))
+            head = head.moved(head.weights + motion[:, : len(self.names)], motion[:, len(self.names) :])
+        weights = head.weights[0].clamp(min=0).minimum(upper)
+        head = HeadState(weights[None], head.rotation, head.translation)
+
+        at = self._linearised(points, head, rays, precision)
+        error = self._error(at, precision, eyes, trust)
+        good = learns * (shown > _SETTLED) * (error < _LOST_FIT)
+        person, information, evidence = self._learned_person(at, head, before, interval, pose, good)
+        gains_after, gains_seen = self._learned_gains(weights, before, interval, pose, (freeze <= 0).double())
+        learned = (before.learned + good * interval).clamp(max=self.settings.learning)
+        return replace(
+            before,
+            shapes=weights,
+            pose=torch.cat([head.rotation[0].flatten(), head.translation[0]]),
+            hidden=hidden[0],
+            shown=shown,
+            lost=torch.zeros_like(shown),
+            error=error,
+            gaze=signals.gaze,
+            person=person,
+            information=information,
+            evidence=evidence,
+            learned=learned,
+            calibrated=learned / self.settings.learning,
+            lids=signals.lids,
+            lids_seen=signals.lids_seen,
+            straight=signals.straight,
+            straight_seen=signals.straight_seen,
+            gains=gains_after,
+            gains_seen=gains_seen,
+        )
+
+    def personal_points(self, person: Tensor) -> FacePoints:
+        """The rig's points where this person's landmarks lie, of coefficients (D,); all lids shut alike."""
+        moved = self.person_basis @ person
+        closing = self.closing_basis @ person
+        basis = torch.cat(
+            [
+                self.basis[:LANDMARKS] - (closing[..., None] * self.closing_shapes[:, None, None]).sum(0),
+                self.basis[LANDMARKS:],
+            ]
+        )
+        return FacePoints(self.rest + moved[self.owner], basis, self.rows, self.valid, self.side)
+
+    def _linearised(self, points: FacePoints, head: HeadState, rays: Tensor, precision: Tensor) -> Linearised:
+        rows = points.chosen(head.weights, head.rotation, head.translation, self.camera)
+        slide = self.settings.contour_slide
+        return linearise(points, head, rows, self.camera, rays[None], precision[None], slide)
+
+    def _near(self, points: FacePoints, pose: tuple[Tensor, Tensor], rays: Tensor, trust: Tensor) -> Tensor:
+        """Whether landmarks are mostly within half the eyes' distance of where a pose shows the head at rest, ()."""
+        rotation, translation = pose
+        placed = points.rest[:LANDMARKS] @ rotation.T + translation
+        apart = (points.rest[36] - points.rest[45]).norm() / placed[:, 2].clamp(min=1.0)
+        off = (placed[:, :2] / placed[:, 2:].clamp(min=1.0) - rays).square().sum(1).sqrt()
+        return (trust * (off < _NEAR * apart)).sum() > 0.5 * trust.sum()
+
+    def _prior(self, weights: Tensor) -> Tensor:
+        """H (N,N) of the shape prior and the ridge."""
+        ridge = 2 * self.settings.ridge * self.identity[: len(self.names), : len(self.names)]
+        if not len(self.precisions):
+            return ridge
+        return ridge + self.strength * StudentGroups(self.precisions, self.freedoms, self.sizes).bound(weights)
+
+    def _error(self, at: Linearised, precision: Tensor, eyes: Tensor, trust: Tensor) -> Tensor:
+        """Root mean square distance of the inner landmarks to the head's, as a share of the eyes' distance, ()."""
+        inner = trust[JAW:]
+        squared = at.residual[0, JAW:].square().sum(1) / precision[JAW:].clamp(min=1e-9).square()
+        return ((inner * squared).sum() / inner.sum().clamp(min=1e-6)).sqrt() / eyes
+
+    def _learned_person(
+        self, at: Linearised, head: HeadState, before: WebcamState, interval: Tensor, pose: Tensor, good: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Coefficients, information and evidence with a frame's, where it is ``good``."""
+        weights = head.weights[0]
+        J, r = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
+        closed = self.closing_shapes @ weights
+        basis = self.person_basis - (closed[:, None, None, None] * self.closing_basis).sum(0)
+        by_person = (at.jacobian[0, ..., -3:] @ head.rotation[0] @ basis).flatten(0, 1)
+        resting = (pose - 1).abs() < 0.5
+        lasting = lasting_precision(weights, self.settings.rest_penalty, resting)
+        frame, gradient = frame_information(r, J, by_person, weights, lasting)
+        eager = 1 + _EAGER * torch.exp(-before.learned / _EAGER_FOR)
+        share = good * (interval / self.settings.alike * eager).clamp(max=1.0)
+        kept = torch.where(good > 0, torch.exp(-interval / self.settings.memory), 1.0)
+        information = kept * before.information + share * frame
+        evidence = kept * before.evidence + share * (frame @ before.person - gradient)
+        count = len(before.person)
+        solved = symmetric_inverse(information + self.identity[:count, :count]) @ evidence
+        return torch.where(good > 0, solved, before.person), information, evidence
+
+    def _gains_of(self, gains: Tensor) -> Tensor:
+        """Of each shape, (N,)."""
+        return torch.exp(gains @ self.gain_shapes)
+
+    def _upper(self, gains: Tensor, pose: Tensor) -> Tensor:
+        """How far weights may go before gains, (N,): a little beyond the person's known range, further if asked to."""
+        asked = self._asked(pose) @ self.gain_shapes
+        grows = self.gain_shapes.amax(0)
+        return torch.where(asked > 0, _MOST_GAIN, torch.where(grows > 0, 1.1 * gains.clamp(min=1.0), 1.0))
+
+    def _asked(self, pose: Tensor) -> Tensor:
+        """Which groups of shapes a pose asks for, (3,)."""
+        return ((pose - 2 - torch.arange(len(_GROUPS))).abs() < 0.5).to(pose)
+
+    def _learned_gains(
+        self, weights: Tensor, before: WebcamState, interval: Tensor, pose: Tensor, learns: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Logarithms of gains, and for how long each has been asked for, (3,)."""
+        reached = (self.gain_shapes @ weights) / self.gain_shapes.sum(1)
+        asked = learns * self._asked(pose)
+        seen = before.gains_seen + asked * interval
+        held = asked * (seen > _REACTION) * (reached > _ASKED)
+        since = (seen - _REACTION).clamp(min=0, max=_GAIN_MEMORY)
+        aim = reached.clamp(_LEAST_GAIN, _MOST_GAIN).log()
+        rate = held * (interval / (since + interval)) * torch.where(aim < before.gains, 0.5, 1.0)
+        gains = before.gains + rate * (aim - before.gains)
+        # Without being asked a range grows where it is left, and never shrinks.
+        beyond = learns * (1 - asked) * (aim - gains).clamp(min=0) * (aim > 0)
+        return gains + beyond * interval / _RANGE_TIME, seen
+
+    def _lost(self, before: WebcamState, interval: Tensor) -> WebcamState:
+        """The state of a frame without a face: as it was, then on its way to rest."""
+        lost = before.lost + interval
+        left = (_HOLD + _RELAX - before.lost).clamp(max=_RELAX)
+        left_now = (_HOLD + _RELAX - lost).clamp(min=0, max=_RELAX)
+        share = torch.where(left > 0, left_now / left.clamp(min=1e-6), 0.0)
+        return replace(
+            before,
+            weights=before.weights * share,
+            shapes=before.shapes * share,
+            gaze=before.gaze * share,
+            speeds=torch.zeros_like(before.speeds),
+            shown=torch.zeros_like(before.shown),
+            tracked=torch.zeros_like(before.tracked),
+            lost=torch.where((before.pose.abs().sum() > 0), lost, 0.0),
+        )
+
+    def _shown(
+        self,
+        after: WebcamState,
+        before: WebcamState,
+        found: Tensor,
+        present: Tensor,
+        interval: Tensor,
+        gain: Tensor,
+        smoothing: Tensor,
+    ) -> WebcamState:
+        """The state with its outputs: weights by ARKit's names with gains, calmed."""
+        gains = self._gains_of(after.gains)
+        weights = (gain * (self.to_arkit @ (after.shapes / gains))).clamp(0, 1)
+        pose = after.pose
+        first = (before.pose.abs().sum() < 1e-9) | (after.shown < 1.5 * interval)
+        turned = pose[:9].reshape(3, 3)
+        # The sine of the turn for the turn: between two frames it is small.
+        apart = 0.5 * (turned @ before.rotation.T - before.rotation @ turned.T)
+        turn = torch.stack([apart[2, 1], apart[0, 2], apart[1, 0]])
+        motion = torch.cat([turn, pose[9:] - before.translation])
+        speeds = torch.where(first, 0.0, before.speeds)
+        old = torch.cat([before.weights, torch.zeros_like(motion)])
+        unit = torch.cat([torch.ones_like(weights), self.motion_unit])
+        calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
+        rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
+        translation = torch.where(first, pose[9:], before.translation + calm[-3:])
+        fit = ((_LOST_FIT - after.error) / (_LOST_FIT - _MISFIT)).clamp(0, 1)
+        return replace(
+            after,
+            weights=torch.where(found, calm[:-6].clamp(0, 1), after.weights),
+            rotation=torch.where(found, rotation, before.rotation),
+            translation=torch.where(found, translation, before.translation),
+            speeds=torch.where(found, speeds, after.speeds),
+            tracked=torch.where(found, present * fit, 0.0),
+        )
+
+
+def _known(values: Tensor, otherwise: float) -> Tensor:
+    return torch.where(torch.isnan(values), otherwise, values)
+
+
+def _double(state: WebcamState) -> WebcamState:
+    return WebcamState(*(getattr(state, one.name).double() for one in fields(state)))
+
+
+def _chosen(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
+    names = [part.name for part in fields(WebcamState)]
+    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in names))
+
+
+def _arkit_names(names: Sequence[str]) -> list[str]:
+    """What ARKit calls each shape; its own name where ARKit knows none."""
+    called = mapping(names, ARKIT)
+    return [
+        ARKIT[int(column.argmax())] if bool(column.any()) else name
+        for name, column in zip(names, called.T, strict=True)
+    ]
+
+
+def _owners(points: FacePoints) -> Tensor:
+    """The landmark whose displacement each point takes, (P,): those of a contour landmark's curve take its."""
+    owner = torch.arange(len(points.rest))
+    for landmark, (row, valid) in enumerate(zip(points.rows, points.valid, strict=True)):  # curves have own lengths
+        owner[row[valid]] = landmark
+    return owner
+
+
+def _closing(basis: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """What displacements (68,3,D) take of the lids' way as an eye shuts, (2,68,3,D); the shapes that shut, (2,N)."""
+    made, shapes = torch.zeros(2, *basis.shape, dtype=basis.dtype), torch.zeros(2, len(names), dtype=basis.dtype)
+    for upper, lower, closing in lid_pairs(names):
+        eye = 0 if upper < 42 else 1
+        apart = 0.5 * (basis[upper] - basis[lower])
+        made[eye, upper], made[eye, lower], shapes[eye] = apart, -apart, closing.double()
+    return made, shapes
+
+
+def _tells(points: FacePoints) -> Tensor:
+    """How much of what could tell of each shape each landmark is, (68,N)."""
+    moved = points.basis[:LANDMARKS].square().sum(1)
+    moved[:JAW] *= _CONTOUR_TRUST
+    return moved / moved.sum(0).clamp(min=1e-6)

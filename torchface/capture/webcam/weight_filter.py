@@ -1,0 +1,37 @@
+"""Calms a webcam's weights and pose frame by frame, at whatever rate frames come."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+_CUTOFF, _SPEED_CUTOFF = 1.5, 3.0  # Hz, at the usual smoothing
+_OPENING = 12.0  # Hz that the cutoff gains for a unit a second
+_OCTAVES = 4.0  # between no smoothing to speak of and the most, of the cutoff
+
+
+def one_euro_step(
+    values: Tensor, before: Tensor, speed: Tensor, interval: Tensor, smoothing: Tensor, unit: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The next filtered values (C,) and their speeds, as of ``torchface.temporal.OneEuroFilter``, by seconds.
+
+    Args:
+        values: of this frame, (C,).
+        before, speed: filtered, of the frame before, (C,), and a second.
+        interval: seconds since then, ().
+        smoothing: () in [0,1]: 0 leaves the values as they are.
+        unit: what counts as much as a weight of 1, (C,).
+    """
+    step = values - before
+    speed = speed + (step / interval - speed) * _gain(_SPEED_CUTOFF * torch.ones_like(interval), interval)
+    calm = torch.exp2(_OCTAVES * (0.5 - smoothing))
+    cutoff = calm * (_CUTOFF + _OPENING * speed.abs() / unit)
+    gain = torch.where(smoothing > 0, _gain(cutoff, interval), 1.0)
+    return before + gain * step, speed
+
+
+def _gain(cutoff: Tensor, interval: Tensor) -> Tensor:
+    """What of a step is taken."""
+    return 1 / (1 + 1 / (2 * math.pi * cutoff * interval))

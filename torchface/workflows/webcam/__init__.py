@@ -1,0 +1,1 @@
+"""A character driven by whoever sits before a webcam."""

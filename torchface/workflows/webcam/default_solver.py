@@ -1,0 +1,26 @@
+"""The webcam's solver as commands use it: on the embedded performer's mean head, for anybody."""
+
+from __future__ import annotations
+
+from torchface import zoo
+from torchface.capture.webcam import WebcamSettings, WebcamSolver
+from torchface.errors import NameMismatchError
+from torchface.modeling import HeadModel
+from torchface.synthetic.head.performer import performer
+from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
+
+_HEADS = "head"
+
+
+def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolver:
+    """The solver of the embedded performer's mean head, with the zoo's model of heads and prior of weights.
+
+    Raises:
+        NameMismatchError: the zoo's model of heads is another kind of model.
+    """
+    rig = performer(texture=False)
+    heads = zoo.get_model(_HEADS)
+    if not isinstance(heads, HeadModel) or heads.landmarks is None:
+        raise NameMismatchError(f"{_HEADS}: found a {type(heads).__name__}, expected a HeadModel with landmarks")
+    modes = heads.shape.modes[:, heads.landmarks]
+    return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings)
