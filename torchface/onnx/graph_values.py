@@ -116,19 +116,19 @@ class Value:
     def __init__(self, graph: ValueGraph, name: str) -> None:
         self.graph, self.name = graph, name
 
-    def __add__(self, other: Value | float) -> Value:
+    def __add__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Add", self, other)
 
-    def __sub__(self, other: Value | float) -> Value:
+    def __sub__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Sub", self, other)
 
     def __rsub__(self, other: float) -> Value:
         return self.graph.op("Sub", other, self)
 
-    def __mul__(self, other: Value | float) -> Value:
+    def __mul__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Mul", self, other)
 
-    def __truediv__(self, other: Value | float) -> Value:
+    def __truediv__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Div", self, other)
 
     def __rtruediv__(self, other: float) -> Value:
@@ -137,16 +137,16 @@ class Value:
     def __neg__(self) -> Value:
         return self.graph.op("Neg", self)
 
-    def __lt__(self, other: Value | float) -> Value:
+    def __lt__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Less", self, other)
 
-    def __gt__(self, other: Value | float) -> Value:
+    def __gt__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("Greater", self, other)
 
-    def __le__(self, other: Value | float) -> Value:
+    def __le__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("LessOrEqual", self, other)
 
-    def __ge__(self, other: Value | float) -> Value:
+    def __ge__(self, other: Value | Tensor | float) -> Value:
         return self.graph.op("GreaterOrEqual", self, other)
 
     def __and__(self, other: Value) -> Value:
@@ -160,7 +160,7 @@ class Value:
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def equals(self, other: Value | float) -> Value:
+    def equals(self, other: Value | Tensor | float) -> Value:
         """Where the two are the same."""
         return self.graph.op("Equal", self, other)
 
@@ -172,11 +172,11 @@ class Value:
         """The same numbers in another form; -1 is what remains."""
         return self.graph.op("Reshape", self, list(sizes))
 
-    def least(self, other: Value | float) -> Value:
+    def least(self, other: Value | Tensor | float) -> Value:
         """The smaller of the two."""
         return self.graph.op("Min", self, other)
 
-    def most(self, other: Value | float) -> Value:
+    def most(self, other: Value | Tensor | float) -> Value:
         """The larger of the two."""
         return self.graph.op("Max", self, other)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import torch
 from onnx import TensorProto
+from torch import Tensor
 
 from torchface.onnx.graph_values import Value, ValueGraph
 from torchface.onnx.webcam.face_place import middle, side, turned
 
 _MULTIPLE = 32  # what a network's coarsest level asks for
-_AROUND = 2.0  # pixels that interpolation needs beyond the border
+AROUND = 2.0
+"""Pixels that interpolation needs beyond points."""
 
 
 def picture_size(image: Value) -> Value:
@@ -19,14 +21,50 @@ def picture_size(image: Value) -> Value:
     return graph.cat(width, height).number()
 
 
-def cut_square(image: Value, place: Value, size: int, margin: float) -> Value:
-    """The square of a picture round a face, upright, as a network takes it: :func:`~.face_crop.cut_crop` in a graph.
+def sampled(image: Value, points: Value, spacing: Value, beyond: Value) -> Value:
+    """A picture's colours at points between its pixels; beyond the border the border's pixels go on.
 
-    Beyond the border the border's pixels go on. Where the square is larger than its copy whole pixels are averaged
-    first, so that none are skipped.
+    Where the points are further apart than pixels, whole pixels are averaged first, so that none are skipped.
 
     Args:
         image: uint8 (H,W,C), red first; a fourth channel counts for nothing.
+        points: (P,2), pixels, finite.
+        spacing: from one point to the next, (1,) pixels.
+        beyond: how far what is averaged goes on beyond the points, (1,) pixels.
+
+    Returns:
+        (3,P) in [0,1].
+    """
+    graph = image.graph
+    last = picture_size(image) - 1.0
+    low = (points.reduced("ReduceMin", 0) - beyond).most(0.0).least(last)
+    low, high = graph.op("Floor", low), graph.op("Ceil", points.reduced("ReduceMax", 0) + beyond).most(0.0).least(last)
+    extent = high - low + 1.0
+    step = graph.op("Round", spacing).most(1.0).least(extent.reduced("ReduceMin", 0, keep=True))
+    count = graph.op("Floor", extent / step)
+    extent = count * step
+    first, end = low.whole(), (low + extent).whole()
+    # Rows first.
+    starts = graph.cat(graph.op("Gather", first, [1, 0]), [0])
+    ends = graph.cat(graph.op("Gather", end, [1, 0]), [3])
+    piece = graph.op("Slice", image, starts, ends, [0, 1, 2])
+    planes = graph.op("Transpose", piece, perm=[2, 0, 1]).number()
+    by, columns = step.whole(), extent.rows(0, 1).whole()
+    rows = graph.op("Reshape", planes, graph.cat([-1], by, columns)).reduced("ReduceMean", 1)
+    pooled = graph.op("Reshape", rows, graph.cat([-1], by)).reduced("ReduceMean", 1)
+    planes = graph.op("Reshape", pooled, graph.cat([1, 3], graph.op("Gather", count.whole(), [1, 0])))
+    places = ((points - low + 0.5) * 2.0 / extent - 1.0).shaped(1, 1, -1, 2)
+    colours = graph.op("GridSample", planes, places, mode="bilinear", padding_mode="border", align_corners=0)
+    return colours.shaped(3, -1) / 255.0
+
+
+def cut_square(image: Value, place: Value, size: int, margin: float) -> Value:
+    """The square of a picture round a face, upright, as a network takes it.
+
+    It shows what :func:`~torchface.landmarks.images.face_crop.cut_crop` does.
+
+    Args:
+        image: uint8 (H,W,C), red first.
         place: of the face (5,), see ``face_place``.
         size: pixels a side of the copy, S.
         margin: side of the square, of the place's.
@@ -34,37 +72,17 @@ def cut_square(image: Value, place: Value, size: int, margin: float) -> Value:
     Returns:
         (1,3,S,S) in [0,1].
     """
-    graph = image.graph
-    wide = side(place) * margin
-    offsets = torch.arange(size).float() - (size - 1) / 2
-    grid = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), -1).reshape(-1, 2) / size
-    points = turned(graph.as_value(grid) * wide, place) + middle(place)
-    turn = graph.op("Abs", place.rows(3, 5)).reduced("ReduceSum", 0, keep=True)
-    reach = wide * turn * 0.5 + _AROUND
-    last = picture_size(image) - 1.0
-    low = graph.op("Floor", middle(place) - reach).most(0.0).least(last)
-    high = graph.op("Ceil", middle(place) + reach).least(last) + 1.0
-    extent = (high - low).most(1.0)
-    step = graph.op("Round", wide / float(size)).most(1.0).least(extent.reduced("ReduceMin", 0, keep=True))
-    count = graph.op("Floor", extent / step)
-    extent = count * step
-    first, end = low.whole(), (low + extent).whole()
-    # Rows first.
-    swapped = [1, 0]
-    starts = graph.cat(graph.op("Gather", first, swapped), [0])
-    ends = graph.cat(graph.op("Gather", end, swapped), [3])
-    piece = graph.op("Slice", image, starts, ends, [0, 1, 2])
-    planes = graph.op("Transpose", piece, perm=[2, 0, 1]).number()
-    by, columns = step.whole(), extent.rows(0, 1).whole()
-    rows = planes.graph.op("Reshape", planes, graph.cat([-1], by, columns)).reduced("ReduceMean", 1)
-    pooled = graph.op("Reshape", rows, graph.cat([-1], by)).reduced("ReduceMean", 1)
-    shape = graph.cat([1, 3], graph.op("Gather", count.whole(), swapped))
-    planes = graph.op("Reshape", pooled, shape)
-    places = (points - low + 0.5) * 2.0 / extent - 1.0
-    square = graph.op(
-        "GridSample", planes, places.shaped(1, size, size, 2), mode="bilinear", padding_mode="border", align_corners=0
-    )
-    return square / 255.0
+    grid = image.graph.as_value(crop_grid(size, size))
+    spacing = side(place) * (margin / size)
+    points = turned(grid * spacing, place) + middle(place)
+    turn = image.graph.op("Abs", place.rows(3, 5)).reduced("ReduceSum", 0, keep=True)
+    return sampled(image, points, spacing, spacing * turn * 0.5 + AROUND).shaped(1, 3, size, size)
+
+
+def crop_grid(width: int, height: int) -> Tensor:
+    """Pixels of a crop beside its middle, (height * width,2)."""
+    across, down = (torch.arange(count).float() - (count - 1) / 2 for count in (width, height))
+    return torch.stack(torch.meshgrid(across, down, indexing="xy"), -1).reshape(-1, 2)
 
 
 def from_square(points: Value, place: Value, size: int, margin: float) -> Value:
