@@ -16,6 +16,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.capture.video.video_solver import VideoSolver
+from torchface.capture.webcam.example_solver import ExampleSolver
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_names, model_roots
 from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model
@@ -33,6 +34,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,
     "appearance": AppearanceModel,
     "dynamics_prior": DynamicsPrior,
+    "example_solver": ExampleSolver,
     "expression_regression": ExpressionRegression,
     "eye_network": EyeNetwork,
     "face_boxes": BoxNetwork,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rich.table import Table
 
@@ -162,10 +162,46 @@ def video_solver(
     print_path(out)
 
 
+def examples(
+    examples: Path,
+    out: Path,
+    solver: Literal["all-at-once", "regional", "model"] = "all-at-once",
+    quiet: Quiet = False,
+) -> None:
+    """Write the solve of a face's 68 landmarks for the weights of examples as an ONNX file, and check it.
+
+    Inputs of the graph: `landmarks` (B,68,2), pixels, NaN where not seen, and `previous` (B,N), what the frame before
+    gave as `carried`, zeros to start. Outputs: `weights` (B,N) in [0,1] and `carried`. Squared distances are minimised.
+    The names of the shapes are in the file's metadata. ONNX Runtime is compared with the exact solve.
+
+    Args:
+        examples: What `torchface examples` wrote.
+        out: The .onnx file to write.
+        solver: All shapes at once, the head first and then regions, or projected on a linear model of landmarks.
+        quiet: Show no progress.
+    """
+    from torchface.capture.webcam import AllAtOnce, ExampleShapes, ExampleSolver, LandmarkModel, Regional
+    from torchface.onnx import export_example_solver
+
+    with progress_bars(quiet) as progress:
+        progress("reading the examples")
+        shapes = ExampleShapes.load(examples)
+        methods = {"all-at-once": AllAtOnce, "regional": Regional, "model": lambda: LandmarkModel.fit(shapes)}
+        made = ExampleSolver(shapes, methods[solver]())
+        progress("exporting and checking")
+        report = export_example_solver(made, out)
+    table = Table(show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    console.print(table)
+    print_path(out)
+
+
 EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
     "video-solver": video_solver,
+    "examples": examples,
     "app": export_app,
 }

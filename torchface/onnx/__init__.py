@@ -3,6 +3,7 @@
 from torchface.onnx.action_unit_graph import ActionUnitReport, export_action_units
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
+from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.model_export import export_model
 from torchface.onnx.solver_graph import SolverGraph
@@ -12,6 +13,7 @@ from torchface.onnx.video_graph_export import VideoReport, export_video_solver
 
 __all__ = [
     "ActionUnitReport",
+    "ExampleReport",
     "ExportReport",
     "HybridGraph",
     "SolverGraph",
@@ -20,6 +22,7 @@ __all__ = [
     "VideoReport",
     "export_action_units",
     "export_dynamics_prior",
+    "export_example_solver",
     "export_hybrid_solver",
     "export_model",
     "export_solver",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import nn
 
-from torchface.capture import MarkerSolver
+from torchface.capture import ExampleSolver, MarkerSolver
 from torchface.capture.priors import DynamicsPrior
 from torchface.capture.video import VideoSolver
 from torchface.errors import ValueRangeError
@@ -16,6 +16,7 @@ from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
+from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
 from torchface.onnx.expression_graph import export_expression_regression
 from torchface.onnx.eye_network_graph import export_eye_network
 from torchface.onnx.face_box_graph import export_box_network
@@ -29,12 +30,13 @@ from torchface.onnx.video_graph_export import VideoReport, write_video_solver
 
 def export_model(
     model: nn.Module, path: str | Path, facts: Mapping[str, object] | None = None
-) -> ExportReport | SolverReport | VideoReport:
+) -> ExportReport | SolverReport | VideoReport | ExampleReport:
     """Writes a model as ONNX, and checks it against PyTorch.
 
     Args:
         model: a ``HeadModel``, ``ExpressionRegression``, ``UVLandmarkDetector``, ``LandmarkNetwork``,
-            ``EyeNetwork``, ``BoxNetwork``, ``LandmarkTrees``, ``DynamicsPrior``, ``MarkerSolver`` or ``VideoSolver``.
+            ``EyeNetwork``, ``BoxNetwork``, ``LandmarkTrees``, ``DynamicsPrior``, ``MarkerSolver``, ``VideoSolver``
+            or ``ExampleSolver``.
         path: the file to write; it appears only when it is complete and checked.
         facts: further metadata, such as licence and data.
 
@@ -61,7 +63,9 @@ def export_model(
         return export_marker_solver(model, path, facts=facts)
     if isinstance(model, VideoSolver):
         return write_video_solver(model, path, facts)
+    if isinstance(model, ExampleSolver):
+        return export_example_solver(model, path, facts=facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver or VideoSolver"
+        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver, VideoSolver or ExampleSolver"
     )

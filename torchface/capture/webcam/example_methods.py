@@ -57,8 +57,7 @@ class Regional:
         basis = equations.basis
         of_head = torch.tensor([region == HEAD for region in regions], device=basis.device)
         head, others = of_head.nonzero()[:, 0], (~of_head).nonzero()[:, 0]
-        rows = torch.zeros(len(basis), dtype=torch.bool, device=basis.device)
-        rows[list(HEAD_LANDMARKS)] = True
+        rows = head_rows(basis)
         # Where a hand hides nose and eyes the whole face must do.
         shown = (equations.seen & rows).sum(1, keepdim=True) >= len(HEAD_LANDMARKS) // 2
         first = equations.with_basis(basis[..., head]).among(torch.where(shown, rows, True))
@@ -66,13 +65,20 @@ class Regional:
             placed = self.objective.minimise(first, None if initial is None else initial[:, head])
         else:  # the placement alone
             placed = first.least_squares(first.share).unknowns(first.offset.new_zeros(len(first.offset), 0))
-        rest = equations.moved(basis[..., head], placed).with_basis(_regional(basis, regions)[..., others])
+        rest = equations.moved(basis[..., head], placed).with_basis(regional_basis(basis, regions)[..., others])
         expression = self.objective.minimise(rest, None if initial is None else initial[:, others])
         order = torch.cat([head, others]).argsort()
         return Unknowns(torch.cat([placed.weights, expression.weights], dim=1)[:, order], placed.free)
 
 
-def _regional(basis: Tensor, regions: tuple[str, ...]) -> Tensor:
+def head_rows(like: Tensor) -> Tensor:
+    """The landmarks that say how the head is turned, (68,) bool, on the device of ``like``."""
+    rows = torch.zeros(68, dtype=torch.bool, device=like.device)
+    rows[list(HEAD_LANDMARKS)] = True
+    return rows
+
+
+def regional_basis(basis: Tensor, regions: tuple[str, ...]) -> Tensor:
     """The basis (68,2,N) with each shape of a region moving that region's landmarks alone."""
     kept = torch.zeros(len(basis), len(regions), dtype=torch.bool, device=basis.device)
     for column, region in enumerate(regions):

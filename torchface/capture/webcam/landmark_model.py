@@ -82,7 +82,7 @@ class LandmarkModel(nn.Module):
     def fit(
         examples: ExampleShapes,
         shapes: Tensor | None = None,
-        variance: float = 0.999,
+        variance: float = 0.9999,
         noise: float = 0.002,
         sparsity: float = 2e-5,
         ridge: float = 1e-7,
@@ -92,7 +92,7 @@ class LandmarkModel(nn.Module):
         Args:
             examples: the neutral and N shapes; all of them are learned from where ``shapes`` is absent.
             shapes: landmarks to learn from instead, placed as the examples are, (S,68,2).
-            variance: the share of it that the components keep, in (0,1]; the paper's is 0.999.
+            variance: the share of it that the components keep, in (0,1]; that of the paper's code if absent.
             noise, sparsity, ridge: of the model.
 
         Raises:
