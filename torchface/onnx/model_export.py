@@ -67,5 +67,6 @@ def export_model(
         return export_example_solver(model, path, facts=facts)
     raise ValueRangeError(
         f"{path}: found a {type(model).__name__}, expected a HeadModel, ExpressionRegression, UVLandmarkDetector, "
-        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver, VideoSolver or ExampleSolver"
+        "LandmarkNetwork, EyeNetwork, BoxNetwork, LandmarkTrees, DynamicsPrior, MarkerSolver, VideoSolver or "
+        "ExampleSolver"
     )
