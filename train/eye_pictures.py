@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder, write_file
+from torchface.landmarks.images.eyes.eye_augmentation import EyeLabels
 from torchface.progress import Progress, silent
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
 from train.face_pictures import head_kinds
@@ -48,6 +49,11 @@ class EyePictures:
 
     def __len__(self) -> int:
         return len(self.rgba)
+
+    @property
+    def labels(self) -> EyeLabels:
+        """What is known of them."""
+        return EyeLabels(self.landmarks, self.visible, self.iris, self.openness, self.bare)
 
     def rows(self, rows: slice | Tensor) -> EyePictures:
         """Some of them."""

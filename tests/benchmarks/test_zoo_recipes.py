@@ -15,6 +15,7 @@ from torchface import zoo
 REPOSITORY = Path(__file__).resolve().parents[2]
 LARGEST = 2_000_000
 HOURS = {
+    "eye_network": "it learns for an hour, from ICT-FaceKit's heads",
     "face_boxes": "it learns from ICT-FaceKit's heads, in two parts of which the command makes one",
     "landmark_network": "it learns for hours, from ICT-FaceKit's heads, and its pictures changed while it did",
 }

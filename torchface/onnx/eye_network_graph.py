@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from torchface import __version__
-from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, POINTS, STRIDE, EyeNetwork
+from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, LEAST_SPREAD, POINTS, STRIDE, EyeNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.network_nodes import convolution, doubled, folded, layers
@@ -82,7 +82,10 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
     def constant(name: str, value: torch.Tensor | float | tuple[int, ...]) -> str:
         return build.constant(f"eye_{name}", value)
 
-    half = layers(build, net.stem, op("Sub", op("Mul", eyes, constant("two", 2.0)), constant("one", 1.0)))
+    centred = op("Sub", eyes, op("ReduceMean", eyes, axes=[1, 2, 3]))
+    power = op("ReduceMean", op("Mul", centred, centred), axes=[1, 2, 3])
+    spread = op("Sqrt", op("Add", power, constant("least", LEAST_SPREAD**2)))
+    half = layers(build, net.stem, op("Div", centred, spread))
     quarter = layers(build, net.quarter, half)
     deep = layers(build, net.eighth, quarter)
     pooled = op("GlobalAveragePool", deep)

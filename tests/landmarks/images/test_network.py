@@ -12,7 +12,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
-from torchface.landmarks.images import network_training
+from torchface.landmarks.images import network_descent
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.finders.crop_finder import BothSides
 from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
@@ -66,7 +66,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     pictures: tuple[torch.Tensor, ...], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = NetworkSettings(steps=6, batch=8, workers=0)
-    monkeypatch.setattr(network_training, "_CHECK", 3)
+    monkeypatch.setattr(network_descent, "_CHECK", 3)
 
     def trained(stop_at: int | None) -> dict[str, torch.Tensor]:
         def stop(_: str, done: int = 0, total: int = 0) -> None:

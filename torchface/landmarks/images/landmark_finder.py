@@ -56,6 +56,11 @@ def confidence_of(deviation: Tensor) -> Tensor:
     return 1 / (1 + (deviation / HALF_CONFIDENCE).square())
 
 
+def deviation_of(confidence: Tensor) -> Tensor:
+    """Deviations in sides of the face's box of confidences in [0,1]: the inverse of :func:`confidence_of`."""
+    return HALF_CONFIDENCE * (1 / confidence.clamp(min=1e-6) - 1).clamp(min=0).sqrt()
+
+
 def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
     """How much each landmark counts, (...,68) in [0,1]: its confidence, if it is seen and so is what it belongs to.
 

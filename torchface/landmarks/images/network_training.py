@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset, get_worker_info
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.network_descent import descend
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, Crops, augmented
 from torchface.progress import Progress, silent
 
 _METHOD = "landmark network/1"
-_CHECK = 200  # steps from checkpoint to checkpoint
 # Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
 _PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
                        [19, 37], [24, 44]])  # fmt: skip
@@ -137,41 +134,16 @@ def fit_network(
     if network is None:
         torch.manual_seed(settings.seed)
         network = LandmarkNetwork()
-    network = network.to(device).to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
-    mean = {name: value.detach().clone() for name, value in network.state_dict().items()}
-    optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
+    chosen = network
+
+    def drawn(first: int) -> _Batches:
+        return _Batches(rgba, landmarks, visible, chosen.size, chosen.margin, first, settings)
+
+    def loss(crops: Crops, share: float) -> tuple[Tensor, float]:
+        return _loss(chosen, crops, settings, share, device)
+
     key = content_key(_METHOD, settings=settings, config=network.config)
-    first = _resume(checkpoint, key, network, mean, optimiser)
-    batches = _Batches(rgba, landmarks, visible, network.size, network.margin, first, settings)
-    loader = DataLoader(
-        batches, batch_size=None, num_workers=settings.workers, prefetch_factor=4 if settings.workers else None
-    )
-    begin, shown = time.monotonic(), 0.0
-    for step, crops in enumerate(loader, first):
-        for group in optimiser.param_groups:
-            group["lr"] = settings.rate * _schedule(step / settings.steps)
-        loss, error = _loss(network, crops, settings, step / settings.steps, device)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-        optimiser.step()
-        keep = min(settings.average, (1 + step) / (10 + step))
-        with torch.no_grad():
-            for name, value in network.state_dict().items():
-                if value.is_floating_point():
-                    mean[name].lerp_(value, 1 - keep)
-                else:
-                    mean[name].copy_(value)
-        shown = error if not shown else 0.98 * shown + 0.02 * error
-        progress(f"training the network, {shown:.2f} pixels off", step + 1, settings.steps)
-        if checkpoint is not None and (step + 1) % _CHECK == 0:
-            _keep(checkpoint, key, step + 1, network, mean, optimiser, time.monotonic() - begin)
-    network.load_state_dict(mean)
-    return network.to("cpu").to(memory_format=torch.contiguous_format).eval()  # type: ignore[call-overload]
-
-
-def _schedule(share: float) -> float:
-    return min(share / 0.05, 1.0) * 0.5 * (1 + math.cos(math.pi * share))
+    return descend(network, drawn, loss, settings, key, "training the network", progress, checkpoint, device)
 
 
 def _loss(
@@ -210,40 +182,3 @@ def _heat_form(network: LandmarkNetwork, heat: Tensor, truth: Tensor) -> Tensor:
     squared = (network.places(heat) / cell - (truth / cell)[:, :, None]).square().sum(-1)
     wanted = torch.softmax(-squared / (2 * _HEAT**2), dim=-1)
     return -(wanted * heat.flatten(2).log_softmax(-1)).sum(-1)
-
-
-def _keep(
-    path: Path,
-    key: str,
-    step: int,
-    network: LandmarkNetwork,
-    mean: dict[str, Tensor],
-    optimiser: torch.optim.Optimizer,
-    seconds: float,
-) -> None:
-    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
-    tensors |= {f"mean.{name}": value for name, value in mean.items()}
-    for number, state in optimiser.state_dict()["state"].items():
-        tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    tensors["step"] = torch.tensor(step)
-    tensors["seconds"] = torch.tensor(seconds)
-    write_checkpoint(path, tensors, key)
-
-
-def _resume(
-    path: Path | None, key: str, network: LandmarkNetwork, mean: dict[str, Tensor], optimiser: torch.optim.Optimizer
-) -> int:
-    """Takes up a checkpoint, if there is one of the same settings; the step to go on with."""
-    found = None if path is None else read_checkpoint(path, key)
-    if found is None:
-        return 0
-    network.load_state_dict({name: found[f"network.{name}"] for name in network.state_dict()})
-    for name, value in mean.items():
-        value.copy_(found[f"mean.{name}"])
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in found.items():
-        if name.startswith("optimiser."):
-            _, number, field_name = name.split(".")
-            state.setdefault(int(number), {})[field_name] = value
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    return int(found["step"])

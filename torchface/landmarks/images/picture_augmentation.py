@@ -232,9 +232,15 @@ def _hair(picture: np.ndarray, uniform: Uniform) -> None:
         cv2.polylines(picture, [(8 * curve).round().astype(np.int32)], False, tone, 1, cv2.LINE_AA, 3)
 
 
-def _photographed(images: Tensor, settings: AugmentationSettings, generator: torch.Generator) -> Tensor:
-    """What lamps, lenses, sensors and codecs make of crops (B,3,S,S)."""
-    count, _, size, _ = images.shape
+def with_light(images: Tensor, generator: torch.Generator, grey_share: float = 0.15) -> Tensor:
+    """Images (B,3,H,W) brighter, darker, of more or less contrast and colour, as lamps and cameras differ.
+
+    Args:
+        images: in [0,1].
+        generator: decides everything.
+        grey_share: of images without colour.
+    """
+    count = len(images)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -245,8 +251,18 @@ def _photographed(images: Tensor, settings: AugmentationSettings, generator: tor
     mean = images.mean((1, 2, 3), keepdim=True)
     images = mean + (images - mean) * (0.6 + 0.7 * rand(count, 1, 1, 1))
     grey = kornia.color.rgb_to_grayscale(images.clamp(0, 1))
-    saturation = torch.where(rand(count, 1, 1, 1) < settings.grey, 0.0, 0.5 + 0.8 * rand(count, 1, 1, 1))
-    images = (grey + saturation * (images - grey)).clamp(0, 1)
+    saturation = torch.where(rand(count, 1, 1, 1) < grey_share, 0.0, 0.5 + 0.8 * rand(count, 1, 1, 1))
+    return (grey + saturation * (images - grey)).clamp(0, 1)
+
+
+def _photographed(images: Tensor, settings: AugmentationSettings, generator: torch.Generator) -> Tensor:
+    """What lamps, lenses, sensors and codecs make of crops (B,3,S,S)."""
+    count, _, size, _ = images.shape
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    images = with_light(images, generator, settings.grey)
     soft = (rand(count) < 0.45).nonzero()[:, 0]
     if len(soft):
         sigma = (0.3 + 1.3 * rand(len(soft), 1) ** 2).expand(-1, 2)

@@ -19,6 +19,8 @@ STRIDE = 2
 """Pixels of the crop a side of a heat map's cell."""
 DEVIATION_RANGE = (0.05, 40.0)
 """Pixels of the crop; the network tells nothing beyond."""
+LEAST_SPREAD = 0.03
+"""Of a crop's brightness, so that what shows nothing is not made to show something."""
 _MOST_CHANNELS, _MOST_BLOCKS, _MOST_SIDE = 256, 8, 256
 
 
@@ -120,7 +122,7 @@ class EyeNetwork(nn.Module):
 
     def maps(self, crops: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heat maps (B,7,h/2,w/2), decoder features (B,C,h/2,w/2) and those of the whole crop (B,C')."""
-        half = self.stem(2 * crops - 1)
+        half = self.stem(evened(crops))
         quarter = self.quarter(half)
         deep = self.eighth(quarter)
         pooled = deep.mean((2, 3))
@@ -150,3 +152,9 @@ class EyeNetwork(nn.Module):
             for side in (self.width, self.height)
         )
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+
+
+def evened(crops: Tensor) -> Tensor:
+    """Crops (B,3,h,w) in [0,1] moved and scaled to a mean of 0 and a standard deviation of about 1."""
+    centred = crops - crops.mean((1, 2, 3), keepdim=True)
+    return centred / (centred.square().mean((1, 2, 3), keepdim=True) + LEAST_SPREAD**2).sqrt()
