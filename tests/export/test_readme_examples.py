@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,8 @@ from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model, export_video_solver
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
+from torchface.workflows.webcam.webcam_export import rendered_frames
+from torchface.workflows.webcam.webcam_graph import webcam_graph
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
 WEB = EXPORT / "web"
@@ -72,6 +75,8 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     person = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "browInnerUp"])
     camera = assumed_calibration(640, 480)
     export_video_solver(person, camera, path / "video_solver.onnx")
+    (path / "webcam.onnx").write_bytes(webcam_graph())
+    film(path)
     marks = synthetic_landmarks(VideoSolver(person, None, camera.intrinsics), 5)[1]
     inputs = {"neutral": people[0], "image": images[0], "markers": markers, "landmarks": marks}
     for name, values in inputs.items():
@@ -79,6 +84,21 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
         np.save(path / f"{name}.npy", array)
         (path / f"{name}.f32").write_bytes(array.tobytes())
     return path
+
+
+def film(path: Path) -> None:
+    """A face before a webcam, as a file without loss and as the pixels of a canvas."""
+    frames = rendered_frames(6)
+    height, width = frames[0].shape[:2]
+    writer = cv2.VideoWriter(str(path / "webcam.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 30.0, (width, height))
+    assert writer.isOpened()
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+    camera, canvas = cv2.VideoCapture(str(path / "webcam.avi")), b""
+    for _ in frames:
+        canvas += cv2.cvtColor(camera.read()[1], cv2.COLOR_BGR2RGBA).tobytes()
+    (path / "webcam.rgba").write_bytes(canvas)
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +131,7 @@ RESULTS = {
     "Landmarks of faces in a picture": "landmarks",
     "Weights from markers": "previous",
     "Weights from landmarks in a video": "weights",
+    "From a webcam's picture to weights": "weights",
 }
 
 

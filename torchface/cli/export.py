@@ -197,11 +197,37 @@ def examples(
     print_path(out)
 
 
+def webcam(out: Path, quiet: Quiet = False) -> None:
+    """Write the whole way from a webcam's picture to ARKit's 52 weights as one ONNX file, and check it.
+
+    Inputs of the graph: `image`, uint8 (rows, columns, 3 or 4 channels), red first, `interval`, seconds since the
+    picture before, `controls` (5,), and `state`, zeros to start. Outputs: `weights` (52,), `rotation` (3,3),
+    `translation` (3,), millimetres, `gaze` (2,2), radians, `landmarks` (68,2) and `iris` (2,2), pixels, `presence`,
+    `calibrated`, and `next_state`, which the next picture takes. It finds the face, follows it and learns the person by
+    itself; the weights move any character with ARKit's shapes. What it is made of is in the file's metadata. ONNX
+    Runtime is compared with PyTorch over a rendered video.
+
+    Args:
+        out: The .onnx file to write.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.webcam.webcam_export import export_webcam
+
+    with progress_bars(quiet) as progress:
+        report = export_webcam(out, progress)
+    table = Table(show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    console.print(table)
+    print_path(out)
+
+
 EXPORTS: dict[str, Callable[..., None]] = {
     "solver": solver,
     "hybrid-solver": hybrid_solver,
     "action-units": action_units,
     "video-solver": video_solver,
     "examples": examples,
+    "webcam": webcam,
     "app": export_app,
 }

@@ -82,8 +82,10 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
     def constant(name: str, value: torch.Tensor | float | tuple[int, ...]) -> str:
         return build.constant(f"eye_{name}", value)
 
-    centred = op("Sub", eyes, op("ReduceMean", eyes, axes=[1, 2, 3]))
-    power = op("ReduceMean", op("Mul", centred, centred), axes=[1, 2, 3])
+    axes, share = constant("axes", (1, 2, 3)), constant("share", 1 / (3 * model.height * model.width))
+    # By sums: means have their axes elsewhere in later versions of the operators.
+    centred = op("Sub", eyes, op("Mul", op("ReduceSum", eyes, axes), share))
+    power = op("Mul", op("ReduceSum", op("Mul", centred, centred), axes), share)
     spread = op("Sqrt", op("Add", power, constant("least", LEAST_SPREAD**2)))
     half = layers(build, net.stem, op("Div", centred, spread))
     quarter = layers(build, net.quarter, half)

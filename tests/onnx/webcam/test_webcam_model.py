@@ -10,9 +10,10 @@ import pytest
 import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 from torch import Tensor
+from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
 
 from torchface import zoo
-from torchface.geometry.cameras.pinhole import look_at
+from torchface.capture.webcam.webcam_state import CONTROLS
 from torchface.landmarks import LandmarkTracker
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.finders.crop_finder import CropFinder
@@ -20,22 +21,11 @@ from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.network_detector import shipped_detector
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.webcam import face_place, picture_pieces
-from torchface.onnx.webcam.webcam_model import CONTROLS, USUAL_CONTROLS, WebcamParts, webcam_model
-from torchface.rendering.clay_shading import Lighting, render
-from torchface.shape_names import ARKIT
-from torchface.synthetic import performer
+from torchface.onnx.webcam.eye_reader import read_eyes
+from torchface.onnx.webcam.face_reader import WebcamNetworks
 
+USUAL = (0.0, 1.0, 0.5, 0.0, 0.0)
 Found = dict[str, np.ndarray]
-
-
-@pytest.fixture(scope="module")
-def portrait() -> tuple[Tensor, Tensor]:
-    """A performer's head on grey, (3,150,150), and its landmarks (68,2)."""
-    rig = performer()
-    marks = rig.neutral.landmarks
-    camera = look_at(rig.vertices[marks].double().mean(0), 0.0, 0.0, 330.0, 150, 150)
-    picture = render(rig.neutral, camera, background=(0.3, 0.35, 0.4), lighting=Lighting(occlusion_rays=0), samples=1)
-    return (picture.clamp(0, 1) * 255).byte(), camera.project(rig.vertices[marks].double()).float()
 
 
 def run_values(make: Callable[[ValueGraph], Value], inputs: dict[str, np.ndarray], axes: int = 1) -> np.ndarray:
@@ -81,6 +71,29 @@ def test_squares_are_cut_as_the_library_cuts_them(box: tuple[float, ...], tilt: 
     np.testing.assert_allclose(back, from_crop(points, way), atol=1e-3)
 
 
+def test_eyes_are_read_as_the_library_reads_them(portrait: tuple[Tensor, Tensor], networks: WebcamNetworks) -> None:
+    """Lids, irises, and what is told of each eye; of eyes too small to be seen nothing."""
+    picture, marks = portrait
+    deviation = torch.linspace(0.5, 2.0, 68)
+    finder = EyeFinder(networks.eyes, networks.eyes.width, networks.eyes.height)
+    sure = torch.ones(68)
+    for size in (1.0, 0.05):
+        face = finder(picture, face_without_eyes(size * marks, deviation, sure, sure[0]))
+        read = (face.landmarks, face.deviation, face.iris, face.openness, face.closed, face.eye_visibility)
+        expected = torch.cat([one.flatten() for one in read])
+
+        def make(graph: ValueGraph) -> Value:
+            found = read_eyes(graph.value("image"), graph.value("marks"), graph.value("deviation"), networks.eyes)
+            parts = (found.landmarks, found.deviation, found.iris, found.openness, found.closed, found.visibility)
+            return graph.cat(*(part.shaped(-1) for part in parts))
+
+        image = picture.permute(1, 2, 0).contiguous().numpy()
+        found = run_values(make, {"image": image, "marks": (size * marks).numpy(), "deviation": deviation.numpy()})
+        np.testing.assert_allclose(found, expected, atol=0.05)
+    assert np.isnan(found[-6:-2]).all()
+    assert (found[-2:] == 0).all()
+
+
 def test_places_are_the_boxes_of_landmarks(portrait: tuple[Tensor, Tensor]) -> None:
     """And a face is looked for again where it was found, however it has turned, moved and grown meanwhile."""
     marks = 1.7 * portrait[1] @ torch.tensor([[0.8, 0.6], [-0.6, 0.8]]) + torch.tensor([300.0, 200.0])
@@ -100,37 +113,18 @@ def test_places_are_the_boxes_of_landmarks(portrait: tuple[Tensor, Tensor]) -> N
     np.testing.assert_allclose(moved[:3], 2 * looked[:3], atol=1e-3)
 
 
-def planted_solver() -> ModelProto:
-    """A solver that counts frames and gives the first weight what the landmarks' mean column is."""
-    graph = ValueGraph()
-    state = graph.value("state")
-    column = graph.value("landmarks").rows(0, 1, axis=1).reduced("ReduceMean", 0)
-    outputs: dict[str, tuple[Value, tuple[int, ...]]] = {
-        "weights": (graph.cat(column, torch.zeros(len(ARKIT) - 1)), (len(ARKIT),)),
-        "rotation": (graph.as_value(torch.eye(3)), (3, 3)),
-        "translation": (graph.value("controls").rows(0, 3), (3,)),
-        "gaze": (graph.as_value(torch.zeros(2, 2)), (2, 2)),
-        "calibrated": (graph.value("interval"), ()),
-        "next_state": (state + 1.0, (2,)),
-    }
-    for name, (value, _) in outputs.items():
-        graph.build.op("Identity", value.name, output=name)
-    inputs = {"landmarks": (68, 2), "controls": (5,), "interval": (), "state": (2,)}
-    return graph.root.model("planted", inputs, {name: shape for name, (_, shape) in outputs.items()}, {}, OPSET)
-
-
 class Webcam:
     """The graph with the state that it hands on."""
 
-    def __init__(self) -> None:
-        parts = WebcamParts(zoo.get_model("face_boxes"), zoo.get_model("landmark_network"), planted_solver())
-        self.model = webcam_model(parts, {"licence": "MIT"})
-        self.session = onnxruntime.InferenceSession(self.model.SerializeToString(), providers=["CPUExecutionProvider"])
+    def __init__(self, content: bytes) -> None:
+        self.session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
         self.names = [one.name for one in self.session.get_outputs()]
         self.start = np.zeros(self.session.get_inputs()[3].shape, np.float32)
         self.state = self.start
 
-    def step(self, frame: Tensor, interval: float = 1 / 30, controls: tuple[float, ...] = USUAL_CONTROLS) -> Found:
+    def step(
+        self, frame: Tensor, interval: float = 1 / 30, controls: tuple[float, ...] = (0.0, 1.0, 0.5, 0.0, 0.0)
+    ) -> Found:
         inputs = {
             "image": frame.permute(1, 2, 0).contiguous().numpy(),
             "interval": np.array(interval, np.float32),
@@ -143,8 +137,8 @@ class Webcam:
 
 
 @pytest.fixture(scope="module")
-def graph() -> Webcam:
-    return Webcam()
+def graph(webcam_file: bytes) -> Webcam:
+    return Webcam(webcam_file)
 
 
 @pytest.fixture
@@ -230,8 +224,8 @@ def test_whatever_comes_is_taken_safely(webcam: Webcam, portrait: tuple[Tensor, 
         assert np.isfinite(webcam.step(torch.zeros(3, *size, dtype=torch.uint8))["next_state"]).all()
 
 
-def test_the_file_says_what_it_takes(graph: Webcam) -> None:
-    model = graph.model
+def test_the_file_says_what_it_takes(webcam_file: bytes) -> None:
+    model = ModelProto.FromString(webcam_file)
     facts = {one.key: one.value for one in model.metadata_props}
     assert (facts["task"], facts["licence"]) == ("webcam", "MIT")
     assert int(facts["state"]) == model.graph.input[3].type.tensor_type.shape.dim[0].dim_value

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 import torch
 
 from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.eyes.eye_network import EyeNetwork
 from torchface.landmarks.images.landmark_finder import HALF_CONFIDENCE
 from torchface.landmarks.images.network import COUNT, LandmarkNetwork
 from torchface.onnx.graph_values import Value, ValueGraph
 from torchface.onnx.landmark_network_graph import landmark_network_nodes
+from torchface.onnx.webcam.eye_reader import read_eyes
 from torchface.onnx.webcam.face_place import overlap_of, place_around, plausible, relation, side, sought
 from torchface.onnx.webcam.face_search import FOUND, SearchSettings, search
 from torchface.onnx.webcam.picture_pieces import cut_square, from_square, picture_size
@@ -24,8 +26,6 @@ _LONGEST = 0.5  # seconds: after a longer break the face may be anywhere
 _ANYWHERE = torch.tensor([32.0, 32.0, 64.0, 1.0, 0.0])  # a place, where there is none to look at
 _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
-_RIGHT, _LEFT = 36, 42
-_SHUT, _STEEP = 0.13, 12.0  # openness of an eye half shut, and how steeply that is said
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,21 @@ class ReaderSettings:
     search: SearchSettings = field(default_factory=SearchSettings)
 
 
+@dataclass(frozen=True, eq=False)
+class WebcamNetworks:
+    """What read faces.
+
+    Args:
+        boxes: finds faces in pictures.
+        landmarks: finds landmarks in a face.
+        eyes: finds lids and irises in an eye.
+    """
+
+    boxes: BoxNetwork
+    landmarks: LandmarkNetwork
+    eyes: EyeNetwork
+
+
 @dataclass(frozen=True)
 class ReadFace:
     """A :class:`~torchface.landmarks.images.face_reading.FaceReading` as values of a graph, and what the next takes.
@@ -89,8 +104,7 @@ def read_face(
     image: Value,
     interval: Value,
     state: Value,
-    boxes: BoxNetwork,
-    landmarks: LandmarkNetwork,
+    networks: WebcamNetworks,
     settings: ReaderSettings,
 ) -> ReadFace:
     """One face in the next picture.
@@ -103,7 +117,7 @@ def read_face(
         image: uint8 (H,W,C), 3 channels or 4, red first.
         interval: seconds since the picture before, (1,), finite and positive.
         state: what the reader of the picture before left, (STATE,); zeros before the first.
-        boxes, landmarks: find them.
+        networks: what read it.
         settings: when a face counts as found and as lost.
     """
     place, anchor = state.rows(0, 5), state.rows(5, 8)
@@ -119,7 +133,7 @@ def read_face(
     searched = asked | lost_now
     found = graph.either(
         searched,
-        lambda: search(image, boxes, settings.search, place, missing < settings.patience, attempt),
+        lambda: search(image, networks.boxes, settings.search, place, missing < settings.patience, attempt),
         lambda: nothing,
     )
     there = found.rows(5, 6) > 0.5
@@ -127,14 +141,14 @@ def read_face(
     ready = plausible(begin, size, settings.smallest) & (followed | there)
     first = graph.where(ready, begin, _ANYWHERE)
     # The network runs on every picture, as ONNX Runtime makes it half as fast inside of a branch.
-    seen = _look(graph, image, first, landmarks)
+    seen = _look(graph, image, first, networks.landmarks)
     moved = place_around(seen.rows(0, 2 * COUNT).shaped(COUNT, 2))
     shared = overlap_of(graph.where(followed, place, first), moved)
     # Boxes of the box network fit loosely, but what lies beside them is not their face.
     again = graph.where(followed, (shared < _FAR).number(), (shared >= _LOOSE).number()) > 0.5
     again = again & ready & plausible(moved, size, settings.smallest)
     looked = graph.where(again, graph.where(followed, sought(moved, anchor), moved), first)
-    seen = graph.either(again, lambda: _look(graph, image, looked, landmarks), lambda: seen)
+    seen = graph.either(again, lambda: _look(graph, image, looked, networks.landmarks), lambda: seen)
     marks, presence = seen.rows(0, 2 * COUNT).shaped(COUNT, 2), seen.rows(4 * COUNT, _SEEN)
     own = place_around(marks)
     growth = side(own) / side(place).most(1.0)
@@ -157,19 +171,17 @@ def read_face(
         graph.where(refused, attempt + 1.0, 0.0),
         size,
     )
-    shown = graph.where(good.shaped(1, 1), marks, float("nan"))
-    right, left = (_eye(shown.rows(first, first + 6)) for first in (_RIGHT, _LEFT))
-    openness = graph.cat(right.openness, left.openness)
-    share = good.number()
+    eyes = read_eyes(image, marks, seen.rows(2 * COUNT, 3 * COUNT), networks.eyes)
+    share, nan = good.number(), float("nan")
     return ReadFace(
-        shown,
-        seen.rows(2 * COUNT, 3 * COUNT),
+        graph.where(good, eyes.landmarks, nan),
+        eyes.deviation,
         seen.rows(3 * COUNT, 4 * COUNT) * share,
         presence * share,
-        graph.cat(right.middle, left.middle).shaped(2, 2),
-        openness,
-        ((_SHUT - openness) * _STEEP + 0.5).least(1.0).most(0.0),
-        graph.cat(share, share),
+        graph.where(good, eyes.iris, nan),
+        graph.where(good, eyes.openness, nan),
+        graph.where(good, eyes.closed, nan),
+        eyes.visibility * share,
         after,
     )
 
@@ -188,23 +200,3 @@ def _confidence(deviation: Value, place: Value) -> Value:
     """The mean (1,) of :func:`~torchface.landmarks.images.landmark_finder.confidence_of` deviations (68,) in pixels."""
     share = deviation / (side(place).most(1.0) * HALF_CONFIDENCE)
     return (1.0 / (share * share + 1.0)).reduced("ReduceMean", 0, keep=True)
-
-
-@dataclass(frozen=True)
-class _Eye:
-    """The middle (2,) of one eye's landmarks, and the distance of its lids over that of its corners (1,)."""
-
-    middle: Value
-    openness: Value
-
-
-def _eye(ring: Value) -> _Eye:
-    """From its six landmarks (6,2)."""
-    graph = ring.graph
-
-    def distance(first: int, second: int) -> Value:
-        apart = ring.rows(first, first + 1) - ring.rows(second, second + 1)
-        return graph.op("Sqrt", (apart * apart).reduced("ReduceSum", 1))
-
-    lids = (distance(1, 5) + distance(2, 4)) * 0.5
-    return _Eye(ring.reduced("ReduceMean", 0), lids / distance(0, 3).most(1e-6))

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import onnx
 import torch
 from onnx import TensorProto
 
 from torchface import __version__
+from torchface.capture.webcam import WebcamControls
+from torchface.capture.webcam.webcam_state import CONTROLS, POSES
 from torchface.errors import ShapeError
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.network import COUNT, LandmarkNetwork
+from torchface.landmarks.images.network import COUNT
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
-from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
+from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, WebcamNetworks, read_face
 from torchface.onnx.webcam.picture_pieces import picture_size
+from torchface.onnx.webcam.webcam_solver_graph import READING
 from torchface.shape_names import ARKIT
-
-CONTROLS = ("pose", "gain", "smoothing", "reset", "freeze")
-"""What the numbers of ``controls`` are."""
-
-USUAL_CONTROLS = (0.0, 1.0, 0.5, 0.0, 0.0)
-POSES = ("none", "rest", "mouth open", "smile", "brows up", "eyes shut")
-"""What ``pose`` counts: what a guided calibration asks the person to hold."""
-
-READING = (
-    "landmarks", "deviation", "visibility", "presence", "iris", "openness", "closed", "eye_visibility",
-)  # fmt: skip
-"""What a solver is given of the face, as :class:`~torchface.landmarks.images.face_reading.FaceReading` names it."""
 
 SOLVED = ("weights", "rotation", "translation", "gaze", "calibrated")
 """What a solver gives."""
@@ -37,27 +26,12 @@ _SHORTEST, _LONGEST, _USUAL = 1e-3, 1.0, 1 / 30  # seconds
 _HIGHEST = torch.tensor([5.0, 10.0, 1.0, 1.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
-class WebcamParts:
-    """What the model is made of.
-
-    Args:
-        boxes: finds faces in pictures.
-        landmarks: finds landmarks in a face.
-        solver: the graph that solves weights. Its inputs are ``READING``'s names with their shapes, ``presence`` (),
-            ``size`` (2,), width and height of the picture, ``interval`` () and ``controls`` (5,), finite and in their
-            ranges, and ``state`` (S,), zeros to start; inputs that it has no use for may be missing. Its outputs are
-            ``SOLVED``'s names and ``next_state`` (S,).
-        settings: when a face counts as found and as lost.
-    """
-
-    boxes: BoxNetwork
-    landmarks: LandmarkNetwork
-    solver: onnx.ModelProto
-    settings: ReaderSettings = field(default_factory=ReaderSettings)
-
-
-def webcam_model(parts: WebcamParts, facts: Mapping[str, object] | None = None) -> onnx.ModelProto:
+def webcam_model(
+    networks: WebcamNetworks,
+    solver: onnx.ModelProto,
+    settings: ReaderSettings | None = None,
+    facts: Mapping[str, object] | None = None,
+) -> onnx.ModelProto:
     """The model: picture, seconds since the one before, controls and state in; weights, head and next state out.
 
     Inputs are ``image`` uint8 (H,W,C), 3 channels or 4, red first; ``interval`` (), seconds; ``controls`` (5,), see
@@ -67,24 +41,29 @@ def webcam_model(parts: WebcamParts, facts: Mapping[str, object] | None = None) 
     their range count as usual ones, and a state that is not finite as a start.
 
     Args:
-        parts: what it is made of.
+        networks: what read faces.
+        solver: the graph that solves weights. Its inputs are ``READING``'s names with their shapes, ``presence`` (),
+            ``size`` (2,), width and height of the picture, ``interval`` () and ``controls`` (5,), finite and in their
+            ranges, and ``state`` (S,), zeros to start; inputs that it has no use for may be missing. Its outputs are
+            ``SOLVED``'s names and ``next_state`` (S,).
+        settings: when a face counts as found and as lost.
         facts: further metadata, such as licence.
 
     Raises:
         ShapeError: the solver's graph has other inputs or outputs.
     """
-    own, theirs = STATE, _state_size(parts.solver)
+    own, theirs = STATE, _state_size(solver)
     graph = ValueGraph()
     image, controls = graph.value("image"), graph.value("controls")
     interval = _finite(graph, graph.value("interval").shaped(1), _USUAL).least(_LONGEST).most(_SHORTEST)
-    controls = _finite(graph, controls, torch.tensor(USUAL_CONTROLS))
+    controls = _finite(graph, controls, WebcamControls().tensor())
     controls = controls.most(0.0).least(graph.as_value(_HIGHEST))
     forget = controls.rows(3, 4) > 0.0
     state = graph.value("state")
     broken = _broken(graph, state).number().reduced("ReduceMax", 0, keep=True) > 0.5
     state = graph.where(broken, 0.0, state)
     reader_state = graph.where(forget, 0.0, state.rows(0, own))
-    read = read_face(graph, image, interval, reader_state, parts.boxes, parts.landmarks, parts.settings)
+    read = read_face(graph, image, interval, reader_state, networks, settings or ReaderSettings())
     given = {name: getattr(read, name) for name in READING}
     given |= {
         "presence": read.presence.shaped(),
@@ -93,10 +72,10 @@ def webcam_model(parts: WebcamParts, facts: Mapping[str, object] | None = None) 
         "controls": controls,
         "state": state.rows(own, own + theirs),
     }
-    wanted = [one.name for one in parts.solver.graph.input]
+    wanted = [one.name for one in solver.graph.input]
     if set(wanted) - set(given):
         raise ShapeError(f"solver's graph: found inputs {wanted}, expected no others than {list(given)}")
-    solved = graph.include(parts.solver, "solver/", {name: given[name] for name in wanted})
+    solved = graph.include(solver, "solver/", {name: given[name] for name in wanted})
     if missing := {*SOLVED, "next_state"} - set(solved):
         raise ShapeError(f"solver's graph: found outputs {list(solved)}, expected also {sorted(missing)}")
     outputs: dict[str, tuple[Value, tuple[int, ...]]] = {
@@ -117,7 +96,7 @@ def webcam_model(parts: WebcamParts, facts: Mapping[str, object] | None = None) 
         "names": list(ARKIT),
         "state": str(own + theirs),
         "controls": list(CONTROLS),
-        "usual_controls": list(USUAL_CONTROLS),
+        "usual_controls": WebcamControls().tensor().tolist(),
         "poses": list(POSES),
         "image": "uint8, rows, columns, channels: red, green, blue, and one more that counts for nothing",
         "units": "seconds, pixels, millimetres, radians; weights, 1 is the whole shape",

@@ -9,7 +9,8 @@ from torchface.modeling import HeadModel
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
-_HEADS = "head"
+HEADS = "head"
+"""The model of the zoo that says which heads there are."""
 
 
 def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolver:
@@ -19,8 +20,8 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
         NameMismatchError: the zoo's model of heads is another kind of model.
     """
     rig = performer(texture=False)
-    heads = zoo.get_model(_HEADS)
+    heads = zoo.get_model(HEADS)
     if not isinstance(heads, HeadModel) or heads.landmarks is None:
-        raise NameMismatchError(f"{_HEADS}: found a {type(heads).__name__}, expected a HeadModel with landmarks")
+        raise NameMismatchError(f"{HEADS}: found a {type(heads).__name__}, expected a HeadModel with landmarks")
     modes = heads.shape.modes[:, heads.landmarks]
     return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings)

@@ -15,9 +15,14 @@ EYE_LANDMARKS = ((36, 37, 38, 39, 40, 41), (45, 44, 43, 42, 47, 46))
 """iBUG's landmarks of the right eye, and of the left in the order that the right one's have in a mirror: the outer
 corner, two of the upper lid, the inner corner, two of the lower lid."""
 
-_SHARE = 0.83  # of the distance of the eyes that a crop is wide
-_DOWN = 1.4  # times as far apart are the eyes as their middle from the nose's base, on heads seen from the front
-_NOSE_BASE = 33
+SHARE = 0.83
+"""How wide a crop is, of the distance of the eyes."""
+
+DOWN = 1.4
+"""The distance of the eyes over that of their middle from the nose's base, on heads seen from the front."""
+
+NOSE_BASE = 33
+"""iBUG's landmark."""
 
 
 def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CROP_HEIGHT) -> Tensor:
@@ -48,9 +53,9 @@ def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CRO
     # Both axes of the face, the second turned on the first: a head that turns aside shortens the first alone.
     upright = torch.stack([across[..., 0] + down[..., 1], across[..., 1] - down[..., 0]], -1)
     upright = upright / upright.square().sum(-1, keepdim=True).sqrt()
-    nose = (landmarks[..., _NOSE_BASE, :] - middle).square().sum(-1)
-    size = ((across.square().sum(-1) + _DOWN**2 * nose) / 2).sqrt()
-    axis = upright * (width / (_SHARE * size))[..., None]
+    nose = (landmarks[..., NOSE_BASE, :] - middle).square().sum(-1)
+    size = ((across.square().sum(-1) + DOWN**2 * nose) / 2).sqrt()
+    axis = upright * (width / (SHARE * size))[..., None]
     turn = torch.stack([axis, torch.stack([-axis[..., 1], axis[..., 0]], -1)], -2)  # (...,2,2)
     mirror = landmarks.new_tensor([[[1.0], [1.0]], [[-1.0], [1.0]]])
     turns = turn[..., None, :, :] * mirror

@@ -15,7 +15,8 @@ from torchface.landmarks.images.eyes.eye_merge import merged_lids
 from torchface.landmarks.images.eyes.eye_network import EyeFindings
 from torchface.landmarks.images.face_reading import FaceReading
 
-_LEAST = 6.0  # pixels of the image that a crop must be wide
+LEAST = 6.0
+"""Pixels of the image that a crop must be wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class EyeFinder:
         """
         transforms = eye_transforms(face.landmarks.double(), self.width, self.height)
         scale = float(transforms[0, :, :2].det().abs().sqrt())
-        if not bool(torch.isfinite(transforms).all()) or scale * _LEAST > self.width:
+        if not bool(torch.isfinite(transforms).all()) or scale * LEAST > self.width:
             return face
         found = self.network(cut_eyes(image, transforms, self.width, self.height).float() / 255)
         back = picture_transforms(transforms)

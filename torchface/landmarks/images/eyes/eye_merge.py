@@ -8,8 +8,11 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.landmarks.images.eyes.eye_crop import EYE_LANDMARKS
 
-_HIDDEN, _SEEN = 0.3, 0.8
-_PLACES = tuple(sum(EYE_LANDMARKS, ()).index(number) for number in range(36, 48))
+HIDDEN, SEEN = 0.3, 0.8
+"""Visibility up to which an eye does not count, and from which it counts fully."""
+
+PLACES = tuple(sum(EYE_LANDMARKS, ()).index(number) for number in range(36, 48))
+"""Rows of both eyes' lids, in the order of ``EYE_LANDMARKS``, that landmarks 36 to 47 are."""
 
 
 def merged_lids(
@@ -41,8 +44,8 @@ def merged_lids(
             f"merged_lids: found landmarks {tuple(landmarks.shape)}, lids {tuple(lids.shape)} and visibility "
             f"{tuple(visibility.shape)}, expected (...,68,2), (...,2,6,2) and (...,2)"
         )
-    share = ((visibility - _HIDDEN) / (_SEEN - _HIDDEN)).clamp(0, 1)[..., None]
-    own, theirs = 1 / deviation[..., 36:48].square(), (share / lid_deviation.square()).flatten(-2)[..., list(_PLACES)]
+    share = ((visibility - HIDDEN) / (SEEN - HIDDEN)).clamp(0, 1)[..., None]
+    own, theirs = 1 / deviation[..., 36:48].square(), (share / lid_deviation.square()).flatten(-2)[..., list(PLACES)]
     both = own + theirs
     places = (own[..., None] * landmarks[..., 36:48, :] + theirs[..., None] * _ordered(lids)) / both[..., None]
     return (
@@ -53,4 +56,4 @@ def merged_lids(
 
 def _ordered(lids: Tensor) -> Tensor:
     """Landmarks 36 to 47 (...,12,2) of both eyes' lids (...,2,6,2)."""
-    return lids.flatten(-3, -2)[..., list(_PLACES), :]
+    return lids.flatten(-3, -2)[..., list(PLACES), :]
