@@ -10,11 +10,11 @@ import pytest
 import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 from torch import Tensor
-from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
 
 from torchface import zoo
 from torchface.capture.webcam.webcam_state import CONTROLS
 from torchface.landmarks import LandmarkTracker
+from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.finders.crop_finder import CropFinder
 from torchface.landmarks.images.ibug_68 import turned_box
