@@ -6,6 +6,7 @@ import json
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import onnx
 import torch
@@ -69,6 +70,7 @@ def exported_model(
         log.setLevel(level)
     if program is None:
         raise AssertionError("torch.onnx.export returned no program")
+    _with_known_casts(program.model)
     ir.passes.Sequential(
         ir.passes.common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         ir.passes.common.LiftSubgraphInitializersToMainGraphPass(),
@@ -85,3 +87,15 @@ def exported_model(
     )
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _with_known_casts(model: Any) -> None:
+    """Casts to the type of another value, of which runtimes warn, as casts to that type."""
+    from onnxscript import ir
+
+    for node in list(model.graph):
+        if node.op_type == "CastLike" and node.inputs[1] is not None and node.inputs[1].dtype is not None:
+            cast = ir.node("Cast", [node.inputs[0]], {"to": int(node.inputs[1].dtype)})
+            cast.outputs[0].name, cast.outputs[0].type = node.outputs[0].name, node.outputs[0].type
+            cast.outputs[0].shape = node.outputs[0].shape
+            ir.convenience.replace_nodes_and_values(model.graph, node, [node], [cast], node.outputs, cast.outputs)

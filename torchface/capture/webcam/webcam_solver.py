@@ -34,6 +34,7 @@ from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.optim.exported_operators import split_box_program, symmetric_inverse
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
@@ -45,6 +46,7 @@ _LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
 _DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
 _FREE = 1e9
 _ENOUGH = 20.0  # landmarks
+_LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
 _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
 _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
@@ -55,6 +57,7 @@ _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is kno
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person tell, and for how long, seconds
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
+_LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
 _CONTOUR_TRUST = 0.5
 _GROUPS = (("jawOpen",), ("mouthSmileLeft", "mouthSmileRight"), ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"))
@@ -125,9 +128,10 @@ class WebcamSolver(nn.Module):
         points = FacePoints.of(rig, rig.neutral.landmarks)
         person = PersonPrior.of(identity_modes, self.settings.coefficients)
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
-        self.strength = 1.0 if prior is None else prior.strength
+        self.strength = self.settings.prior_strength
         groups = StudentGroups.of(prior, len(rig.names), points.rest)
-        rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], _arkit_names(rig.names))
+        called = _arkit_names(rig.names)
+        rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], called)
         for name, value in {
             "rest": points.rest,
             "basis": points.basis,
@@ -139,6 +143,7 @@ class WebcamSolver(nn.Module):
             "person_remainder": person.remainder,
             "closing_basis": _closing(person.basis, rig.names)[0],
             "closing_shapes": _closing(person.basis, rig.names)[1],
+            "lid_ridge": torch.tensor([next((v for k, v in _LID_RIDGE.items() if n.startswith(k)), 0.0) for n in called]),
             "precisions": groups.precisions,
             "freedoms": groups.freedoms,
             "sizes": groups.sizes,
@@ -148,7 +153,7 @@ class WebcamSolver(nn.Module):
             "usual_openness": usual,
             "look_shapes": mapping(LOOKS, rig.names).double(),
             "gain_shapes": torch.stack([mapping(group, rig.names).double().amax(1) for group in _GROUPS]),
-            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in _arkit_names(rig.names)]),
+            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
             "landmark_weights": torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW)),
             "identity": torch.eye(max(len(rig.names) + 6, self.settings.coefficients)),
             "camera": torch.eye(3),
@@ -217,7 +222,9 @@ class WebcamSolver(nn.Module):
         seen = ~torch.isnan(rays).any(1)
         present = _known(presence.double(), 0.0) * (seen.double().sum() >= _ENOUGH)
         found = present > _PRESENT
-        trust = self.landmark_weights * seen * _known(visibility.double(), 1.0).clamp(0, 1)
+        visible = _known(visibility.double(), 1.0).clamp(0, 1)
+        trust = trust_of(self.landmark_weights * seen, visible)
+        found = found & (trust.sum() > _LEAST_TRUST)
         # Without a face all counts alike and what comes of it is dropped, so that no number is a NaN.
         trust = torch.where(found, trust, 1.0)
         rays = torch.where(seen[:, None] & found, rays, self.rest[:LANDMARKS, :2] * self.upright)
@@ -375,7 +382,7 @@ class WebcamSolver(nn.Module):
 
     def _prior(self, weights: Tensor) -> Tensor:
         """H (N,N) of the shape prior and the ridge."""
-        ridge = 2 * self.settings.ridge * self.identity[: len(self.names), : len(self.names)]
+        ridge = (2 * self.settings.ridge + self.lid_ridge).diag()
         if not len(self.precisions):
             return ridge
         return ridge + self.strength * StudentGroups(self.precisions, self.freedoms, self.sizes).bound(weights)
