@@ -29,8 +29,8 @@ _SHUT = 0.05
 _SURELY_OPEN, _SURELY_SHUT = 0.3, 0.9
 _LEAST_OPEN = 0.35  # of an eye that is surely not shut
 _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
-_OPEN_MEMORY, _SHUT_MEMORY, _STRAIGHT_MEMORY = 8.0, 2.0, 20.0  # seconds
-_LASTING = 0.3
+_OPEN_MEMORY, _SHUT_MEMORY, _STRAIGHT_MEMORY = 8.0, 2.0, 60.0  # seconds
+_LASTING, _ASKED = 0.3, 10.0  # who is asked to rest looks ahead: that counts as much as ten times as long without
 _STRAIGHT_PRIOR, _SHUT_PRIOR = 1.0, 0.2  # seconds
 _DOWNWARD = 0.2  # how quickly the open level falls beside how it rises: blinks and squints are no level
 
@@ -147,13 +147,14 @@ def eye_signals(
     looks = ~torch.isnan(gaze).any(1)
     seen = torch.where(looks[:, None], gaze, 0.0)
     gaze_trust = looks * visible * (1 - shut)
-    patience = interval / (before.straight_seen + _STRAIGHT_PRIOR + interval) * torch.where(resting, 3.0, 1.0)
+    counted = interval * torch.where(resting, _ASKED, 1.0)
+    patience = counted / (before.straight_seen + _STRAIGHT_PRIOR + counted)
     rate = (learns * gaze_trust * patience.clamp(max=1.0))[:, None]
     # People look up or down for long, to the side or across only as their eyes lie otherwise than is usual.
     one = torch.ones_like(pose)
     lasting = seen.clamp(-_STRAYS, _STRAYS) * torch.stack([one, torch.where(resting, one, _LASTING * one)])
     straight = before.straight + rate * (lasting - before.straight)
-    straight_seen = (before.straight_seen + learns * interval * gaze_trust.max()).clamp(max=_STRAIGHT_MEMORY)
+    straight_seen = (before.straight_seen + learns * counted * gaze_trust.max()).clamp(max=_STRAIGHT_MEMORY)
     ahead = seen - straight
     # Both eyes look at one thing, and what they squint at the person's own nearness is learned as straight ahead.
     share = gaze_trust + 1e-3

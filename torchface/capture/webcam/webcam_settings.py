@@ -36,7 +36,7 @@ class WebcamSettings:
     ridge: float = 1e-2
     motion: float = 1.5
     contour_slide: float = 0.3
-    steps: int = 2
+    steps: int = 1
     coefficients: int = 64
     alike: float = 0.3
     learning: float = 10.0

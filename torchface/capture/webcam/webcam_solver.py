@@ -39,9 +39,10 @@ from torchface.optim.exported_operators import split_box_program, symmetric_inve
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
-_RHO, _SPLITTING_STEPS = 0.05, 40
+_RHO, _SPLITTING_STEPS = 0.05, 30
 _UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
-_ROTATION_UNIT, _TRANSLATION_UNIT = 0.5, 100.0  # radians and millimetres that count as a weight of 1 in the filter
+_BLINK_UNIT = 0.25  # what counts as a weight of 1 in the filter: of blinks, which it must not smooth away,
+_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # and of the head's motion, radians and millimetres
 _LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
 _DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
 _FREE = 1e9
@@ -143,7 +144,9 @@ class WebcamSolver(nn.Module):
             "person_remainder": person.remainder,
             "closing_basis": _closing(person.basis, rig.names)[0],
             "closing_shapes": _closing(person.basis, rig.names)[1],
-            "lid_ridge": torch.tensor([next((v for k, v in _LID_RIDGE.items() if n.startswith(k)), 0.0) for n in called]),
+            "lid_ridge": torch.tensor(
+                [_LID_RIDGE.get(n.removesuffix("Left").removesuffix("Right"), 0.0) for n in called]
+            ),
             "precisions": groups.precisions,
             "freedoms": groups.freedoms,
             "sizes": groups.sizes,
@@ -160,7 +163,9 @@ class WebcamSolver(nn.Module):
             "look_eyes": torch.tensor(_LOOK_EYES),
             "upright": torch.tensor(_UPRIGHT),
             "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
-            "motion_unit": torch.tensor([_ROTATION_UNIT] * 3 + [_TRANSLATION_UNIT] * 3),
+            "filter_units": torch.tensor(
+                [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
+            ),
         }.items():
             self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=False)
 
@@ -483,7 +488,7 @@ class WebcamSolver(nn.Module):
         motion = torch.cat([turn, pose[9:] - before.translation])
         speeds = torch.where(first, 0.0, before.speeds)
         old = torch.cat([before.weights, torch.zeros_like(motion)])
-        unit = torch.cat([torch.ones_like(weights), self.motion_unit])
+        unit = self.filter_units
         calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
         rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
         translation = torch.where(first, pose[9:], before.translation + calm[-3:])
