@@ -70,13 +70,13 @@ def exported_model(
         log.setLevel(level)
     if program is None:
         raise AssertionError("torch.onnx.export returned no program")
-    _with_known_casts(program.model)
     ir.passes.Sequential(
         ir.passes.common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         ir.passes.common.LiftSubgraphInitializersToMainGraphPass(),
         ir.passes.common.DeduplicateInitializersPass(size_limit=2**30),
         ir.passes.common.ClearMetadataAndDocStringPass(),
     )(program.model)
+    _with_known_casts(program.model)
     model = program.model_proto
     del model.graph.value_info[:], model.metadata_props[:]
     for value in (*model.graph.input, *model.graph.output):
@@ -94,8 +94,12 @@ def _with_known_casts(model: Any) -> None:
     from onnxscript import ir
 
     for node in list(model.graph):
-        if node.op_type == "CastLike" and node.inputs[1] is not None and node.inputs[1].dtype is not None:
-            cast = ir.node("Cast", [node.inputs[0]], {"to": int(node.inputs[1].dtype)})
+        if node.op_type != "CastLike":
+            continue
+        like = node.inputs[1]
+        dtype = like.dtype if like.const_value is None else like.const_value.dtype
+        if dtype is not None:
+            cast = ir.node("Cast", [node.inputs[0]], {"to": int(dtype)})
             cast.outputs[0].name, cast.outputs[0].type = node.outputs[0].name, node.outputs[0].type
             cast.outputs[0].shape = node.outputs[0].shape
             ir.convenience.replace_nodes_and_values(model.graph, node, [node], [cast], node.outputs, cast.outputs)

@@ -402,22 +402,43 @@ class WebcamSolver(nn.Module):
         self, at: Linearised, head: HeadState, before: WebcamState, interval: Tensor, pose: Tensor, good: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients, information and evidence with a frame's, where it is ``good``."""
-        weights = head.weights[0]
-        J, r = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
+        resting = ((pose - 1).abs() < 0.5).to(pose)
+        frame = at.residual[0], at.jacobian[0], head.weights[0], head.rotation[0], interval, resting
+        known = before.person, before.information, before.evidence, before.learned
+        learns = good > 0
+        if torch.compiler.is_exporting():  # a graph has both ways; here a call that is not exported takes one
+            return torch.cond(learns, self._updated_person, self._same_person, (*frame, *known))
+        return (self._updated_person if bool(learns) else self._same_person)(*frame, *known)
+
+    def _updated_person(
+        self,
+        residual: Tensor,
+        jacobian: Tensor,
+        weights: Tensor,
+        rotation: Tensor,
+        interval: Tensor,
+        resting: Tensor,
+        person: Tensor,
+        information: Tensor,
+        evidence: Tensor,
+        learned: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         closed = self.closing_shapes @ weights
         basis = self.person_basis - (closed[:, None, None, None] * self.closing_basis).sum(0)
-        by_person = (at.jacobian[0, ..., -3:] @ head.rotation[0] @ basis).flatten(0, 1)
-        resting = (pose - 1).abs() < 0.5
-        lasting = lasting_precision(weights, self.settings.rest_penalty, resting)
-        frame, gradient = frame_information(r, J, by_person, weights, lasting)
-        eager = 1 + _EAGER * torch.exp(-before.learned / _EAGER_FOR)
-        share = good * (interval / self.settings.alike * eager).clamp(max=1.0)
-        kept = torch.where(good > 0, torch.exp(-interval / self.settings.memory), 1.0)
-        information = kept * before.information + share * frame
-        evidence = kept * before.evidence + share * (frame @ before.person - gradient)
-        count = len(before.person)
-        solved = symmetric_inverse(information + self.identity[:count, :count]) @ evidence
-        return torch.where(good > 0, solved, before.person), information, evidence
+        by_person = (jacobian[..., -3:] @ rotation @ basis).flatten(0, 1)
+        lasting = lasting_precision(weights, self.settings.rest_penalty, resting > 0)
+        frame, gradient = frame_information(residual.flatten(), jacobian.flatten(0, 1), by_person, weights, lasting)
+        eager = 1 + _EAGER * torch.exp(-learned / _EAGER_FOR)
+        share = (interval / self.settings.alike * eager).clamp(max=1.0)
+        kept = torch.exp(-interval / self.settings.memory)
+        information = kept * information + share * frame
+        evidence = kept * evidence + share * (frame @ person - gradient)
+        count = len(person)
+        return symmetric_inverse(information + self.identity[:count, :count]) @ evidence, information, evidence
+
+    def _same_person(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        person, information, evidence, _ = given[-4:]
+        return person.clone(), information.clone(), evidence.clone()
 
     def _gains_of(self, gains: Tensor) -> Tensor:
         """Of each shape, (N,)."""
