@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,11 +88,11 @@ class GraphBuilder:
     def model(
         self,
         name: str,
-        inputs: dict[str, Sequence[int | str]],
-        outputs: dict[str, Sequence[int | str]],
-        metadata: dict[str, Any],
+        inputs: Mapping[str, Sequence[int | str]],
+        outputs: Mapping[str, Sequence[int | str]],
+        metadata: Mapping[str, Any],
         opset: int = OPSET,
-        types: dict[str, int] | None = None,
+        types: Mapping[str, int] | None = None,
     ) -> onnx.ModelProto:
         """The checked model.
 
@@ -104,7 +104,7 @@ class GraphBuilder:
             types: of inputs and outputs that are not float32.
         """
 
-        def infos(values: dict[str, Sequence[int | str]]) -> list[onnx.ValueInfoProto]:
+        def infos(values: Mapping[str, Sequence[int | str]]) -> list[onnx.ValueInfoProto]:
             kinds = types or {}
             return [
                 helper.make_tensor_value_info(key, kinds.get(key, onnx.TensorProto.FLOAT), list(shape))

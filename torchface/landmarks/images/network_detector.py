@@ -96,7 +96,7 @@ def _one_each(boxes: Tensor) -> Tensor:
     return torch.tensor(kept, dtype=torch.long)
 
 
-def without_normalisation(network: BoxNetwork) -> nn.Module:
+def without_normalisation(network: BoxNetwork) -> BoxNetwork:
     """A copy that computes the same with batch normalisation folded into the convolutions before it."""
     fused = copy.deepcopy(network).eval()
     for module in fused.modules():

@@ -103,7 +103,12 @@ def webcam_model(
         "version": __version__,
         **(facts or {}),
     }
-    inputs = {"image": ("height", "width", "channels"), "interval": (), "controls": (5,), "state": (own + theirs,)}
+    inputs: dict[str, tuple[int | str, ...]] = {
+        "image": ("height", "width", "channels"),
+        "interval": (),
+        "controls": (5,),
+        "state": (own + theirs,),
+    }
     shapes = {name: shape for name, (_, shape) in outputs.items()}
     return graph.root.model("webcam", inputs, shapes, metadata, OPSET, {"image": TensorProto.UINT8})
 
