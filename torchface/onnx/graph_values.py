@@ -8,7 +8,7 @@ from typing import Any
 
 import onnx
 import torch
-from onnx import TensorProto, compose
+from onnx import TensorProto
 from torch import Tensor
 
 from torchface.onnx.graph_builder import GraphBuilder
@@ -96,11 +96,13 @@ class ValueGraph:
         Returns:
             Its outputs by name.
         """
-        renamed = compose.add_prefix(model, prefix)
+        renamed = onnx.GraphProto()
+        renamed.CopyFrom(model.graph)
+        _rename(renamed, prefix)
         for name, value in inputs.items():
             self.build.op("Identity", value.name, output=prefix + name)
-        self.root._nodes.extend(renamed.graph.node)
-        for constant in renamed.graph.initializer:
+        self.root._nodes.extend(renamed.node)
+        for constant in renamed.initializer:
             self.root._constants[constant.name] = constant
         return {one.name: self.value(prefix + one.name) for one in model.graph.output}
 
@@ -191,3 +193,16 @@ class Value:
     def reduced(self, kind: str, axis: int, keep: bool = False) -> Value:
         """Over an axis: ``ReduceMin``, ``ReduceMax``, ``ReduceSum`` or ``ReduceMean``."""
         return self.graph.op(kind, self, [axis], keepdims=int(keep))
+
+
+def _rename(graph: onnx.GraphProto, prefix: str) -> None:
+    """Puts a prefix before all names, those in branches and loops too, which ``onnx.compose`` does not reach."""
+    for value in (*graph.input, *graph.output, *graph.initializer):
+        value.name = prefix + value.name
+    for node in graph.node:
+        node.name = prefix + node.name
+        for names in (node.input, node.output):
+            names[:] = [prefix + name if name else "" for name in names]
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.GRAPH:
+                _rename(attribute.g, prefix)

@@ -44,8 +44,13 @@ def planted_solver() -> ModelProto:
     graph = ValueGraph()
     state = graph.value("state")
     column = graph.value("landmarks").rows(0, 1, axis=1).reduced("ReduceMean", 0)
+    weights = graph.either(  # a branch that uses constants from outside
+        graph.value("interval").shaped(1) > 0.0,
+        lambda: graph.cat(column, torch.zeros(len(ARKIT) - 1)),
+        lambda: graph.as_value(torch.zeros(len(ARKIT))),
+    )
     outputs: dict[str, tuple[Value, tuple[int, ...]]] = {
-        "weights": (graph.cat(column, torch.zeros(len(ARKIT) - 1)), (len(ARKIT),)),
+        "weights": (weights, (len(ARKIT),)),
         "rotation": (graph.as_value(torch.eye(3)), (3, 3)),
         "translation": (graph.value("controls").rows(0, 3), (3,)),
         "gaze": (graph.as_value(torch.zeros(2, 2)), (2, 2)),
