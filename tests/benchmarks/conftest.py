@@ -27,7 +27,6 @@ PEERS = (
     "proxsuite",
     "quadprog",
     "eos-py",
-    "nlopt",
     "dlib",
     "menpofit",
 )

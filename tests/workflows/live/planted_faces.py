@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from torchface.capture.webcam import WebcamControls
 from torchface.io.video import VideoFile, write_video
 from torchface.shape_names import ARKIT
-from torchface.workflows.live.solved_frames import LiveControls, LiveFrame
+from torchface.workflows.live.solved_frames import LiveFrame
 
 JAW = ARKIT.index("jawOpen")
 SMILE = ARKIT.index("mouthSmileLeft")
@@ -31,11 +32,11 @@ class ShadeSolver:
     names = ARKIT
 
     def __init__(self, *_: object) -> None:
-        self.controls: list[LiveControls] = []
+        self.controls: list[WebcamControls] = []
         self.intervals: list[float | None] = []
         self.posed = 0
 
-    def step(self, picture: np.ndarray, interval: float | None, controls: LiveControls) -> LiveFrame:
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         if len(self.controls) < 330:
             self.controls.append(controls)
             self.intervals.append(interval)

@@ -14,6 +14,7 @@ import torch
 from planted_faces import JAW, SMILE, Endless, ShadeSolver, film
 
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
+from torchface.capture.webcam import WebcamControls
 from torchface.cli import main
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -101,7 +102,7 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
     recordings.start()
     for i, came in enumerate(times):
-        frame = ShadeSolver().step(np.full((48, 64, 3), 40 + 20 * i, np.uint8), None, _controls())
+        frame = ShadeSolver().step(np.full((48, 64, 3), 40 + 20 * i, np.uint8), None, WebcamControls())
         recordings.add(float(came), frame)
     recordings.finish()
     table = np.loadtxt(tmp_path / "out" / "weights.csv", delimiter=",", skiprows=1, usecols=(1,))
@@ -110,12 +111,6 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     assert keys is not None
     np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
-
-
-def _controls() -> object:
-    from torchface.workflows.live.solved_frames import LiveControls
-
-    return LiveControls()
 
 
 def test_even_frames_make_an_even_take(tmp_path: Path) -> None:

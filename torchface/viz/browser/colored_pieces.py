@@ -16,7 +16,7 @@ from torchface.rendering.clay_shading import CLAY
 
 _MAX_COMPONENTS = 16
 _MAX_COLORS = 6
-_MIN_COLOR_DISTANCE = 0.12
+_MIN_COLOR_DISTANCE = 0.72  # over the number of colours
 _MIN_FRACTION = 0.004
 
 
@@ -35,16 +35,20 @@ class Part:
     color: tuple[float, float, float]
 
 
-def split_parts(mesh: Mesh) -> list[Part]:
+def split_parts(mesh: Mesh, most_colors: int = _MAX_COLORS) -> list[Part]:
     """The mesh cut by connected component and by colour, largest piece first.
 
     Colours are those of the texture, else of the vertices, else of what regions are named; few classes, for shapes in
     motion. Every triangle lands in one part, but for those of clear shells over the eye and of lashes.
+
+    Args:
+        mesh: what to cut.
+        most_colors: at most; more look smoother and make more pieces.
     """
     mesh = mesh.to("cpu")
     colors, shown = _triangle_colors(mesh)
     component = _components(mesh)
-    classes, palette = _color_classes(colors)
+    classes, palette = _color_classes(colors, most_colors)
     piece = torch.where(shown, component * len(palette) + classes, -1)
     # A few triangles of a stray colour do not deserve a part of their own: they take their component's main one.
     for number in component.unique().tolist():
@@ -104,13 +108,13 @@ def _components(mesh: Mesh) -> Tensor:
     return rank[label].clamp(max=_MAX_COMPONENTS - 1)
 
 
-def _color_classes(colors: Tensor) -> tuple[Tensor, Tensor]:
+def _color_classes(colors: Tensor, most: int) -> tuple[Tensor, Tensor]:
     """A class (F,) and the palette (K,3): k-means from colours that lie far from each other."""
     points = colors.double().numpy()
     centres = [points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]]
-    while len(centres) < _MAX_COLORS:
+    while len(centres) < most:
         distance = np.min([np.linalg.norm(points - centre, axis=1) for centre in centres], axis=0)
-        if distance.max(initial=0.0) < _MIN_COLOR_DISTANCE:
+        if distance.max(initial=0.0) < _MIN_COLOR_DISTANCE / most:
             break
         centres.append(points[distance.argmax()])
     palette, label = kmeans2(points, np.stack(centres), minit="matrix", missing="warn")

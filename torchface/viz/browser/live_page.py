@@ -25,6 +25,7 @@ from torchface.viz.browser.shared_input import SharedInput
 _RATE, _LEAST_RATE = 25.0, 2.0  # updates a second
 _LIGHT = 12_000  # vertices that a browser moves at that rate
 _PANEL_INTERVAL = 0.2
+_COLORS = 16  # the texture is never shown: in motion a browser gets positions alone
 _SHOWN_NOTES = 3
 _NO_PICTURE = np.full((360, 480, 3), 60, np.uint8)
 
@@ -59,7 +60,7 @@ class LivePage(BrowserPage):
         self.updates = 0
         super().__init__(label, port)
         self._frame = self.server.scene.add_frame("/head", show_axes=False)
-        self.head = HeadOnPage(self.server, rig.neutral, "head")
+        self.head = HeadOnPage(self.server, rig.neutral, "head", most_colors=_COLORS)
         self.head.enable_texture(False)  # it would follow at rest alone
         vertices = rig.neutral.vertices
         self._pivot = ((vertices.amin(0) + vertices.amax(0)) / 2).double().numpy()

@@ -8,6 +8,7 @@ import torch
 from torchface.capture.video import VideoState
 from torchface.capture.video.landmark_offsets import LandmarkOffsets
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
+from torchface.capture.webcam import WebcamControls
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
@@ -15,7 +16,7 @@ from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.landmarks.images.tracking import LandmarkTracker
 from torchface.rig import BlendshapeRig
 from torchface.workflows.live.live_frames import planes
-from torchface.workflows.live.solved_frames import LiveControls, LiveFrame
+from torchface.workflows.live.solved_frames import LiveFrame
 from torchface.workflows.track.track_models import TrackModels
 from torchface.workflows.track.track_video import solver_for
 
@@ -50,7 +51,7 @@ class ActorSolver:
         self._solver = solver if offsets is None else solver.shifted(offsets)
         self._state: VideoState | None = None
 
-    def step(self, picture: np.ndarray, interval: float | None, controls: LiveControls) -> LiveFrame:
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; before the first face all weights are 0. Of an actor nothing is learned on the way."""
         seen = self._tracker.step(planes(picture))
         trust = trust_of(seen.confidence, seen.visibility)

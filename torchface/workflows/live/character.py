@@ -46,7 +46,7 @@ class Character:
     def notes(self) -> tuple[str, ...]:
         """What the user should know of it."""
         driven = len(self.rig.names) - len(self.shapes.undriven)
-        if driven >= _FEW:
+        if driven >= _FEW or not self.shapes.undriven:
             return ()
         return (
             f"{self.name}: {driven} of its {len(self.rig.names)} shapes move; {quoted(self.shapes.undriven)} are "

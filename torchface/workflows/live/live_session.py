@@ -8,6 +8,7 @@ from collections import deque
 
 import numpy as np
 
+from torchface.capture.webcam import WebcamControls
 from torchface.errors import FileFormatError
 from torchface.progress import Progress, silent
 from torchface.viz.browser.live_view import LiveView
@@ -16,7 +17,7 @@ from torchface.workflows.live.guided_calibration import GuidedCalibration
 from torchface.workflows.live.live_figures import LiveFigures
 from torchface.workflows.live.live_frames import FrameSource, Say
 from torchface.workflows.live.recordings import Recordings
-from torchface.workflows.live.solved_frames import FaceSolver, LiveControls, LiveFrame, solved_frames
+from torchface.workflows.live.solved_frames import FaceSolver, LiveFrame, solved_frames
 from torchface.workflows.live.weight_streams import WeightStreams
 
 _MAX_NOTES = 20
@@ -126,10 +127,10 @@ class LiveSession:
         except KeyboardInterrupt:  # how people end what has no end of its own
             pass
 
-    def _controls(self) -> LiveControls:
+    def _controls(self) -> WebcamControls:
         forget, self._forget = self._forget, False
         pose = 0 if self._calibration is None else self._calibration.pose
-        return LiveControls(pose, self.gain, self.smoothing, reset=forget)
+        return WebcamControls(pose, self.gain, self.smoothing, reset=forget)
 
     def _keep(self, came: float, solved: LiveFrame) -> None:
         with self._lock:

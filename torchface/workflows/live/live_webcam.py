@@ -18,7 +18,7 @@ from torchface.workflows.live.camera import DEFAULT_SIZE
 from torchface.workflows.live.character import load_character
 from torchface.workflows.live.face_watch import FaceWatch
 from torchface.workflows.live.live_figures import LiveReport
-from torchface.workflows.live.live_frames import FrameSource, Say, open_source
+from torchface.workflows.live.live_frames import Say, open_source
 from torchface.workflows.live.live_session import LiveSession, Notes
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.solved_frames import FaceSolver
@@ -61,7 +61,7 @@ def go_live(
     settings: LiveSettings,
     say: Say,
     opened: Say,
-    make_solver: Callable[[FrameSource], FaceSolver],
+    make_solver: Callable[[Progress], FaceSolver],
     progress: Progress | None = None,
 ) -> tuple[LiveReport, list[SavedTake]]:
     """Solves, sends, records and shows what a camera sees, until it ends or is interrupted.
@@ -70,7 +70,7 @@ def go_live(
         settings: what with.
         say: told what the user should know while it runs, and without a page what a calibration asks for.
         opened: told the page's address.
-        make_solver: gives what solves the frames, by ARKit's names.
+        make_solver: gives what solves the frames, by ARKit's names; told where its steps are shown.
         progress: called with the number of frames.
 
     Returns:
@@ -99,10 +99,10 @@ def go_live(
     with ExitStack() as stack:
         if settings.record is not None:
             stack.enter_context(job_lock(settings.record))
+        progress("loading the solver")
+        solver = make_solver(progress)
         progress("opening the camera")
         source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size)))
-        progress("loading the solver")
-        solver = make_solver(source)
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
         place = settings.record or RECORDINGS
         recordings = Recordings(place, character, source.video.path.name, source.video.fps)

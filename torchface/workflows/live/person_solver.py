@@ -1,45 +1,53 @@
-"""What solves anybody's face: the embedded performer's rig stands for theirs."""
+"""What solves anybody's face: the webcam's graph, as the browser app runs it too."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import torch
 
-from torchface.shape_names import ARKIT, mapping
-from torchface.synthetic import performer
-from torchface.workflows.live.actor_solver import ActorSolver
-from torchface.workflows.live.live_frames import FrameSource
-from torchface.workflows.live.solved_frames import FaceSolver, LiveControls, LiveFrame
-from torchface.workflows.track.track_models import load_track_models
-from torchface.workflows.track.track_video import camera_of
+from torchface.capture.webcam import WebcamControls
+from torchface.onnx.webcam.webcam_session import WebcamSession
+from torchface.progress import Progress
+from torchface.workflows.live.solved_frames import LiveFrame
+from torchface.workflows.webcam.webcam_graph import webcam_graph
+
+_USUAL = 1 / 30  # seconds
 
 
 class PersonSolver:
     """Solves frames for ARKit's weights.
 
     Args:
-        solver: by any rig's names.
+        session: runs the graph.
     """
 
-    names = ARKIT
+    def __init__(self, session: WebcamSession) -> None:
+        self._session = session
+        self._ever = False
 
-    def __init__(self, solver: FaceSolver) -> None:
-        self._solver = solver
-        self._matrix = mapping(solver.names, ARKIT)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self._session.names
 
-    def step(self, picture: np.ndarray, interval: float | None, controls: LiveControls) -> LiveFrame:
-        """Solves the next frame; see :class:`FaceSolver`."""
-        solved = self._solver.step(picture, interval, controls)
-        return replace(solved, weights=(controls.gain * (self._matrix @ solved.weights)).clamp(0, 1))
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
+        """Solves the next frame; see :class:`torchface.workflows.live.solved_frames.FaceSolver`."""
+        self._session.controls = controls
+        found = self._session.step(picture, _USUAL if interval is None else interval)
+        solved = LiveFrame(
+            found.weights, found.rotation, found.landmarks, found.iris, found.gaze, calibrated=found.calibrated
+        )
+        self._ever = (self._ever and not controls.reset) or solved.seen
+        # Before the first face the graph's head looks anywhere.
+        return solved if self._ever else replace(solved, rotation=torch.full((3, 3), torch.nan))
 
 
-def person_solver(source: FrameSource) -> PersonSolver:
-    """A solver for whoever sits before a camera.
+def person_solver(progress: Progress) -> PersonSolver:
+    """A solver for whoever sits before a camera; the first time it is made, which takes a minute.
 
     Raises:
-        FileFormatError: a model is damaged.
+        FileFormatError: a model is damaged, or the cache cannot be written to.
     """
-    rig = performer(texture=False)
-    models = load_track_models(rig, fps=source.video.fps)
-    return PersonSolver(ActorSolver(rig, models, camera_of(source.video, None)))
+    return PersonSolver(WebcamSession(webcam_graph(progress)))

@@ -11,29 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchface.capture.webcam import WebcamControls
 from torchface.workflows.live.live_frames import FrameSource
 from torchface.workflows.track.head_rotations import eye_angles, head_angles
 
 _SHORTEST = 1e-3  # seconds between frames
-
-
-@dataclass(frozen=True)
-class LiveControls:
-    """What a user sets while frames are solved.
-
-    Args:
-        pose: what the person was asked to hold: 0 nothing, 1 rest, 2 mouth open, 3 smile, 4 brows up, 5 eyes shut.
-        gain: 1 is usual; more makes expressions larger.
-        smoothing: 0 none, 0.5 usual, 1 most.
-        reset: forget the person.
-        freeze: learn no more of the person.
-    """
-
-    pose: int = 0
-    gain: float = 1.0
-    smoothing: float = 0.5
-    reset: bool = False
-    freeze: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +56,7 @@ class FaceSolver(Protocol):
     @property
     def names(self) -> tuple[str, ...]: ...
 
-    def step(self, picture: np.ndarray, interval: float | None, controls: LiveControls) -> LiveFrame:
+    def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame.
 
         Args:
@@ -85,7 +67,7 @@ class FaceSolver(Protocol):
 
 
 def solved_frames(
-    source: FrameSource, solver: FaceSolver, controls: Callable[[], LiveControls] = LiveControls
+    source: FrameSource, solver: FaceSolver, controls: Callable[[], WebcamControls] = WebcamControls
 ) -> Iterator[tuple[float, np.ndarray, LiveFrame]]:
     """When each frame came, the frame, and what was solved of it."""
     before: float | None = None

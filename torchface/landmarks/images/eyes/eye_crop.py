@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
-from torchface.landmarks.images.face_crop import cut_crops
+from torchface.landmarks.images.face_crop import cut_crop
 
 CROP_WIDTH, CROP_HEIGHT = 48, 32
 """Pixels of an eye's crop."""
@@ -92,4 +92,4 @@ def cut_eyes(image: Tensor, transforms: Tensor, width: int = CROP_WIDTH, height:
     Raises:
         ShapeError: no such image.
     """
-    return cut_crops(image, transforms.double(), width, height)
+    return torch.stack([cut_crop(image, one.double(), width, height) for one in transforms])

@@ -1,1 +1,0 @@
-"""Examples of a person's expressions, from pictures or before a webcam."""
