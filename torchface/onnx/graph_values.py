@@ -200,7 +200,7 @@ def _rename(graph: onnx.GraphProto, prefix: str) -> None:
     for value in (*graph.input, *graph.output, *graph.initializer):
         value.name = prefix + value.name
     for node in graph.node:
-        node.name = prefix + node.name
+        node.name = prefix + node.name if node.name else ""
         for names in (node.input, node.output):
             names[:] = [prefix + name if name else "" for name in names]
         for attribute in node.attribute:
