@@ -36,7 +36,7 @@ from torchface.synthetic.stages.webcam.webcam_video import WebcamFrame, WebcamSe
 FPS = 30.0
 CAMERA = WebcamSettings()
 KEPT = Path("out/webcam_clips")
-_METHOD = "webcam clips/1"
+_METHOD = "webcam clips/2"
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Scene:
 SHORT = {
     "ict, 4 s": Scene("ict", 92001, 1, 5.0, 4.0, SittingSettings(520, (10, 15), 5.0), (0.2, 3.9), hand=2.2),
     "performer, 4 s": Scene(
-        "performer", 91005, 0, 17.5, 4.0, SittingSettings(560, (-30, 25), -4.0), (0.2, 3.9), away=0.9, blinks=(0.3, 3.2)
+        "performer", 91005, 0, 17.5, 4.0, SittingSettings(560, (-30, 25), -4.0), (0.2, 3.9), away=1.2, blinks=(0.3, 3.3)
     ),
 }
 """Of people and takes as in ``SCENES``: quick to render."""

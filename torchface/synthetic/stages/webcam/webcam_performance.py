@@ -12,12 +12,15 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.face_pictures.turned_eyes import FULL_GAZE
-from torchface.synthetic.stages.weight_curves import perform, raised_cosine
+from torchface.synthetic.stages.weight_curves import GESTURES, perform, raised_cosine
 
 _MOUTH = ("jaw", "mouth")
 _AWAY = 105.0  # degrees that a head turns away: no face is left to be seen
 _TURNING, _TURNED = 0.5, 0.7  # seconds on the way there or back, and away
 _RAISING, _RAISED = 0.25, 0.9  # seconds that a hand takes to the mouth, and stays there
+# What a talking mouth does besides, and where between start and end; seconds of rise, hold and fall.
+_ASKED = ((GESTURES["smile"], 0.1), ({"jawOpen": 0.75}, 0.72))
+_ASKED_FOR = (0.25, 0.25, 0.35)
 _BLINK = (0.08, 0.03, 0.16)  # seconds to close, closed, to open
 
 
@@ -115,7 +118,7 @@ def sitting(
 
 
 def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: float, end: float) -> Tensor:
-    """Weights (T,52) with a mouth that talks, smiles and opens between two seconds.
+    """Weights (T,52) with a mouth that talks between two seconds, and meanwhile smiles once and opens wide once.
 
     Args:
         weights: of a take whose mouth rests.
@@ -128,7 +131,13 @@ def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: 
     assert made is not None
     seconds = torch.arange(len(weights), dtype=torch.float64) / fps
     share = raised_cosine(seconds, start, 0.4, max(end - start - 0.8, 0.0), 0.4).float()[:, None]
-    return torch.where(mouth, torch.maximum(weights, share * made.values[..., 0]), weights)
+    talking = torch.where(mouth, torch.maximum(weights, share * made.values[..., 0]), weights)
+    for pose, place in _ASKED:
+        curve = raised_cosine(seconds, start + place * (end - start), *_ASKED_FOR).float()
+        for name, value in pose.items():
+            row = ARKIT.index(name)
+            talking[:, row] = torch.maximum(talking[:, row], value * curve)
+    return talking
 
 
 def with_blinks(weights: Tensor, fps: float, seconds: tuple[float, ...]) -> Tensor:
