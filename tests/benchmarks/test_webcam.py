@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
-from webcam_clips import FPS, KEPT, SCENES, SHORT, Clip, webcam_clip
+from webcam_clips import CAMERA, FPS, KEPT, SCENES, SHORT, Clip, webcam_clip
 from webcam_measures import (
     LIDS,
     REGIONS,
@@ -36,6 +35,7 @@ from torchface.landmarks.images.face_reading import FaceReading
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
 
 pytestmark = pytest.mark.real
+SIZE = (CAMERA.width, CAMERA.height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,6 @@ class Filmed:
     name: str
     clip: Clip
     readings: list[FaceReading]
-    trust: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +69,13 @@ def filmed(data: Path) -> list[Filmed]:
     shots = []
     for name, scene in scenes.items():
         clip = webcam_clip(scene, data)
-        shots.append(Filmed(name, clip, *read_faces(clip.frames(), KEPT)))
+        shots.append(Filmed(name, clip, read_faces(clip.frames(), FPS, KEPT)))
     return shots
 
 
 @pytest.fixture(scope="module")
 def rows(filmed: list[Filmed]) -> dict[str, Row]:
-    return {name: measured(filmed, [solve(shot.readings, shot.trust, FPS) for shot in filmed])
+    return {name: measured(filmed, [solve(shot.readings, FPS, SIZE) for shot in filmed])
             for name, solve in SOLVERS.items()}  # fmt: skip
 
 

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import onnxruntime
 import torch
+from onnx import ModelProto, TensorProto
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from torchface import zoo
 from torchface.capture.video import VideoState
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
+from torchface.capture.webcam import (
+    AllAtOnce,
+    ExampleShapes,
+    ExampleSolver,
+    LandmarkModel,
+    Regional,
+    character_matrix,
+    paper_examples,
+)
+from torchface.capture.webcam.example_methods import ExampleMethod
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.landmarks import LandmarkTracker, TrackedFace
+from torchface.landmarks import LandmarkNetwork
+from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.landmark_finder import trust_of
+from torchface.landmarks.images.ibug_68 import box_around
+from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
+from torchface.onnx.graph_values import OPSET, ValueGraph
+from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
+from torchface.onnx.webcam.webcam_model import READING
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
-from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.track.track_video import solver_for
 
-SIZE = (640, 480)
-_HALF = 0.02  # of a box's side: the deviation at which a confidence is one half
-_SHUT, _SHUT_WIDTH = 0.1, 0.03  # openness of eyes that may well be shut
 _LEAST = 6  # landmarks that a solve needs
 
 
@@ -47,61 +63,118 @@ class Solved:
     milliseconds: float
 
 
-Solver = Callable[[list[FaceReading], Tensor, float], Solved]
-"""Solves readings and how far each landmark is to be trusted (T,68) at frames a second."""
+Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]
+"""Solves readings of a video with so many frames a second, pixels wide and high."""
 
 
-def read_faces(frames: Tensor, kept: Path) -> tuple[list[FaceReading], Tensor]:
-    """What the shipped networks read of the largest face in frames uint8 (T,3,H,W), and their trust (T,68); kept."""
-    named = load_finder()
-    path = kept / f"{content_key('faces read/1', finder=Path(named.source), frames=frames)[:16]}.safetensors"
+def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
+    """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model; kept in a folder."""
+    model = _reader().SerializeToString()
+    key = content_key("faces read/2", model=hashlib.sha256(model).hexdigest(), frames=frames, fps=fps)[:16]
+    path = kept / f"{key}.safetensors"
     if not path.is_file():
-        tracker = LandmarkTracker(named.finder)
-        rows = [_reading(tracker.step(frame)) for frame in frames]
+        session = onnxruntime.InferenceSession(model, _one_thread(), providers=["CPUExecutionProvider"])
+        state, rows = np.zeros(STATE, np.float32), []
+        for frame in frames:  # a frame's place is the next one's
+            given = {"image": frame.permute(1, 2, 0).contiguous().numpy(), "interval": np.float32([1 / fps])}
+            *row, state = session.run(None, given | {"state": state})
+            rows.append(row)
         tables = {
-            field.name: torch.stack([getattr(row, field.name) for row, _ in rows]) for field in fields(FaceReading)
+            name: torch.from_numpy(np.stack(column))
+            for name, column in zip(READING, zip(*rows, strict=True), strict=True)
         }
-        write_file(path, save(tables | {"trust": torch.stack([trust for _, trust in rows])}))
+        write_file(path, save(tables))
     stored = load_file(path)
-    trust = stored.pop("trust")
-    return [FaceReading(**{name: values[row] for name, values in stored.items()}) for row in range(len(trust))], trust
+    stored["presence"] = stored["presence"].reshape(-1)
+    return [FaceReading(**{name: values[row] for name, values in stored.items()}) for row in range(len(frames))]
 
 
-def _reading(face: TrackedFace) -> tuple[FaceReading, Tensor]:
-    """A tracked face as a reading whose eyes are told by their landmarks, its irises unseen."""
-    marks = face.landmarks
-    deviation = _HALF * (1 / face.confidence.clamp(min=1e-4) - 1).clamp(min=0).sqrt() * face.box[2]
-    eyes = torch.stack([marks[36:42], marks[42:48]])
-    gap = (eyes[:, [1, 2]] - eyes[:, [5, 4]]).norm(dim=-1).mean(1)
-    openness = gap / (eyes[:, 0] - eyes[:, 3]).norm(dim=-1)
-    shut = torch.sigmoid((_SHUT - openness) / _SHUT_WIDTH)
-    seen = torch.stack([face.visibility[36:42].mean(), face.visibility[42:48].mean()])
-    return FaceReading(
-        marks, deviation, face.visibility, torch.tensor(face.presence), torch.full((2, 2), torch.nan),
-        openness.nan_to_num(0.0), shut.nan_to_num(0.0), seen,
-    ), trust_of(face.confidence, face.visibility)  # fmt: skip
+def _reader() -> ModelProto:
+    """The part of a webcam's model that reads a face."""
+    graph = ValueGraph()
+    boxes, landmarks = zoo.get_model("face_boxes"), zoo.get_model("landmark_network")
+    assert isinstance(boxes, BoxNetwork)
+    assert isinstance(landmarks, LandmarkNetwork)
+    image, interval, state = (graph.value(name) for name in ("image", "interval", "state"))
+    read = read_face(graph, image, interval, state, boxes, landmarks, ReaderSettings())
+    for name in (*READING, "state"):
+        graph.build.op("Identity", getattr(read, name).name, output=f"read_{name}")
+    shapes = {
+        "landmarks": (68, 2), "deviation": (68,), "visibility": (68,), "presence": (1,), "iris": (2, 2),
+        "openness": (2,), "closed": (2,), "eye_visibility": (2,), "state": (STATE,),
+    }  # fmt: skip
+    outputs = {f"read_{name}": shape for name, shape in shapes.items()}
+    inputs = {"image": ("height", "width", "channels"), "interval": (1,), "state": (STATE,)}
+    return graph.root.model("reader", inputs, outputs, {}, OPSET, {"image": TensorProto.UINT8})
 
 
-def video_solver(readings: list[FaceReading], trust: Tensor, fps: float) -> Solved:
+def _one_thread() -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return options
+
+
+def _trust(reading: FaceReading) -> Tensor:
+    """How far each landmark is to be trusted, (68,), as ``trust_of`` says it of trackers' landmarks."""
+    share = reading.deviation / box_around(reading.landmarks)[2]
+    sure = trust_of(confidence_of(share), reading.visibility)
+    return torch.where(torch.isfinite(reading.landmarks).all(1), sure, 0.0).nan_to_num(0.0)
+
+
+def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]) -> Solved:
     """``VideoSolver`` on the embedded performer's mean head, as ``torchface track --live`` runs it."""
     rig = performer(texture=False)
-    calibration = assumed_calibration(*SIZE)
-    solver = solver_for(rig, load_track_models(rig, fps=fps), calibration)
-    smoother, state, rows = LandmarkFilter(), None, []
-    onto = mapping(rig.names, ARKIT)
+    solver = solver_for(rig, load_track_models(rig, fps=fps), assumed_calibration(*size))
+    smoother = LandmarkFilter()
+    state: VideoState | None = None
+
+    def step(reading: FaceReading) -> Tensor:
+        nonlocal state
+        sure = _trust(reading)
+        landmarks = smoother.step(torch.where(sure[:, None] > 0, reading.landmarks, torch.nan))
+        if state is None and int((torch.isfinite(landmarks).all(1) & (sure > 0)).sum()) < _LEAST:
+            return torch.zeros(len(rig.names))
+        state = solver.step(state or solver.start(), landmarks, confidence=sure, interval=1 / fps)
+        return state.weights.detach().float()
+
+    weights, milliseconds = _timed(step, readings)
+    weights = weights @ mapping(rig.names, ARKIT).T
+    return Solved(weights, gaze_of(weights), milliseconds)
+
+
+def example_solver(make: Callable[[ExampleShapes], ExampleMethod]) -> Solver:
+    """One of the paper's solvers with the examples that the embedded performer shows, and ARKit's names for them."""
+
+    def solve(readings: list[FaceReading], fps: float, size: tuple[int, int]) -> Solved:
+        examples = paper_examples(performer(texture=False))
+        solver = ExampleSolver(examples, make(examples))
+        onto = character_matrix(examples.names, ARKIT)
+        before: Tensor | None = None
+
+        def step(reading: FaceReading) -> Tensor:
+            nonlocal before
+            if torch.isfinite(reading.landmarks).all():
+                before = solver(reading.landmarks[None], before)
+            return torch.zeros(len(examples.names)) if before is None else before[0]
+
+        weights, milliseconds = _timed(step, readings)
+        weights = (weights @ onto.T).clamp(0, 1)
+        return Solved(weights, gaze_of(weights), milliseconds)
+
+    return solve
+
+
+def _timed(step: Callable[[FaceReading], Tensor], readings: list[FaceReading]) -> tuple[Tensor, float]:
+    """What frames give one after the other, and milliseconds of processor time a frame."""
     started = time.process_time()
-    for reading, sure in zip(readings, trust, strict=True):  # a frame's state is the next one's
-        shown = torch.where(sure[:, None] > 0, reading.landmarks, torch.nan)
-        landmarks = smoother.step(shown)
-        if state is None and int(torch.isfinite(landmarks).all(1).sum()) < _LEAST:
-            rows.append(torch.zeros(len(rig.names)))
-            continue
-        before: VideoState = state or solver.start()
-        state = solver.step(before, landmarks, confidence=sure, interval=1 / fps)
-        rows.append(state.weights.detach().float())
-    took = 1000 * (time.process_time() - started) / len(readings)
-    weights = torch.stack(rows) @ onto.T
-    return Solved(weights, gaze_of(weights), took)
+    with torch.no_grad():
+        rows = torch.stack([step(reading) for reading in readings])
+    return rows, 1000 * (time.process_time() - started) / len(readings)
 
 
-SOLVERS: dict[str, Solver] = {"VideoSolver, mean head": video_solver}
+PAPER: dict[str, Solver] = {
+    "paper: all at once": example_solver(lambda examples: AllAtOnce()),
+    "paper: regional": example_solver(lambda examples: Regional()),
+    "paper: linear model": example_solver(LandmarkModel.fit),
+}
+SOLVERS: dict[str, Solver] = {**PAPER, "VideoSolver, mean head": video_solver}
