@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from torchface.capture.webcam import (
     ExampleSolver,
     LandmarkModel,
     Regional,
+    WebcamControls,
     character_matrix,
     paper_examples,
 )
@@ -39,11 +41,13 @@ from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
 from torchface.onnx.graph_values import OPSET, ValueGraph
 from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
 from torchface.onnx.webcam.webcam_model import READING
+from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.track.track_video import solver_for
+from torchface.workflows.webcam.default_solver import default_webcam_solver
 
 _LEAST = 6  # landmarks that a solve needs
 
@@ -142,6 +146,29 @@ def video_solver(readings: list[FaceReading], fps: float, size: tuple[int, int])
     return Solved(weights, gaze_of(weights), milliseconds)
 
 
+def webcam_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]) -> Solved:
+    """``WebcamSolver``'s graph as ``torchface live`` and the app run it; nobody calibrates anything."""
+    session = _webcam_session()
+    controls = WebcamControls().tensor().numpy()
+    state = np.zeros(session.get_inputs()[-1].shape, np.float32)
+    fixed = {"size": np.float32(size), "interval": np.float32(1 / fps), "controls": controls}
+    weights, gazes = [], []
+    started = time.process_time()
+    for reading in readings:  # a frame's state is the next one's
+        given = {name: getattr(reading, name).numpy() for name in READING}
+        solved, gaze, state = session.run(["weights", "gaze", "next_state"], given | fixed | {"state": state})
+        weights.append(torch.from_numpy(solved))
+        gazes.append(torch.from_numpy(gaze))
+    milliseconds = 1000 * (time.process_time() - started) / len(readings)
+    return Solved(torch.stack(weights), torch.stack(gazes), milliseconds)
+
+
+@lru_cache(maxsize=1)
+def _webcam_session() -> onnxruntime.InferenceSession:
+    model = webcam_solver_model(default_webcam_solver()).SerializeToString()
+    return onnxruntime.InferenceSession(model, _one_thread(), providers=["CPUExecutionProvider"])
+
+
 def example_solver(make: Callable[[ExampleShapes], ExampleMethod]) -> Solver:
     """One of the paper's solvers with the examples that the embedded performer shows, and ARKit's names for them."""
 
@@ -177,4 +204,4 @@ PAPER: dict[str, Solver] = {
     "paper: regional": example_solver(lambda examples: Regional()),
     "paper: linear model": example_solver(LandmarkModel.fit),
 }
-SOLVERS: dict[str, Solver] = {**PAPER, "VideoSolver, mean head": video_solver}
+SOLVERS: dict[str, Solver] = {**PAPER, "VideoSolver, mean head": video_solver, "WebcamSolver": webcam_solver}
