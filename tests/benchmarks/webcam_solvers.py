@@ -16,7 +16,6 @@ from onnx import ModelProto, TensorProto
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from torchface import zoo
 from torchface.capture.video import VideoState
 from torchface.capture.video.landmark_smoothing import LandmarkFilter
 from torchface.capture.webcam import (
@@ -33,21 +32,19 @@ from torchface.capture.webcam.example_methods import ExampleMethod
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
-from torchface.landmarks import LandmarkNetwork
-from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.landmark_finder import confidence_of, trust_of
 from torchface.onnx.graph_values import OPSET, ValueGraph
 from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
-from torchface.onnx.webcam.webcam_model import READING
-from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
+from torchface.onnx.webcam.webcam_solver_graph import READING, webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.track.track_video import solver_for
 from torchface.workflows.webcam.default_solver import default_webcam_solver
+from torchface.workflows.webcam.webcam_graph import webcam_networks
 
 _LEAST = 6  # landmarks that a solve needs
 
@@ -96,11 +93,8 @@ def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
 def _reader() -> ModelProto:
     """The part of a webcam's model that reads a face."""
     graph = ValueGraph()
-    boxes, landmarks = zoo.get_model("face_boxes"), zoo.get_model("landmark_network")
-    assert isinstance(boxes, BoxNetwork)
-    assert isinstance(landmarks, LandmarkNetwork)
     image, interval, state = (graph.value(name) for name in ("image", "interval", "state"))
-    read = read_face(graph, image, interval, state, boxes, landmarks, ReaderSettings())
+    read = read_face(graph, image, interval, state, webcam_networks(), ReaderSettings())
     for name in (*READING, "state"):
         graph.build.op("Identity", getattr(read, name).name, output=f"read_{name}")
     shapes = {
@@ -151,7 +145,7 @@ def webcam_solver(readings: list[FaceReading], fps: float, size: tuple[int, int]
     session = _webcam_session()
     controls = WebcamControls().tensor().numpy()
     state = np.zeros(session.get_inputs()[-1].shape, np.float32)
-    fixed = {"size": np.float32(size), "interval": np.float32(1 / fps), "controls": controls}
+    fixed = {"size": np.array(size, np.float32), "interval": np.array(1 / fps, np.float32), "controls": controls}
     weights, gazes = [], []
     started = time.process_time()
     for reading in readings:  # a frame's state is the next one's
