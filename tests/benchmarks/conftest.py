@@ -27,6 +27,7 @@ PEERS = (
     "proxsuite",
     "quadprog",
     "eos-py",
+    "nlopt",
     "dlib",
     "menpofit",
 )

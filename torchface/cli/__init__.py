@@ -21,6 +21,7 @@ from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
 from torchface.cli.evaluate import evaluate
+from torchface.cli.examples import examples
 from torchface.cli.exit_messages import plain_errors
 from torchface.cli.export import EXPORTS
 from torchface.cli.export_model import export_model
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "attach": attach,
     "solve": solve,
     "track": track,
+    "examples": examples,
     "live": live,
     "retarget": retarget,
     "evaluate": evaluate,

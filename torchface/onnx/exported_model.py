@@ -6,6 +6,7 @@ import json
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import onnx
 import torch
@@ -75,6 +76,7 @@ def exported_model(
         ir.passes.common.DeduplicateInitializersPass(size_limit=2**30),
         ir.passes.common.ClearMetadataAndDocStringPass(),
     )(program.model)
+    _with_known_casts(program.model)
     model = program.model_proto
     del model.graph.value_info[:], model.metadata_props[:]
     for value in (*model.graph.input, *model.graph.output):
@@ -85,3 +87,19 @@ def exported_model(
     )
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _with_known_casts(model: Any) -> None:
+    """Casts to the type of another value, of which runtimes warn, as casts to that type."""
+    from onnxscript import ir
+
+    for node in list(model.graph):
+        if node.op_type != "CastLike":
+            continue
+        like = node.inputs[1]
+        dtype = like.dtype if like.const_value is None else like.const_value.dtype
+        if dtype is not None:
+            cast = ir.node("Cast", [node.inputs[0]], {"to": int(dtype)})
+            cast.outputs[0].name, cast.outputs[0].type = node.outputs[0].name, node.outputs[0].type
+            cast.outputs[0].shape = node.outputs[0].shape
+            ir.convenience.replace_nodes_and_values(model.graph, node, [node], [cast], node.outputs, cast.outputs)

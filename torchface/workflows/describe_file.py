@@ -9,6 +9,8 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import MarkerSolver, observability
+from torchface.capture.webcam import ExampleShapes, ExampleSolver, landmark_observability
+from torchface.capture.webcam.example_shapes import is_examples
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_mesh, load_rig, load_take
@@ -58,6 +60,8 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _mesh_rows(load_mesh(path))
     if suffix in {".c3d", ".trc", ".csv"}:
         return _take_rows(load_take(path))
+    if suffix == ".json" and is_examples(path):
+        return _example_rows(ExampleShapes.load(path))
     if suffix == ".json":
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
@@ -65,6 +69,14 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected .glb .obj .ply .stl .off .c3d .trc .csv .json .onnx"
     )
+
+
+def _example_rows(examples: ExampleShapes) -> Rows:
+    return [
+        ("examples", f"{len(examples.names)}: {', '.join(examples.names)}"[:_MAX_LENGTH]),
+        ("eyes' distance", f"{examples.eyes_distance:.1f} pixels"),
+        ("what landmarks see", str(landmark_observability(ExampleSolver(examples)))),
+    ]
 
 
 def _mesh_rows(mesh: Mesh) -> Rows:

@@ -8,11 +8,12 @@ from torchface.capture.markers.helmet_solver import HelmetMotion, HelmetSolver
 from torchface.capture.markers.hybrid_solver import HybridSolver, gamma_curves
 from torchface.capture.markers.marker_labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.marker_solver import MarkerSolver
-from torchface.capture.markers.observability import Observability, observability
+from torchface.capture.markers.observability import observability
 from torchface.capture.markers.rig_fit_check import FitCheck, check_fit
 from torchface.capture.markers.sparsity import sparsity_by_rule
 from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
+from torchface.capture.weight_observability import Observability
 
 __all__ = [
     "AttachmentFit",

@@ -11,8 +11,10 @@ from torchface.capture.webcam.example_shapes import ExampleShapes
 from torchface.capture.webcam.example_solver import ExampleFit, ExampleSolver
 from torchface.capture.webcam.landmark_model import LandmarkModel
 from torchface.capture.webcam.landmark_objectives import Distances, SquaredDistances
+from torchface.capture.webcam.landmark_observability import landmark_observability
 from torchface.capture.webcam.landmark_placement import LandmarkBoxes, SolvedSimilarity
 from torchface.capture.webcam.rig_examples import paper_examples, rig_examples
+from torchface.capture.webcam.shown_examples import example_remarks, shown_examples
 from torchface.capture.webcam.webcam_settings import WebcamSettings
 from torchface.capture.webcam.webcam_solver import WebcamSolver
 from torchface.capture.webcam.webcam_state import WebcamControls, WebcamState
@@ -34,8 +36,11 @@ __all__ = [
     "WebcamSolver",
     "WebcamState",
     "character_matrix",
+    "example_remarks",
     "head_angles",
+    "landmark_observability",
     "paper_examples",
     "paper_expressions",
     "rig_examples",
+    "shown_examples",
 ]

@@ -21,6 +21,16 @@ _MAX_BYTES = 2**22
 _DECIMALS = 4
 
 
+def is_examples(path: str | Path) -> bool:
+    """Whether a JSON file says that it holds examples.
+
+    Raises:
+        FileFormatError: the file is missing, too large or no JSON.
+    """
+    document = read_json(path, max_bytes=_MAX_BYTES)
+    return isinstance(document.found, dict) and document.found.get("format") == _FORMAT
+
+
 @dataclass(frozen=True, eq=False)
 class ExampleShapes:
     """Where the 68 landmarks lie on one face at rest and in N expressions.

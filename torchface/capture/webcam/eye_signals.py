@@ -21,15 +21,16 @@ LOOKS = (
 SIDEWAYS, UPWARD = 0.52, 0.45
 """Rotation of an eye at weight 1, radians: 30 degrees to the side, 26 up and down."""
 
-# Millimetres: an eyeball's middle lies behind the middle of its corners, its iris before the eyeball's.
-_BEHIND, _IRIS = 8.5, 10.5
+# Millimetres: an eyeball's middle lies behind the middle of its corners, above it and further out; its iris before it.
+_BEHIND, _ABOVE, _OUTWARD, _IRIS = 9.5, 1.8, 1.8, 11.5
 _WIDEST = 0.9 * _IRIS
 _STRAYS = 0.35  # radians: what is further to the side or up is no looking straight ahead
 _SHUT = 0.05
 _SURELY_OPEN, _SURELY_SHUT = 0.3, 0.9
 _LEAST_OPEN = 0.35  # of an eye that is surely not shut
 _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
-_OPEN_MEMORY, _SHUT_MEMORY, _STRAIGHT_MEMORY = 8.0, 2.0, 20.0  # seconds
+_OPEN_MEMORY, _SHUT_MEMORY, _STRAIGHT_MEMORY = 8.0, 2.0, 60.0  # seconds
+_LASTING, _ASKED = 0.3, 10.0  # who is asked to rest looks ahead: that counts as much as ten times as long without
 _STRAIGHT_PRIOR, _SHUT_PRIOR = 1.0, 0.2  # seconds
 _DOWNWARD = 0.2  # how quickly the open level falls beside how it rises: blinks and squints are no level
 
@@ -92,7 +93,9 @@ def seen_gaze(rays: Tensor, iris: Tensor, rotation: Tensor, depth: Tensor) -> Te
         depth: of the eyes, (2,), millimetres.
     """
     middle = torch.stack([0.5 * (rays[a] + rays[b]) for a, b in CORNERS])
-    across = (iris - middle) * depth[:, None] + _BEHIND * rotation[:2, 2]
+    out = torch.stack([-rotation[:2, 0], rotation[:2, 0]])
+    centre = _OUTWARD * out + _ABOVE * rotation[:2, 1] - _BEHIND * rotation[:2, 2]
+    across = (iris - middle) * depth[:, None] - centre
     length = across.square().sum(1, keepdim=True).sqrt()
     across = across * (_WIDEST / length.clamp(min=_WIDEST))
     toward = -(_IRIS**2 - across.square().sum(1, keepdim=True)).sqrt()
@@ -144,16 +147,18 @@ def eye_signals(
     looks = ~torch.isnan(gaze).any(1)
     seen = torch.where(looks[:, None], gaze, 0.0)
     gaze_trust = looks * visible * (1 - shut)
-    patience = interval / (before.straight_seen + _STRAIGHT_PRIOR + interval) * torch.where(resting, 3.0, 1.0)
+    counted = interval * torch.where(resting, _ASKED, 1.0)
+    patience = counted / (before.straight_seen + _STRAIGHT_PRIOR + counted)
     rate = (learns * gaze_trust * patience.clamp(max=1.0))[:, None]
-    straight = before.straight + rate * (seen.clamp(-_STRAYS, _STRAYS) - before.straight)
-    straight_seen = (before.straight_seen + learns * interval * gaze_trust.max()).clamp(max=_STRAIGHT_MEMORY)
+    # People look up or down for long, to the side or across only as their eyes lie otherwise than is usual.
+    one = torch.ones_like(pose)
+    lasting = seen.clamp(-_STRAYS, _STRAYS) * torch.stack([one, torch.where(resting, one, _LASTING * one)])
+    straight = before.straight + rate * (lasting - before.straight)
+    straight_seen = (before.straight_seen + learns * counted * gaze_trust.max()).clamp(max=_STRAIGHT_MEMORY)
     ahead = seen - straight
-    # Both eyes look at one thing: up alike, and to the side by what the surer one says where the other is hidden.
+    # Both eyes look at one thing, and what they squint at the person's own nearness is learned as straight ahead.
     share = gaze_trust + 1e-3
-    both = (share[:, None] * ahead).sum(0) / share.sum()
-    sideways = gaze_trust * ahead[:, 0] + (1 - gaze_trust) * both[0]
-    ahead = torch.stack([sideways, both[1].expand(2)], dim=1)
+    ahead = ((share[:, None] * ahead).sum(0) / share.sum()).expand(2, 2)
     any_gaze = gaze_trust.max().expand(2)
 
     level, floor = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]

@@ -13,6 +13,7 @@ class WebcamSettings:
 
     Args:
         noise: of landmarks in one frame, as a share of the distance of the eyes' outer corners.
+        prior_strength: of the shape prior; 1 is Bayes' rule, were landmarks' errors independent of each other.
         sparsity: the L1 penalty, for a weight of 1.
         ridge: for a squared weight of 1.
         motion: how far a weight wanders in a second, standard deviation.
@@ -30,11 +31,12 @@ class WebcamSettings:
     """
 
     noise: float = 0.015
-    sparsity: float = 1.0
+    prior_strength: float = 0.3
+    sparsity: float = 0.5
     ridge: float = 1e-2
     motion: float = 1.5
     contour_slide: float = 0.3
-    steps: int = 2
+    steps: int = 1
     coefficients: int = 64
     alike: float = 0.3
     learning: float = 10.0
@@ -44,7 +46,7 @@ class WebcamSettings:
     gaze_noise: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("sparsity", "ridge", "rest_penalty"):
+        for name in ("prior_strength", "sparsity", "ridge", "rest_penalty"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT)
         for name in ("noise", "motion", "alike", "learning", "memory", "openness_noise", "gaze_noise"):
             checked_number(name, getattr(self, name), 0.0, LARGEST_WEIGHT, above=True)

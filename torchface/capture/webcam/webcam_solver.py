@@ -34,17 +34,20 @@ from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.optim.exported_operators import split_box_program, symmetric_inverse
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
-_RHO, _SPLITTING_STEPS = 0.05, 40
+_RHO, _SPLITTING_STEPS = 0.05, 30
 _UPRIGHT = (1 / 600, -1 / 600)  # of a face some way off; the camera's y goes down
-_ROTATION_UNIT, _TRANSLATION_UNIT = 0.5, 100.0  # radians and millimetres that count as a weight of 1 in the filter
+_BLINK_UNIT = 0.25  # what counts as a weight of 1 in the filter: of blinks, which it must not smooth away,
+_MOTION_UNITS = [0.5] * 3 + [100.0] * 3  # and of the head's motion, radians and millimetres
 _LOOK_EYES = (0, 0, 1, 1, 0, 0, 1, 1)  # whose each of ``LOOKS`` is
 _DAMPING_ROTATION, _DAMPING_TRANSLATION = 0.5, 500.0  # radians and millimetres that a step of a pose may well be
 _FREE = 1e9
 _ENOUGH = 20.0  # landmarks
+_LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
 _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
 _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
@@ -55,6 +58,7 @@ _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is kno
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person tell, and for how long, seconds
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
+_LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
 _CONTOUR_TRUST = 0.5
 _GROUPS = (("jawOpen",), ("mouthSmileLeft", "mouthSmileRight"), ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"))
@@ -125,9 +129,10 @@ class WebcamSolver(nn.Module):
         points = FacePoints.of(rig, rig.neutral.landmarks)
         person = PersonPrior.of(identity_modes, self.settings.coefficients)
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
-        self.strength = 1.0 if prior is None else prior.strength
+        self.strength = self.settings.prior_strength
         groups = StudentGroups.of(prior, len(rig.names), points.rest)
-        rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], _arkit_names(rig.names))
+        called = _arkit_names(rig.names)
+        rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], called)
         for name, value in {
             "rest": points.rest,
             "basis": points.basis,
@@ -139,6 +144,9 @@ class WebcamSolver(nn.Module):
             "person_remainder": person.remainder,
             "closing_basis": _closing(person.basis, rig.names)[0],
             "closing_shapes": _closing(person.basis, rig.names)[1],
+            "lid_ridge": torch.tensor(
+                [_LID_RIDGE.get(n.removesuffix("Left").removesuffix("Right"), 0.0) for n in called]
+            ),
             "precisions": groups.precisions,
             "freedoms": groups.freedoms,
             "sizes": groups.sizes,
@@ -148,14 +156,16 @@ class WebcamSolver(nn.Module):
             "usual_openness": usual,
             "look_shapes": mapping(LOOKS, rig.names).double(),
             "gain_shapes": torch.stack([mapping(group, rig.names).double().amax(1) for group in _GROUPS]),
-            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in _arkit_names(rig.names)]),
+            "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
             "landmark_weights": torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW)),
             "identity": torch.eye(max(len(rig.names) + 6, self.settings.coefficients)),
             "camera": torch.eye(3),
             "look_eyes": torch.tensor(_LOOK_EYES),
             "upright": torch.tensor(_UPRIGHT),
             "damping": torch.tensor([_DAMPING_ROTATION] * 3 + [_DAMPING_TRANSLATION] * 3).double() ** -2,
-            "motion_unit": torch.tensor([_ROTATION_UNIT] * 3 + [_TRANSLATION_UNIT] * 3),
+            "filter_units": torch.tensor(
+                [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
+            ),
         }.items():
             self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=False)
 
@@ -217,7 +227,9 @@ class WebcamSolver(nn.Module):
         seen = ~torch.isnan(rays).any(1)
         present = _known(presence.double(), 0.0) * (seen.double().sum() >= _ENOUGH)
         found = present > _PRESENT
-        trust = self.landmark_weights * seen * _known(visibility.double(), 1.0).clamp(0, 1)
+        visible = _known(visibility.double(), 1.0).clamp(0, 1)
+        trust = trust_of(self.landmark_weights * seen, visible)
+        found = found & (trust.sum() > _LEAST_TRUST)
         # Without a face all counts alike and what comes of it is dropped, so that no number is a NaN.
         trust = torch.where(found, trust, 1.0)
         rays = torch.where(seen[:, None] & found, rays, self.rest[:LANDMARKS, :2] * self.upright)
@@ -375,7 +387,7 @@ class WebcamSolver(nn.Module):
 
     def _prior(self, weights: Tensor) -> Tensor:
         """H (N,N) of the shape prior and the ridge."""
-        ridge = 2 * self.settings.ridge * self.identity[: len(self.names), : len(self.names)]
+        ridge = (2 * self.settings.ridge + self.lid_ridge).diag()
         if not len(self.precisions):
             return ridge
         return ridge + self.strength * StudentGroups(self.precisions, self.freedoms, self.sizes).bound(weights)
@@ -390,22 +402,43 @@ class WebcamSolver(nn.Module):
         self, at: Linearised, head: HeadState, before: WebcamState, interval: Tensor, pose: Tensor, good: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients, information and evidence with a frame's, where it is ``good``."""
-        weights = head.weights[0]
-        J, r = at.jacobian[0].flatten(0, 1), at.residual[0].flatten()
+        resting = ((pose - 1).abs() < 0.5).to(pose)
+        frame = at.residual[0], at.jacobian[0], head.weights[0], head.rotation[0], interval, resting
+        known = before.person, before.information, before.evidence, before.learned
+        learns = good > 0
+        if torch.compiler.is_exporting():  # a graph has both ways; here a call that is not exported takes one
+            return torch.cond(learns, self._updated_person, self._same_person, (*frame, *known))
+        return (self._updated_person if bool(learns) else self._same_person)(*frame, *known)
+
+    def _updated_person(
+        self,
+        residual: Tensor,
+        jacobian: Tensor,
+        weights: Tensor,
+        rotation: Tensor,
+        interval: Tensor,
+        resting: Tensor,
+        person: Tensor,
+        information: Tensor,
+        evidence: Tensor,
+        learned: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         closed = self.closing_shapes @ weights
         basis = self.person_basis - (closed[:, None, None, None] * self.closing_basis).sum(0)
-        by_person = (at.jacobian[0, ..., -3:] @ head.rotation[0] @ basis).flatten(0, 1)
-        resting = (pose - 1).abs() < 0.5
-        lasting = lasting_precision(weights, self.settings.rest_penalty, resting)
-        frame, gradient = frame_information(r, J, by_person, weights, lasting)
-        eager = 1 + _EAGER * torch.exp(-before.learned / _EAGER_FOR)
-        share = good * (interval / self.settings.alike * eager).clamp(max=1.0)
-        kept = torch.where(good > 0, torch.exp(-interval / self.settings.memory), 1.0)
-        information = kept * before.information + share * frame
-        evidence = kept * before.evidence + share * (frame @ before.person - gradient)
-        count = len(before.person)
-        solved = symmetric_inverse(information + self.identity[:count, :count]) @ evidence
-        return torch.where(good > 0, solved, before.person), information, evidence
+        by_person = (jacobian[..., -3:] @ rotation @ basis).flatten(0, 1)
+        lasting = lasting_precision(weights, self.settings.rest_penalty, resting > 0)
+        frame, gradient = frame_information(residual.flatten(), jacobian.flatten(0, 1), by_person, weights, lasting)
+        eager = 1 + _EAGER * torch.exp(-learned / _EAGER_FOR)
+        share = (interval / self.settings.alike * eager).clamp(max=1.0)
+        kept = torch.exp(-interval / self.settings.memory)
+        information = kept * information + share * frame
+        evidence = kept * evidence + share * (frame @ person - gradient)
+        count = len(person)
+        return symmetric_inverse(information + self.identity[:count, :count]) @ evidence, information, evidence
+
+    def _same_person(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        person, information, evidence, _ = given[-4:]
+        return person.clone(), information.clone(), evidence.clone()
 
     def _gains_of(self, gains: Tensor) -> Tensor:
         """Of each shape, (N,)."""
@@ -476,7 +509,7 @@ class WebcamSolver(nn.Module):
         motion = torch.cat([turn, pose[9:] - before.translation])
         speeds = torch.where(first, 0.0, before.speeds)
         old = torch.cat([before.weights, torch.zeros_like(motion)])
-        unit = torch.cat([torch.ones_like(weights), self.motion_unit])
+        unit = self.filter_units
         calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
         rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
         translation = torch.where(first, pose[9:], before.translation + calm[-3:])

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-_CUTOFF, _SPEED_CUTOFF = 1.5, 3.0  # Hz, at the usual smoothing
-_OPENING = 12.0  # Hz that the cutoff gains for a unit a second
+_CUTOFF, _SPEED_CUTOFF = 0.7, 3.0  # Hz, at the usual smoothing
+_OPENING = 4.0  # Hz that the cutoff gains for a unit a second
 _OCTAVES = 4.0  # between no smoothing to speak of and the most, of the cutoff
 
 

@@ -49,33 +49,52 @@ def crop_transform(box: Tensor, tilt: float, size: int, margin: float = CROP_MAR
     return torch.cat([turn, ((size - 1) / 2 - turn @ middle)[:, None]], 1)
 
 
-def cut_crop(image: Tensor, transform: Tensor, width: int, height: int | None = None) -> Tensor:
-    """The rectangle of an image that a transform shows; beyond the border the border's pixels go on.
+def cut_crop(image: Tensor, transform: Tensor, size: int) -> Tensor:
+    """The square of an image that a transform shows; beyond the border the border's pixels go on.
 
     Where the face is larger than the crop it is made smaller by averaging first, so that no pixels are skipped.
 
     Args:
         image: uint8 (H,W), or (3,H,W) red first.
         transform: (2,3), see :func:`crop_transform`.
-        width, height: pixels of the crop; a square of that width if there is no height.
+        size: pixels a side.
 
     Returns:
-        uint8 (3,h,w), red first; a grey image gives three alike.
+        uint8 (3,S,S), red first; a grey image gives three alike.
+
+    Raises:
+        ShapeError: no such image.
+    """
+    return cut_crops(image, transform[None], size, size)[0]
+
+
+def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Tensor:
+    """Rectangles of one image, near each other and of one scale; see :func:`cut_crop`.
+
+    Args:
+        image: uint8 (H,W), or (3,H,W) red first.
+        transforms: (N,2,3) float64.
+        width, height: pixels of the crops.
+
+    Returns:
+        uint8 (N,3,h,w), red first.
 
     Raises:
         ShapeError: no such image.
     """
     check_image(image)
     rows, columns = image.shape[-2:]
-    size = (width, width if height is None else height)
-    right, bottom = size[0] - 0.5, size[1] - 0.5
-    corners = from_crop(torch.tensor([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]]), transform)
-    left, top = (corners.amin(0) - 2).floor().clamp(min=0).long().tolist()
-    right, bottom = ((corners.amax(0) + 2).ceil().long() + 1).tolist()
+    last, low = width - 0.5, height - 0.5
+    corners = torch.tensor([[-0.5, -0.5], [last, -0.5], [-0.5, low], [last, low]], dtype=torch.float64)
+    seen = (corners - transforms[:, None, :, 2]) @ torch.linalg.inv(transforms[:, :, :2]).transpose(1, 2)
+    seen = seen.float().flatten(0, 1)
+    left, top = (seen.amin(0) - 2).floor().clamp(min=0).long().tolist()
+    right, bottom = ((seen.amax(0) + 2).ceil().long() + 1).tolist()
     left, top = min(left, columns - 1), min(top, rows - 1)
     right, bottom = min(max(right, left + 1), columns), min(max(bottom, top + 1), rows)
     # Whole pixels are averaged, which OpenCV does ten times as fast as shares of them; the rest is left to the warp.
-    step = max(1, round(1 / float(transform[:, :2].det().abs().sqrt())))
+    (a, b, _), (c, d, _) = transforms[0].tolist()
+    step = max(1, round(1 / math.sqrt(abs(a * d - b * c))))
     high, wide = max(1, (bottom - top) // step) * step, max(1, (right - left) // step) * step
     piece = image[..., top : top + high, left : left + wide].cpu()
     small = (max(1, piece.shape[-1] // step), max(1, piece.shape[-2] // step))
@@ -86,9 +105,12 @@ def cut_crop(image: Tensor, transform: Tensor, width: int, height: int | None = 
     ratio = (small[0] / piece.shape[-1], small[1] / piece.shape[-2])
     # From the pixels of the piece, that may be a smaller copy, to the image's, and from there to the crop's.
     back = np.array([[1 / ratio[0], 0, left - 0.5 + 0.5 / ratio[0]], [0, 1 / ratio[1], top - 0.5 + 0.5 / ratio[1]]])
-    way = transform.double().numpy() @ np.concatenate([back, [[0.0, 0.0, 1.0]]])
-    crop = cv2.warpAffine(pixels, way, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(crop).permute(2, 0, 1)
+    back = np.concatenate([back, [[0.0, 0.0, 1.0]]])
+    crops = [
+        cv2.warpAffine(pixels, way @ back, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for way in transforms.double().numpy()
+    ]
+    return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
 
 
 def from_crop(points: Tensor, transform: Tensor) -> Tensor:

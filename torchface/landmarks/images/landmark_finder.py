@@ -18,7 +18,7 @@ HALF_CONFIDENCE = 0.02
 """The deviation, in sides of the face's box, of a confidence of one half."""
 
 _HIDDEN, _SEEN = 0.7, 0.95
-_LIPS, _CHIN = slice(48, 68), slice(4, 13)
+_LIPS, _CHIN, _CONTOUR = slice(48, 68), slice(4, 13), 17
 _GROUPS = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), _LIPS)
 """Brows, nose, eyes, lips."""
 
@@ -71,13 +71,12 @@ def trust_of(confidence: Tensor, visibility: Tensor) -> Tensor:
     Args:
         confidence, visibility: of landmarks, (...,68) in [0,1].
     """
-    seen = visibility.clone()
-    for group in _GROUPS:
-        mean = visibility[..., group].mean(-1, keepdim=True)
-        seen[..., group] = visibility[..., group].minimum(mean)
+    parts = [visibility[..., group] for group in _GROUPS]
+    whole = [part.minimum(part.mean(-1, keepdim=True)) for part in parts]
     # Who hides the mouth hides the chin: what is found of it would open the jaw.
-    lips = visibility[..., _LIPS].mean(-1, keepdim=True)
-    seen[..., _CHIN] = visibility[..., _CHIN].minimum(lips)
+    contour, lips = visibility[..., :_CONTOUR], parts[-1].mean(-1, keepdim=True)
+    jaw = contour[..., : _CHIN.start], contour[..., _CHIN].minimum(lips), contour[..., _CHIN.stop :]
+    seen = torch.cat([*jaw, *whole], dim=-1)
     return confidence * ((seen - _HIDDEN) / (_SEEN - _HIDDEN)).clamp(0, 1)
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
-from torchface.landmarks.images.face_crop import cut_crop
+from torchface.landmarks.images.face_crop import cut_crops
 
 CROP_WIDTH, CROP_HEIGHT = 48, 32
 """Pixels of an eye's crop."""
@@ -92,4 +92,4 @@ def cut_eyes(image: Tensor, transforms: Tensor, width: int = CROP_WIDTH, height:
     Raises:
         ShapeError: no such image.
     """
-    return torch.stack([cut_crop(image, one.double(), width, height) for one in transforms])
+    return cut_crops(image, transforms.double(), width, height)

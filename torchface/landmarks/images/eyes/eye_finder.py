@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -46,8 +47,8 @@ class EyeFinder:
             ShapeError: no such image.
         """
         transforms = eye_transforms(face.landmarks.double(), self.width, self.height)
-        scale = float(transforms[0, :, :2].det().abs().sqrt())
-        if not bool(torch.isfinite(transforms).all()) or scale * LEAST > self.width:
+        scale = math.hypot(*transforms[0, 0, :2].tolist())  # NaN where there is no face
+        if not 0 < scale * LEAST <= self.width:
             return face
         found = self.network(cut_eyes(image, transforms, self.width, self.height).float() / 255)
         back = picture_transforms(transforms)

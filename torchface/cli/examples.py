@@ -1,0 +1,73 @@
+"""``torchface examples``: a person's example expressions, or a rig's, for the solve from landmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+
+
+def examples(
+    pictures: Annotated[Positional[tuple[Path, ...]], arg(metavar="PICTURES")] = (),
+    *,
+    out: Path,
+    camera: str | None = None,
+    rig: Path | None = None,
+    paper: bool = False,
+    seconds: float = 4.0,
+    landmarks: str = "landmark_network",
+    quiet: Quiet = False,
+) -> None:
+    """Make the examples that a solve from landmarks mixes: from pictures, before a webcam, or from a rig.
+
+    From PICTURES: a folder or files named by what they show (neutral, brow_lower_left, brow_raise_left,
+    brow_lower_right, brow_raise_right, suck, pull_open, pull_left, pull_right, lower_lip_depress, pucker, stretch,
+    rotate_left, rotate_right, tilt_left, tilt_right; or ARKit's names), or these 16 in this order. With --camera you
+    are asked for one after the other. With --rig a rig's own shapes are seen by a camera. Left is the person's left,
+    in pictures that are not mirrored. Then: torchface export examples --examples OUT --out solver.onnx.
+
+    Args:
+        pictures: Pictures of one person, or a folder of them.
+        out: The .json file to write.
+        camera: A camera's number, or a video file in which somebody went through the 16 to the same clock.
+        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
+        paper: Of the rig only the 16 above, made of ARKit's shapes.
+        seconds: For each expression before the camera.
+        landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
+        quiet: Show no progress.
+    """
+    from torchface.capture.webcam import (
+        ExampleSolver,
+        example_remarks,
+        landmark_observability,
+        paper_examples,
+        rig_examples,
+    )
+    from torchface.errors import ValueRangeError
+    from torchface.io import load_rig
+    from torchface.workflows.examples.guided_session import guided_examples
+    from torchface.workflows.examples.picture_examples import picture_examples
+
+    given = [name for name, there in (("PICTURES", pictures), ("--camera", camera), ("--rig", rig)) if there]
+    if len(given) != 1:
+        raise ValueRangeError(
+            f"examples: found {' and '.join(given) or 'nothing'}, expected PICTURES, --camera or --rig"
+        )
+    if camera is not None:
+        made = guided_examples(camera, lambda words: console.print(words, highlight=False), seconds, landmarks)
+    else:
+        with progress_bars(quiet) as progress:
+            if rig is not None:
+                progress("reading the rig")
+                loaded = load_rig(rig)
+                made = paper_examples(loaded) if paper else rig_examples(loaded)
+            else:
+                made = picture_examples(pictures, landmarks, progress)
+    made.save(out)
+    if not quiet:
+        remarks = [] if rig is not None else example_remarks(made)
+        print_lines([*remarks, *str(landmark_observability(ExampleSolver(made))).splitlines()])
+    print_path(out)

@@ -1,0 +1,1 @@
+"""Examples of a person's expressions, from pictures or before a webcam."""

@@ -1,0 +1,102 @@
+"""Examples from pictures, in the paper's order or by the files' names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from torchface.capture.webcam import ExampleShapes, paper_expressions, shown_examples
+from torchface.capture.webcam.example_expressions import NEUTRAL
+from torchface.errors import FileFormatError, NameMismatchError
+from torchface.io.images.image_files import load_image
+from torchface.landmarks import NoFaceError, find_landmarks
+from torchface.progress import Progress, silent
+from torchface.shape_names import ARKIT
+from torchface.workflows.named_finders import DEFAULT_LANDMARKS, load_finder
+
+_ENDINGS = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+_MOST = 256
+
+
+def picture_examples(
+    pictures: Sequence[Path], landmarks: str = DEFAULT_LANDMARKS, progress: Progress = silent
+) -> ExampleShapes:
+    """Examples of the person in pictures.
+
+    Args:
+        pictures: files, or one folder of them. Where names say what they show (``neutral.png``, ``pucker.jpg``, ARKit's
+            ``jawOpen.png``, digits before a name left out), any order and choice that has a neutral; otherwise the
+            paper's 16 in its order.
+        landmarks: what finds landmarks.
+        progress: told how far it is.
+
+    Raises:
+        FileFormatError: no pictures, or one that is none.
+        NameMismatchError: names that are not known, twice or without a neutral.
+        NoFaceError: a picture shows no face.
+    """
+    files = _files(pictures)
+    names = _names(files)
+    finder = load_finder(landmarks, photographs=True).finder
+    found, sides = [], []
+    for number, (path, name) in enumerate(zip(files, names, strict=True)):  # pictures differ in size
+        progress("finding landmarks", number, len(files))
+        pixels = (load_image(path)[:3].clamp(0, 1) * 255).round().to(torch.uint8)
+        try:
+            found.append(find_landmarks(pixels, finder).landmarks)
+        except NoFaceError as error:
+            raise NoFaceError(f"{path}: {str(error).partition(': ')[2]}; it should show {name}") from error
+        sides.append(pixels.shape[1:])
+    progress("finding landmarks", len(files), len(files))
+    height = sides[names.index(NEUTRAL)][0]
+    # The same picture in another resolution shows the same face.
+    scaled = [points * (height / side[0]) for points, side in zip(found, sides, strict=True)]
+    return shown_examples(names, torch.stack(scaled))
+
+
+def _files(pictures: Sequence[Path]) -> list[Path]:
+    if len(pictures) == 1 and pictures[0].is_dir():
+        folder = pictures[0]
+        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), key=_natural)
+        if not files:
+            raise FileFormatError(f"{folder}: found no picture, expected files ending in {', '.join(sorted(_ENDINGS))}")
+    else:
+        files = list(pictures)
+    if len(files) > _MOST:
+        raise FileFormatError(f"examples: found {len(files)} pictures, expected at most {_MOST}")
+    return files
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sorts 2 before 10."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(part[:18]), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    paper = [one.name for one in paper_expressions()]
+    spelled = {re.sub("[^a-z]", "", name.lower()): name for name in (*paper, *ARKIT)}
+    named = [spelled.get(re.sub("[^a-z]", "", path.stem.lower())) for path in files]
+    known = [name for name in named if name is not None]
+    if not known:
+        if len(files) != len(paper):
+            raise NameMismatchError(
+                f"examples: found {len(files)} pictures whose names say nothing ({files[0].name}, ...), expected "
+                f"{len(paper)} in this order: {', '.join(paper)}; or name files by what they show"
+            )
+        return paper
+    if len(known) < len(files):
+        unknown = [path.name for path, name in zip(files, named, strict=True) if name is None]
+        raise NameMismatchError(
+            f"examples: found {', '.join(unknown[:5])}{', ...' if len(unknown) > 5 else ''} among files named by what "
+            f"they show, expected {', '.join(paper)}, or ARKit's names"
+        )
+    twice = sorted({name for name in known if known.count(name) > 1})
+    if twice:
+        raise NameMismatchError(f"examples: found several pictures of {', '.join(twice[:5])}, expected one each")
+    if NEUTRAL not in known or len(known) < 2:
+        raise NameMismatchError(f"examples: found {', '.join(known[:5])}, expected {NEUTRAL} and at least one other")
+    return known
