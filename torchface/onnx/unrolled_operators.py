@@ -9,6 +9,8 @@ import numpy as np
 
 from torchface.optim import exported_operators
 
+_NEWTON_STEPS = 14  # to a residual of 1e-9 for rows' sums of 30 and a share of 0.05
+
 
 def _sweep_inverse(matrix: Any) -> Any:
     r"""``symmetric_inverse`` in float64 by D sweeps of rank one; ONNX has no factorisation.
@@ -37,6 +39,34 @@ def _sweep_inverse(matrix: Any) -> Any:
     return op.Mul(op.Sub(identity, swept), scales)
 
 
+def _newton_inverse(matrix: Any, rho: float) -> Any:
+    r"""``shifted_inverse`` by Newton's iteration in single precision, :math:`X' = X (2 I - A X)`, the last in double.
+
+    With a diagonal of ones before it grew, no eigenvalue is below :math:`\rho` and none beyond the largest sum of a
+    row's absolute values, by which the identity is divided to begin with.
+
+    Source: Schulz 1933; Ben-Israel 1965 for the start.
+    """
+    from onnx import TensorProto
+    from onnxscript import ir
+
+    op, size = _onnx_operators(), int(matrix.shape[0])
+    identity = op.Constant(value=ir.tensor(np.eye(size)))
+    diagonal = op.ReduceSum(op.Mul(matrix, identity), op.Constant(value_ints=[0]), keepdims=1)
+    scale = op.Reciprocal(op.Sqrt(diagonal))
+    scales = op.Mul(op.Transpose(scale, perm=[1, 0]), scale)
+    scaled = op.Add(op.Mul(matrix, scales), op.Constant(value=ir.tensor(rho * np.eye(size))))
+    quick = op.Cast(scaled, to=TensorProto.FLOAT)
+    rows = op.ReduceSum(op.Abs(quick), op.Constant(value_ints=[1]), keepdims=1)
+    found = op.Div(op.Constant(value=ir.tensor(np.eye(size, dtype=np.float32))), op.ReduceMax(rows, keepdims=1))
+    twice = op.Constant(value=ir.tensor(2 * np.eye(size, dtype=np.float32)))
+    for _ in range(_NEWTON_STEPS):  # each doubles the digits that are right
+        found = op.MatMul(found, op.Gemm(quick, found, twice, alpha=-1.0))
+    found = op.Cast(found, to=TensorProto.DOUBLE)
+    left = op.Sub(op.Constant(value=ir.tensor(2 * np.eye(size))), op.MatMul(scaled, found))
+    return op.Mul(op.MatMul(found, left), scales)
+
+
 def _unrolled_splitting(
     constant: Any, step: Any, double_step: Any, lower: Any, upper: Any, dual: Any, steps: int
 ) -> tuple[Any, Any]:
@@ -50,6 +80,7 @@ def _unrolled_splitting(
 
 TRANSLATIONS: Mapping[Callable[..., object], Callable[..., object]] = {
     exported_operators.symmetric_inverse._opoverload: _sweep_inverse,
+    exported_operators.shifted_inverse._opoverload: _newton_inverse,
     exported_operators.box_splitting._opoverload: _unrolled_splitting,
 }
 """For ``exported_model``."""

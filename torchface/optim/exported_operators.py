@@ -21,6 +21,20 @@ def _(matrix: Tensor) -> Tensor:
     return torch.empty_like(matrix)
 
 
+@torch.library.custom_op("torchface::shifted_inverse", mutates_args=())
+def shifted_inverse(matrix: Tensor, rho: float) -> Tensor:
+    """The inverse (D,D) of a positive definite matrix (D,D) whose diagonal grows by a share of itself.
+
+    A graph takes products alone for it, as the shift bounds the condition; the less the share, the less exact.
+    """
+    return torch.linalg.inv_ex(matrix + rho * torch.diag(matrix.diagonal())).inverse.contiguous()
+
+
+@shifted_inverse.register_fake
+def _(matrix: Tensor, rho: float) -> Tensor:
+    return torch.empty_like(matrix)
+
+
 @torch.library.custom_op("torchface::box_splitting", mutates_args=())
 def box_splitting(
     constant: Tensor, step: Tensor, double_step: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, steps: int
@@ -62,8 +76,34 @@ def split_box_program(
         steps: of operator splitting.
     """
     diagonal = (H * identity).sum(0)
-    offset = -RELAXATION * symmetric_inverse(H + rho * diagonal * identity)
-    step = -rho * diagonal[:, None] * offset - identity
-    double_step = 2 * step + (2 - RELAXATION) * identity
-    v, z = box_splitting(gradient[None] @ offset, step, double_step, lower, upper, dual[None], steps)
+    return _split(
+        symmetric_inverse(H + rho * diagonal * identity), H, gradient, lower, upper, dual, identity, rho, steps
+    )
+
+
+def split_box_program_quickly(
+    H: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor, dual: Tensor, identity: Tensor, rho: float, steps: int
+) -> tuple[Tensor, Tensor]:
+    """As :func:`split_box_program`, its steps in single precision, in a tenth of the operators of a graph."""
+    inverse = shifted_inverse(H, rho)
+    z, dual = _split(inverse, H, gradient, lower, upper, dual, identity, rho, steps, torch.float32)
+    return z.to(H), dual.to(H)
+
+
+def _split(
+    inverse: Tensor,
+    H: Tensor,
+    gradient: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    dual: Tensor,
+    identity: Tensor,
+    rho: float,
+    steps: int,
+    dtype: torch.dtype | None = None,
+) -> tuple[Tensor, Tensor]:
+    offset = -RELAXATION * inverse
+    step = -rho * (H * identity).sum(0)[:, None] * offset - identity
+    given = gradient[None] @ offset, step, 2 * step + (2 - RELAXATION) * identity, lower, upper, dual[None]
+    v, z = box_splitting(*(value.to(dtype or H.dtype) for value in given), steps)
     return z, (v - z)[0]

@@ -10,11 +10,13 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.webcam import WebcamControls, WebcamSettings, WebcamSolver, WebcamState
+from torchface.capture.webcam.weight_filter import one_euro_step, usual_filter
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
+from torchface.temporal import one_euro_filter
 
 FPS = 15.0
 FOCAL = 554.256
@@ -180,3 +182,35 @@ def test_an_eye_that_shuts_blinks_and_one_that_looks_down_does_not(solver: Webca
     assert float(shut.weights[blink]) > 0.6
     down = stepped(stepped(state, 0.16, 0.05, eyeLookDownLeft=0.8), 0.15, 0.05, eyeLookDownLeft=0.8)
     assert float(down.weights[blink]) < 0.5
+
+
+def test_a_guided_calibration_finds_how_far_landmarks_go(
+    solver: WebcamSolver, person: Tensor, known: WebcamState
+) -> None:
+    """Somebody whose widest smile goes seven tenths of the rig's way, and who has been asked to smile, smiles fully."""
+    half, asked = 0.7, WebcamControls(pose=3, smoothing=0.0)
+    smile = seen(solver, person, weights_of(mouthSmileLeft=half, mouthSmileRight=half), (0, 0, 0))
+    plain = known
+    for _ in range(5):
+        plain = solver.step(plain, smile, 1 / FPS, WebcamControls(smoothing=0.0))
+    state = known
+    for _ in range(45):
+        state = solver.step(state, smile, 1 / FPS, asked)
+    rows = [ARKIT.index("mouthSmileLeft"), ARKIT.index("mouthSmileRight")]
+    assert float(plain.weights[rows].mean()) == pytest.approx(half, abs=0.15)
+    assert float(state.gains[1].exp()) == pytest.approx(half, abs=0.15)
+    assert float(state.weights[rows].mean()) > 0.9
+    assert float(state.gains[[0, 2]].abs().max()) < 0.02
+
+
+def test_the_filter_by_seconds_is_the_filter_by_frames() -> None:
+    curve = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)).double()
+    settings = usual_filter()
+    expected = one_euro_filter(curve, 30.0, settings)
+    value, speed, unit = curve[0], torch.zeros(3).double(), torch.ones(3).double()
+    half = torch.tensor(0.5).double()
+    for frame in range(1, len(curve)):
+        value, speed = one_euro_step(curve[frame], value, speed, torch.tensor(1 / 30).double(), half, unit)
+        torch.testing.assert_close(value, expected[frame])
+    plain, _ = one_euro_step(curve[0], value, speed, torch.tensor(1 / 30).double(), 0 * half, unit)
+    torch.testing.assert_close(plain, curve[0])

@@ -35,7 +35,7 @@ from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import trust_of
-from torchface.optim.exported_operators import split_box_program, symmetric_inverse
+from torchface.optim.exported_operators import split_box_program_quickly, symmetric_inverse
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
@@ -317,7 +317,7 @@ class WebcamSolver(nn.Module):
             f = walked * (weights - mean) + pull * (weights - looking) + (sure * gap) @ self.open_rows
             f = f + prior @ weights + self.settings.sparsity * (1 + _UNKNOWN * unknown)
             damping = torch.cat([torch.zeros_like(weights), self.damping])
-            motion, dual = split_box_program(
+            motion, dual = split_box_program_quickly(
                 J.T @ J + pad(H, (0, 6, 0, 6)) + damping.diag(),
                 r @ J + pad(f, (0, 6)),
                 pad(-weights, (0, 6), value=-_FREE),
