@@ -32,7 +32,7 @@ export function offerCharacters(use) {
 /** The character beside the page. */
 export async function shippedCharacter(use) {
   const answer = await fetch("./character.glb");
-  if (!answer.ok) return showProblem(new Error("character.glb is not beside this page; choose a character of your own."));
+  if (!answer.ok) return showProblem("character", "character.glb is not beside this page; choose one of your own.");
   await take(new File([await answer.blob()], "character.glb"), use);
 }
 
@@ -44,8 +44,8 @@ async function take(file, use) {
     const { driven, unknown } = character.check;
     const others = unknown.length > 0 ? `; these stay still: ${listed(unknown)}` : "";
     showCharacterLine(`${file.name}: your face moves ${driven.length} of its ${driven.length + unknown.length} shapes${others}`);
-    hideProblem();
+    hideProblem("character");
   } catch (error) {
-    showProblem(new Error(`${file.name}: ${error.message}`));
+    showProblem("character", `${file.name}: ${error.message}`);
   }
 }

@@ -32,7 +32,7 @@ const controls = () => {
 
 async function start() {
   element("start").disabled = true;
-  hideProblem();
+  hideProblem("camera");
   try {
     showStatus("Asking for the camera…");
     stream = await openCamera(element("video"), () => stop("The camera was unplugged or taken away."));
@@ -68,7 +68,7 @@ function stop(problem = null) {
   drawFace(element("overlay"), null);
   setRunning(false);
   showStatus("");
-  if (problem) showProblem(new Error(problem));
+  if (problem) showProblem("camera", problem);
 }
 
 function setRunning(running) {
@@ -151,10 +151,10 @@ setInterval(showRate, 500);
 try {
   stage = new Stage(element("character"));
 } catch {
-  showProblem(new Error("The character cannot be drawn: this browser has no WebGL 2. Recording works without it."));
+  element("undrawn").hidden = false;
 }
 const use = (chosen) => {
   stage?.show((character = chosen));
 };
 offerCharacters(use);
-shippedCharacter(use).catch(showProblem);
+shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));

@@ -66,7 +66,7 @@ export class Recording {
       link.click();
       setTimeout(() => URL.revokeObjectURL(address), 60_000); // the browser may ask first where to put it
     } catch (error) {
-      showProblem(error);
+      showProblem("character", error.message);
     }
   }
 }

@@ -2,13 +2,15 @@
 
 const element = (id) => document.getElementById(id);
 
-export function showProblem(error) {
-  element("problem").firstElementChild.textContent = error.message ?? String(error);
+/** Says what went wrong; `part` names the part of the page, "camera" or "character", whose next success takes it away. */
+export function showProblem(part, words) {
+  element("problem").firstElementChild.textContent = words;
+  element("problem").dataset.with = part;
   element("problem").hidden = false;
 }
 
-export function hideProblem() {
-  element("problem").hidden = true;
+export function hideProblem(part) {
+  if (element("problem").dataset.with === part) element("problem").hidden = true;
 }
 
 /** What the camera's side is doing; said again only when it changes. */
@@ -25,4 +27,4 @@ export function speak(words) {
   element("spoken").textContent = words;
 }
 
-element("problem").lastElementChild.addEventListener("click", hideProblem);
+element("problem").lastElementChild.addEventListener("click", () => (element("problem").hidden = true));

@@ -77,13 +77,15 @@ def opened(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open
     with (
         static_host(app) as host,
         elsewhere() as outside,
-        chromium(folder / "profile", *switches, f"--proxy-server={outside.url}") as driver,
+        # Drawing in software takes ten seconds to begin with, and test_app_film.py looks at that.
+        chromium(folder / "profile", *switches, "--disable-3d-apis", f"--proxy-server={outside.url}") as driver,
     ):
         driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
         allow_camera(driver, "granted")
         driver.get(f"{host.url}/index.html")
         page = Page(driver)
         until(lambda: page.text("character-line"))
+        assert "cannot be drawn" in page.text("undrawn")  # and all else works
         yield Open(page, host, outside)
 
 
@@ -252,7 +254,7 @@ def bare(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
     with (
         static_host(app) as host,
         elsewhere() as outside,
-        chromium(folder / "profile", f"--proxy-server={outside.url}") as driver,
+        chromium(folder / "profile", "--disable-3d-apis", f"--proxy-server={outside.url}") as driver,
     ):
         yield Open(Page(driver), host, outside)
 

@@ -17,6 +17,7 @@ from torchface.progress import Progress
 
 _PACKAGES = ("package.json", "package-lock.json")
 _SOURCES = (*_PACKAGES, "index.html", "vite.config.js", "src", "public", "licences")
+_IN_WHEEL = "_app"
 _LEAST_NODE = (20, 19)
 _SECONDS = 600
 _LAST_WORDS = 400  # characters of what a program said before it failed
@@ -31,10 +32,8 @@ def built_page(progress: Progress) -> Path:
     Raises:
         MissingExtraError: it has to be built, and Node or npm is missing or too old, or one of them failed.
     """
-    package = Path(__file__).resolve().parents[2]
-    in_checkout = is_checkout(package.parent, package.name)
-    sources = package.parent / "export" / "web" if in_checkout else package / "_app"
-    if not in_checkout and (sources / "dist" / "index.html").is_file():
+    sources = page_sources()
+    if sources.name == _IN_WHEEL and (sources / "dist" / "index.html").is_file():
         return sources / "dist"
     key = content_key("browser app/1", sources={name: sources / name for name in _SOURCES})
     kept = cache_folder("app") / f"page-{key[:32]}"
@@ -43,9 +42,15 @@ def built_page(progress: Progress) -> Path:
     return kept
 
 
+def page_sources() -> Path:
+    """The folder that the page is built from: the checkout's, or the installed package's."""
+    package = Path(__file__).resolve().parents[2]
+    return package.parent / "export" / "web" if is_checkout(package.parent, package.name) else package / _IN_WHEEL
+
+
 def _build(sources: Path, kept: Path, progress: Progress) -> None:
     node, npm = _node()
-    packages = _packages(sources, npm, progress)
+    packages = installed_packages(sources, npm, progress)
     progress("building the page")
     workplace, out = packages / temporary_name(kept).name, temporary_name(kept)
     try:
@@ -61,8 +66,12 @@ def _build(sources: Path, kept: Path, progress: Progress) -> None:
         shutil.rmtree(out, ignore_errors=True)
 
 
-def _packages(sources: Path, npm: str, progress: Progress) -> Path:
-    """The folder with the installed ``node_modules``, once for each ``package-lock.json``."""
+def installed_packages(sources: Path, npm: str, progress: Progress) -> Path:
+    """The folder with the installed ``node_modules``, once for each ``package-lock.json``.
+
+    Raises:
+        MissingExtraError: npm failed.
+    """
     key = content_key("browser app packages/1", files=[sources / name for name in _PACKAGES])
     kept = cache_folder("app") / f"packages-{key[:32]}"
     if kept.is_dir():
