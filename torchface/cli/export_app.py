@@ -9,7 +9,7 @@ from rich.table import Table
 from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 
-def export_app(out: Path, webcam: Path, character: Path | None = None, quiet: Quiet = False) -> None:
+def export_app(out: Path, character: Path | None = None, webcam: Path | None = None, quiet: Quiet = False) -> None:
     """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
 
     Everything runs on the user's machine; the page sends nothing. To try it: `python -m http.server --directory OUT`,
@@ -18,14 +18,14 @@ def export_app(out: Path, webcam: Path, character: Path | None = None, quiet: Qu
 
     Args:
         out: The folder to write; an earlier app in it is replaced.
-        webcam: The graph from picture to weights, as `torchface export webcam` writes it.
         character: A .glb, or another rig, whose shapes have ARKit's names; the embedded performer if absent.
+        webcam: The graph from picture to weights, as `torchface export webcam` writes it; that one if absent.
         quiet: Show no progress.
     """
     from torchface.workflows.browser_app import export_app as write
 
     with progress_bars(quiet) as progress:
-        report = write(out, webcam, character, progress)
+        report = write(out, character, webcam, progress)
     table = Table(show_header=False)
     for row in report.rows():
         table.add_row(*row)

@@ -154,7 +154,8 @@ try {
   element("undrawn").hidden = false;
 }
 const use = (chosen) => {
-  stage?.show((character = chosen));
+  character = chosen;
+  stage?.show(chosen);
 };
 offerCharacters(use);
 shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));

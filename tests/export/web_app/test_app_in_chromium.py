@@ -14,7 +14,7 @@ import pytest
 import torch
 from app_browser import Page, Server, chromium, elsewhere, film_camera, static_host, until
 from film import planted_film, write_y4m
-from planted_graph import STATE, write_planted_graph
+from planted_graph import write_planted_graph
 from rig_samples import quad_sheet
 from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
 
@@ -55,7 +55,7 @@ def app(character: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("app")
     write_planted_graph(folder / "planted.onnx")
     try:
-        export_app(folder / "app", folder / "planted.onnx", character)
+        export_app(folder / "app", character, folder / "planted.onnx")
     except MissingExtraError as error:
         pytest.skip(f"the page cannot be built here: {error}")
     return folder / "app"
@@ -125,11 +125,15 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(opened: Open, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    page, folder = opened.page, tmp_path_factory.mktemp("recorded")
+    return record(opened.page, tmp_path_factory.mktemp("recorded"), 10)
+
+
+def record(page: Page, folder: Path, frames: int) -> Recorded:
+    """Starts the camera, records about so many frames, stops both, and downloads what the page made of it."""
     page.driver.execute_script("watched.keep = true")
     page.start()
     page.click("record")
-    until(lambda: page.driver.execute_script("return watched.solved.length") >= 10)
+    until(lambda: page.driver.execute_script("return watched.solved.length") >= frames)
     page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
     page.driver.execute_script("watched.keep = false")
     script = """
@@ -148,8 +152,20 @@ def recorded(opened: Open, tmp_path_factory: pytest.TempPathFactory) -> Recorded
 
 def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorded: Recorded) -> None:
     """On the very pixels and intervals that the page gave its worker."""
-    session = onnxruntime.InferenceSession(app / "webcam.onnx")
-    state = np.zeros(STATE, np.float32)
+    assert_same_weights(app / "webcam.onnx", recorded, 1e-5)
+    rows = load_take(recorded.csv).weights
+    assert rows is not None
+    answers = np.array([one["weights"] for one in recorded.recorded])
+    np.testing.assert_allclose(rows.values[..., 0], answers, rtol=0, atol=1e-7)
+    assert len(answers) > 5
+    assert answers.std(0).min() > 0.01  # the film moves every shape
+
+
+def assert_same_weights(graph: Path, recorded: Recorded, tolerance: float) -> None:
+    """Runs the graph over the pixels that the page gave its worker, and compares the page's answers."""
+    session = onnxruntime.InferenceSession(graph)
+    size = next(one.shape[0] for one in session.get_inputs() if one.name == "state")
+    state = np.zeros(size, np.float32)
     for sent, solved in zip(recorded.sent, recorded.solved, strict=False):
         pixels = np.frombuffer(base64.b64decode(sent["pixels"]), np.uint8)
         inputs = {
@@ -159,13 +175,7 @@ def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorde
             "state": state,
         }
         weights, state = session.run(["weights", "next_state"], inputs)
-        np.testing.assert_allclose(solved["weights"], weights, rtol=0, atol=1e-5)
-    rows = load_take(recorded.csv).weights
-    assert rows is not None
-    answers = np.array([one["weights"] for one in recorded.recorded])
-    np.testing.assert_allclose(rows.values[..., 0], answers, rtol=0, atol=1e-7)
-    assert len(answers) > 5
-    assert answers.std(0).min() > 0.01  # the film moves every shape
+        np.testing.assert_allclose(solved["weights"], weights, rtol=0, atol=tolerance)
 
 
 def test_the_csv_has_the_cameras_times_and_the_heads_rotation(recorded: Recorded) -> None:

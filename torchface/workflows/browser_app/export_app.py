@@ -17,6 +17,7 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.browser_app.webcam_graph_check import check_webcam_graph
+from torchface.workflows.webcam.webcam_graph import webcam_graph
 
 CHARACTER, GRAPH, PAGE = "character.glb", "webcam.onnx", "index.html"
 _ASSETS = (".js", ".css", ".wasm")
@@ -61,15 +62,19 @@ class AppReport:
 
 
 def export_app(
-    out: str | Path, webcam: str | Path, character: str | Path | None = None, progress: Progress | None = None
+    out: str | Path,
+    character: str | Path | None = None,
+    webcam: str | Path | None = None,
+    progress: Progress | None = None,
 ) -> AppReport:
     """Writes a folder that any static host serves: a page in which a webcam moves a character, on the user's machine.
 
     Args:
         out: the folder; files of an earlier app in it are replaced.
-        webcam: the graph from picture to weights, as ``torchface export webcam`` writes it.
         character: a ``.glb``, which is taken as it is, or another rig, with shapes that ARKit knows; the embedded
             performer if absent.
+        webcam: the graph from picture to weights, as ``torchface export webcam`` writes it; made, or taken from the
+            cache, if absent.
         progress: called with each step.
 
     Raises:
@@ -81,11 +86,12 @@ def export_app(
     out, progress = Path(out), progress or silent
     check_writable(folder=out)
     _check_folder(out)
-    check_webcam_graph(webcam)
     progress("reading the character")
     rig = performer() if character is None else load_rig(character)
     driven, still = _shapes(rig, character)
-    files = {GRAPH: read_file(webcam), CHARACTER: _glb(rig, character)}
+    graph = webcam_graph(progress) if webcam is None else read_file(webcam)
+    check_webcam_graph(graph, webcam or "the webcam's graph")
+    files = {GRAPH: graph, CHARACTER: _glb(rig, character)}
     page = built_page(progress)
     files |= {path.relative_to(page).as_posix(): read_file(path) for path in sorted(page.rglob("*")) if path.is_file()}
     progress("writing the app")

@@ -8,7 +8,6 @@ from pathlib import Path
 import onnxruntime
 
 from torchface.errors import FileFormatError
-from torchface.files.whole_files import read_file
 from torchface.shape_names import ARKIT
 
 _INPUTS = {"image": "tensor(uint8)", "interval": "tensor(float)", "controls": "tensor(float)", "state": "tensor(float)"}
@@ -18,18 +17,22 @@ _OUTPUTS = (
 )
 
 
-def check_webcam_graph(path: str | Path) -> None:
+def check_webcam_graph(data: bytes, path: str | Path) -> None:
     """Looks at inputs, outputs and names of shapes; runs nothing.
+
+    Args:
+        data: the file's bytes.
+        path: names it in errors.
 
     Raises:
         FileFormatError: it is no ONNX file, or another graph.
     """
     wanted = f"expected the graph of torchface export webcam ({', '.join(_INPUTS)} to {', '.join(_OUTPUTS)})"
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # errors alone
     try:
-        session = onnxruntime.InferenceSession(read_file(path), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common class for what it raises
-        if isinstance(error, FileFormatError):
-            raise
         raise FileFormatError(f"{path}: not an ONNX file that runs ({str(error)[:160]}), {wanted}") from error
     inputs = {one.name: one.type for one in session.get_inputs()}
     missing = sorted(set(_OUTPUTS) - {one.name for one in session.get_outputs()})

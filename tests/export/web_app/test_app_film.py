@@ -1,0 +1,79 @@
+"""The app with the webcam's own graph before films of rendered faces: Python's weights, drawn, and how fast."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from app_browser import Page, chromium, film_camera, static_host, until
+from film import write_y4m
+from PIL import Image
+from test_app_in_chromium import WATCH, allow_camera, assert_same_weights, record
+
+from torchface.errors import MissingExtraError
+from torchface.workflows.browser_app import export_app
+from torchface.workflows.webcam.webcam_export import rendered_frames
+
+pytestmark = [pytest.mark.browser, pytest.mark.bench]
+TOLERANCE = 0.02
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("app") / "app"
+    try:
+        export_app(folder)
+    except MissingExtraError as error:
+        pytest.skip(f"the page cannot be built here: {error}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def faces() -> np.ndarray:
+    return np.stack(rendered_frames(24))
+
+
+@contextmanager
+def opened(app: Path, frames: np.ndarray, folder: Path, isolated: bool = False) -> Iterator[Page]:
+    write_y4m(folder / "film.y4m", frames)
+    with (
+        static_host(app, isolated) as host,
+        chromium(folder / "profile", *film_camera(folder / "film.y4m")) as driver,
+    ):
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
+        allow_camera(driver, "granted")
+        driver.get(f"{host.url}/index.html")
+        yield Page(driver)
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
+    app: Path, faces: np.ndarray, tmp_path: Path, isolated: bool
+) -> None:
+    with opened(app, faces, tmp_path, isolated) as page:
+        recorded = record(page, tmp_path, 40)
+        assert_same_weights(app / "webcam.onnx", recorded, TOLERANCE)
+        assert np.array([one["weights"] for one in recorded.solved]).std(0).max() > 0.02
+        canvas = page.driver.find_element("id", "character").screenshot_as_png
+        assert np.asarray(Image.open(io.BytesIO(canvas)).convert("L"), float).std() > 15
+        times = np.array([one["interval"] for one in recorded.solved[10:]])
+        solving = np.array([one["milliseconds"] for one in recorded.solved[10:]])
+        print(
+            f"\n{'isolated' if isolated else 'one thread'}: {1 / times.mean():.0f} frames a second, "
+            f"{np.median(solving):.0f} ms a frame in the worker, least {solving.min():.0f}"
+        )
+
+
+def test_of_two_faces_one_is_followed(app: Path, faces: np.ndarray, tmp_path: Path) -> None:
+    width = faces.shape[2]
+    with opened(app, np.concatenate([faces, faces[:, :, ::-1]], axis=2), tmp_path) as page:
+        page.start()
+        until(lambda: page.driver.execute_script("return watched.solved.length") >= 20)
+        nose = "return watched.solved.slice(3).map(s => s.landmarks[60])"
+        sides = np.array(page.driver.execute_script(nose), float)
+        assert np.isfinite(sides).all()
+        assert (sides < width).all() or (sides >= width).all()
