@@ -22,7 +22,7 @@ def relative_trust(trust: Tensor) -> Tensor:
     return trust / trust.amax(1, keepdim=True).clamp(min=_LEAST_TRUST)
 
 
-def unseen_time(before: Tensor | None, told: Tensor, interval: float) -> Tensor:
+def unseen_time(before: Tensor | None, told: Tensor, interval: float | Tensor) -> Tensor:
     """For how long shapes have been hidden, (B,N), seconds.
 
     Args:
@@ -34,12 +34,12 @@ def unseen_time(before: Tensor | None, told: Tensor, interval: float) -> Tensor:
     return torch.where(told < HIDDEN, since + interval, 0.0)
 
 
-def faded(hidden: Tensor, interval: float) -> Tensor:
+def faded(hidden: Tensor, interval: float | Tensor) -> Tensor:
     """What is left of weights, (B,N), of shapes that have been hidden for (B,N) seconds, since the frame before."""
     return (-(hidden - HOLD).clamp(min=0).clamp(max=interval) / RELAXATION).exp()
 
 
-def walk_information(variance: Tensor, told: Tensor, interval: float) -> Tensor:
+def walk_information(variance: Tensor, told: Tensor, interval: float | Tensor) -> Tensor:
     """How sure the last frame's weights tell of this one's, one over a variance, (B,N).
 
     Args:

@@ -106,6 +106,28 @@ class WebcamSolver(nn.Module):
     valid: Tensor
     side: Tensor
     owner: Tensor
+    person_basis: Tensor
+    person_remainder: Tensor
+    closing_basis: Tensor
+    closing_shapes: Tensor
+    lid_ridge: Tensor
+    precisions: Tensor
+    freedoms: Tensor
+    sizes: Tensor
+    to_arkit: Tensor
+    tells: Tensor
+    open_rows: Tensor
+    usual_openness: Tensor
+    look_shapes: Tensor
+    look_eyes: Tensor
+    gain_shapes: Tensor
+    walk: Tensor
+    landmark_weights: Tensor
+    identity: Tensor
+    camera: Tensor
+    upright: Tensor
+    damping: Tensor
+    filter_units: Tensor
 
     def __init__(
         self,

@@ -53,7 +53,7 @@ class WebcamSolverGraph(nn.Module):
         """The frame's answer, of ``INPUTS`` in their order."""
         vector = self.solver(*given)
         state = self.solver.layout.unpack(vector)
-        return WebcamAnswer(*(getattr(state, name) for name in OUTPUTS[:-1]), vector)
+        return WebcamAnswer._make([*(getattr(state, name) for name in OUTPUTS[:-1]), vector])
 
 
 def empty_reading() -> FaceReading:
