@@ -84,16 +84,16 @@ def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Ten
     """
     check_image(image)
     rows, columns = image.shape[-2:]
-    last, low = width - 0.5, height - 0.5
-    corners = torch.tensor([[-0.5, -0.5], [last, -0.5], [-0.5, low], [last, low]], dtype=torch.float64)
-    seen = (corners - transforms[:, None, :, 2]) @ torch.linalg.inv(transforms[:, :, :2]).transpose(1, 2)
-    seen = seen.float().flatten(0, 1)
-    left, top = (seen.amin(0) - 2).floor().clamp(min=0).long().tolist()
-    right, bottom = ((seen.amax(0) + 2).ceil().long() + 1).tolist()
+    ways, last, low = transforms.double().numpy(), width - 0.5, height - 0.5  # NumPy is quicker on few numbers
+    corners = np.array([[-0.5, -0.5], [last, -0.5], [-0.5, low], [last, low]])
+    seen = (corners - ways[:, None, :, 2]) @ np.linalg.inv(ways[:, :, :2]).transpose(0, 2, 1)
+    seen = seen.astype(np.float32).reshape(-1, 2)
+    left, top = np.maximum(np.floor(seen.min(0) - 2), 0).astype(int).tolist()
+    right, bottom = (np.ceil(seen.max(0) + 2).astype(int) + 1).tolist()
     left, top = min(left, columns - 1), min(top, rows - 1)
     right, bottom = min(max(right, left + 1), columns), min(max(bottom, top + 1), rows)
     # Whole pixels are averaged, which OpenCV does ten times as fast as shares of them; the rest is left to the warp.
-    (a, b, _), (c, d, _) = transforms[0].tolist()
+    (a, b, _), (c, d, _) = ways[0].tolist()
     step = max(1, round(1 / math.sqrt(abs(a * d - b * c))))
     high, wide = max(1, (bottom - top) // step) * step, max(1, (right - left) // step) * step
     piece = image[..., top : top + high, left : left + wide].cpu()
@@ -108,7 +108,7 @@ def cut_crops(image: Tensor, transforms: Tensor, width: int, height: int) -> Ten
     back = np.concatenate([back, [[0.0, 0.0, 1.0]]])
     crops = [
         cv2.warpAffine(pixels, way @ back, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for way in transforms.double().numpy()
+        for way in ways
     ]
     return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
 
