@@ -34,7 +34,7 @@ class WebcamSettings:
     prior_strength: float = 0.3
     sparsity: float = 0.5
     ridge: float = 1e-2
-    motion: float = 1.5
+    motion: float = 1.0
     contour_slide: float = 0.3
     steps: int = 1
     coefficients: int = 64

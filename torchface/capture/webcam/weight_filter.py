@@ -11,7 +11,7 @@ from torchface.temporal.one_euro import OneEuroSettings
 
 # By lag and tremor on rendered videos of the test takes: at equal tremor a Kalman filter of constant acceleration comes
 # four times as late.
-_CUTOFF, _OPENING, _SPEED_CUTOFF = 0.7, 4.0, 3.0
+_CUTOFF, _OPENING, _SPEED_CUTOFF = 0.7, 2.0, 3.0
 _OCTAVES = 4.0  # between no smoothing to speak of and the most, of the cutoff
 
 
