@@ -51,7 +51,7 @@ class GraphBuilder:
 
     def unnamed(self, value: Tensor) -> str:
         """A float32 constant under a name of its own; the same numbers are kept once."""
-        return self._once(np.ascontiguousarray(value.detach().cpu().numpy().astype(np.float32)))
+        return self._once(value.detach().cpu().numpy().astype(np.float32, order="C"))
 
     def _once(self, array: np.ndarray) -> str:
         name = f"{array.dtype} {'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"

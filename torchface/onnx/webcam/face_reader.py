@@ -53,7 +53,7 @@ class ReaderSettings:
     least: float = 0.1
     doubt: float = 0.25
     patience: float = 0.3
-    eager: float = 1.0
+    eager: float = 0.5
     pause: float = 0.1
     smallest: float = 12.0
     search: SearchSettings = field(default_factory=SearchSettings)
