@@ -29,7 +29,7 @@ from webcam_measures import (
     vertex_error,
     weight_error,
 )
-from webcam_solvers import SOLVERS, Solved, read_faces
+from webcam_solvers import PAPER, SOLVERS, Solved, read_faces
 
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
@@ -143,3 +143,16 @@ def test_weights(rows: dict[str, Row]) -> None:
     print(f"\n{'correlation, slope':26s}" + "".join(f"{name:>16s}" for name in SIGNALS))
     for name, row in rows.items():
         print(f"{name:26s}" + "".join(f"{c:8.2f}, {s:5.2f} " for c, s in row.follows.values()))
+
+
+def test_the_error_is_half_of_the_papers(rows: dict[str, Row]) -> None:
+    best = min(rows[name].weights["all"] for name in PAPER)
+    own = rows["WebcamSolver"].weights["all"]
+    print(f"\nerror of weights: {own:.3f}, {own / best:.0%} of the best of the paper's three ({best:.3f})")
+    assert own <= 0.5 * best
+
+
+def test_blinks_are_found(rows: dict[str, Row]) -> None:
+    count = rows["WebcamSolver"].blinks
+    print(f"\n{count.found} of {count.true} blinks found, {count.false} of {count.reported} reported are none")
+    assert count.recall >= 0.95
