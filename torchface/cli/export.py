@@ -180,13 +180,17 @@ def examples(
         solver: All shapes at once, the head first and then regions, or projected on a linear model of landmarks.
         quiet: Show no progress.
     """
-    from torchface.capture.webcam import AllAtOnce, ExampleShapes, ExampleSolver, LandmarkModel, Regional
+    from torchface.capture.webcam import AllAtOnce, ExampleMethod, ExampleShapes, ExampleSolver, LandmarkModel, Regional
     from torchface.onnx import export_example_solver
 
     with progress_bars(quiet) as progress:
         progress("reading the examples")
         shapes = ExampleShapes.load(examples)
-        methods = {"all-at-once": AllAtOnce, "regional": Regional, "model": lambda: LandmarkModel.fit(shapes)}
+        methods: dict[str, Callable[[], ExampleMethod]] = {
+            "all-at-once": AllAtOnce,
+            "regional": Regional,
+            "model": lambda: LandmarkModel.fit(shapes),
+        }
         made = ExampleSolver(shapes, methods[solver]())
         progress("exporting and checking")
         report = export_example_solver(made, out)

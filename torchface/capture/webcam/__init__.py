@@ -6,7 +6,7 @@ from torchface.capture.webcam.example_expressions import (
     head_angles,
     paper_expressions,
 )
-from torchface.capture.webcam.example_methods import AllAtOnce, Regional
+from torchface.capture.webcam.example_methods import AllAtOnce, ExampleMethod, Regional
 from torchface.capture.webcam.example_shapes import ExampleShapes
 from torchface.capture.webcam.example_solver import ExampleFit, ExampleSolver
 from torchface.capture.webcam.landmark_model import LandmarkModel
@@ -24,6 +24,7 @@ __all__ = [
     "Distances",
     "ExampleExpression",
     "ExampleFit",
+    "ExampleMethod",
     "ExampleShapes",
     "ExampleSolver",
     "LandmarkBoxes",

@@ -76,7 +76,9 @@ def paper_examples(rig: BlendshapeRig, landmark_vertices: Tensor | None = None) 
 
 def _marks(rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
     annotations = rig.neutral.annotations
-    marks = landmark_vertices if landmark_vertices is not None else annotations and annotations.landmarks
+    marks = landmark_vertices
+    if marks is None and annotations is not None:
+        marks = annotations.landmarks
     if marks is None or marks.shape != (68,):
         found = "no landmarks" if marks is None else f"{tuple(marks.shape)}"
         raise ShapeError(f"rig: found {found}, expected the 68 of iBUG annotated: torchface pick")
