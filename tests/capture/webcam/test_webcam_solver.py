@@ -178,6 +178,10 @@ def test_an_eye_that_shuts_blinks_and_one_that_looks_down_does_not(solver: Webca
     for _ in range(30):
         state = stepped(state, 0.22, 0.02)
     assert float(state.weights[blink]) < 0.15
+    narrow = solver.start()
+    for _ in range(60):
+        narrow = stepped(narrow, 0.14, 0.02)
+    assert float(narrow.weights[blink]) < 0.35
     shut = stepped(stepped(state, 0.12, 0.6), 0.06, 0.99)
     assert float(shut.weights[blink]) > 0.6
     down = stepped(stepped(state, 0.16, 0.05, eyeLookDownLeft=0.8), 0.15, 0.05, eyeLookDownLeft=0.8)

@@ -32,6 +32,7 @@ _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
 _OPEN_MEMORY, _SHUT_MEMORY, _STRAIGHT_MEMORY = 8.0, 2.0, 60.0  # seconds
 _LASTING, _ASKED = 0.3, 10.0  # who is asked to rest looks ahead: that counts as much as ten times as long without
 _STRAIGHT_PRIOR, _SHUT_PRIOR = 1.0, 0.2  # seconds
+_NARROWEST = 0.15
 _DOWNWARD = 0.2  # how quickly the open level falls beside how it rises: blinks and squints are no level
 
 
@@ -166,7 +167,8 @@ def eye_signals(
     by_look = 1 + looking @ look_weights(ahead) * any_gaze
     part = (found - floor) / span
     rested = floor + (found - floor) / by_look.clamp(min=0.4)
-    counts = learns * known * visible * (shut < _SURELY_OPEN) * (part > 0.5) * ~shutting
+    # Narrow eyes stay so, blinks do not: what is far below the level counts, and moves it slowly.
+    counts = learns * known * visible * (shut < _SURELY_OPEN) * (part > _NARROWEST) * ~shutting
     falls = torch.where(resting, 1.0, torch.where(rested < level, _DOWNWARD, 1.0))
     lid_rate = counts * falls * interval / (before.lids_seen[:, 0].clamp(max=_OPEN_MEMORY) + interval)
     opened = before.lids[:, 0] + lid_rate * (rested - level)
