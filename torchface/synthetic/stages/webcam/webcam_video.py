@@ -197,7 +197,9 @@ def _taken(picture: np.ndarray, settings: WebcamSettings, noise: np.random.Gener
     soft += settings.noise * noise.standard_normal(picture.shape, dtype=np.float32)
     stored = np.clip(soft, 0, 255).round().astype(np.uint8)
     coded = cv2.imencode(".jpg", stored[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, settings.quality])[1]
-    return np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1])
+    sent = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    assert sent is not None
+    return np.ascontiguousarray(sent[..., ::-1])
 
 
 def _drawn(seed: int, number: int) -> torch.Generator:
