@@ -29,6 +29,7 @@ export function answerFrames(ort, engine) {
     session = await ort.InferenceSession.create(new Uint8Array(await answer.arrayBuffer()), {
       executionProviders: [engine],
       graphOptimizationLevel: "all",
+      logSeverityLevel: 3, // errors alone
     });
     const size = session.inputMetadata.find((input) => input.name === "state").shape[0];
     state = new ort.Tensor("float32", new Float32Array(size), [size]);
