@@ -62,7 +62,7 @@ class ValueGraph:
         """One where the condition holds, the other elsewhere."""
         return self.op("Where", condition, one, other)
 
-    def cat(self, *values: Value | float, axis: int = 0) -> Value:
+    def cat(self, *values: Value | Tensor | float | Sequence[int], axis: int = 0) -> Value:
         """Values one after the other."""
         return self.op("Concat", *values, axis=axis)
 

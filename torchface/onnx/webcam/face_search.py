@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.onnx.face_box_graph import box_network_nodes
 from torchface.onnx.graph_values import Value
@@ -12,6 +14,9 @@ from torchface.onnx.webcam.picture_pieces import whole_picture
 
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6
 _FIRST = 1e6  # more than any side: a face that is near goes before all others
+# Cosine and sine of the roll angles, 50 degrees either way, that faces are looked for at where what the network says
+# (the first) shows none.
+_LEANING = ((1.0, 0.0), (1.0, 0.0), (0.643, 0.766), (0.643, -0.766))
 FOUND = 7
 """Numbers that a search gives."""
 
@@ -70,9 +75,13 @@ def search(
     preference = graph.where(meant, preference, 0.0).shaped(network.faces)
     order, rows = graph.two_of("TopK", preference, [settings.candidates])
     count = (order > 0.0).number().reduced("ReduceSum", 0, keep=True)
-    turn = attempt - graph.op("Floor", attempt / count.most(1.0)) * count.most(1.0)
-    row = graph.op("Gather", rows, turn.whole())
+    rounds = graph.op("Floor", attempt / count.most(1.0))
+    row = graph.op("Gather", rows, (attempt - rounds * count.most(1.0)).whole())
     chosen = graph.op("Gather", graph.cat(middles, sides, angles, axis=1), row).shaped(5)
+    # The network may take a leaning face for one that is upside down: refused ones are looked at in other ways.
+    other = rounds - graph.op("Floor", rounds / float(len(_LEANING))) * float(len(_LEANING))
+    angle = graph.op("Gather", graph.as_value(torch.tensor(_LEANING)), other.whole()).shaped(2)
+    chosen = graph.cat(chosen.rows(0, 3), graph.where(other > 0.0, angle, chosen.rows(3, 5)))
     there = (overlap(middles, sides, place) > settings.overlap) & (scores >= settings.again)
     seen = there.number().reduced("ReduceMax", 0).shaped(1)
     return graph.cat(chosen, (count > 0.0).number(), seen)
