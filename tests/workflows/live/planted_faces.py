@@ -34,13 +34,14 @@ class ShadeSolver:
     def __init__(self, *_: object) -> None:
         self.controls: list[WebcamControls] = []
         self.intervals: list[float | None] = []
-        self.posed = 0
+        self.posed = self.resets = 0
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         if len(self.controls) < 330:
             self.controls.append(controls)
             self.intervals.append(interval)
         self.posed += controls.pose > 0
+        self.resets += controls.reset
         shade = float(picture[24, 32].mean())
         height, width = picture.shape[:2]
         weights = torch.zeros(52)
