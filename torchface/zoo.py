@@ -16,7 +16,7 @@ from torchface.capture.action_units.classifier import ActionUnitClassifier
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.capture.video.video_solver import VideoSolver
-from torchface.capture.webcam.example_solver import ExampleSolver
+from torchface.capture.webcam.examples.example_solver import ExampleSolver
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_names, model_roots
 from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model

@@ -28,7 +28,7 @@ from torchface.capture.webcam import (
     character_matrix,
     paper_examples,
 )
-from torchface.capture.webcam.example_methods import ExampleMethod
+from torchface.capture.webcam.examples.example_methods import ExampleMethod
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration

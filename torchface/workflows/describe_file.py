@@ -10,7 +10,7 @@ import torch
 from torchface.attachment import Attachment
 from torchface.capture.markers import MarkerSolver, observability
 from torchface.capture.webcam import ExampleShapes, ExampleSolver, landmark_observability
-from torchface.capture.webcam.example_shapes import is_examples
+from torchface.capture.webcam.examples.example_shapes import is_examples
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_mesh, load_rig, load_take

@@ -23,7 +23,7 @@ from torchface.capture.webcam import (
     SolvedSimilarity,
     SquaredDistances,
 )
-from torchface.capture.webcam.example_methods import ExampleMethod
+from torchface.capture.webcam.examples.example_methods import ExampleMethod
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 
 FREE = {"sparsity": 0.0, "ridge": 0.0}

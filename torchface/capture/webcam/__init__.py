@@ -1,20 +1,20 @@
 """Blendshape weights of somebody before a webcam, from the landmarks of their face alone."""
 
-from torchface.capture.webcam.example_expressions import (
+from torchface.capture.webcam.examples.example_expressions import (
     ExampleExpression,
     character_matrix,
     head_angles,
     paper_expressions,
 )
-from torchface.capture.webcam.example_methods import AllAtOnce, ExampleMethod, Regional
-from torchface.capture.webcam.example_shapes import ExampleShapes
-from torchface.capture.webcam.example_solver import ExampleFit, ExampleSolver
-from torchface.capture.webcam.landmark_model import LandmarkModel
-from torchface.capture.webcam.landmark_objectives import Distances, SquaredDistances
-from torchface.capture.webcam.landmark_observability import landmark_observability
-from torchface.capture.webcam.landmark_placement import LandmarkBoxes, SolvedSimilarity
-from torchface.capture.webcam.rig_examples import paper_examples, rig_examples
-from torchface.capture.webcam.shown_examples import example_remarks, shown_examples
+from torchface.capture.webcam.examples.example_methods import AllAtOnce, ExampleMethod, Regional
+from torchface.capture.webcam.examples.example_shapes import ExampleShapes
+from torchface.capture.webcam.examples.example_solver import ExampleFit, ExampleSolver
+from torchface.capture.webcam.examples.landmark_model import LandmarkModel
+from torchface.capture.webcam.examples.landmark_objectives import Distances, SquaredDistances
+from torchface.capture.webcam.examples.landmark_observability import landmark_observability
+from torchface.capture.webcam.examples.landmark_placement import LandmarkBoxes, SolvedSimilarity
+from torchface.capture.webcam.examples.rig_examples import paper_examples, rig_examples
+from torchface.capture.webcam.examples.shown_examples import example_remarks, shown_examples
 from torchface.capture.webcam.webcam_settings import WebcamSettings
 from torchface.capture.webcam.webcam_solver import WebcamSolver
 from torchface.capture.webcam.webcam_state import WebcamControls, WebcamState

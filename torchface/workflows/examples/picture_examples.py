@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from torchface.capture.webcam import ExampleShapes, paper_expressions, shown_examples
-from torchface.capture.webcam.example_expressions import NEUTRAL
+from torchface.capture.webcam.examples.example_expressions import NEUTRAL
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.images.image_files import load_image
 from torchface.landmarks import NoFaceError, find_landmarks

@@ -8,8 +8,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam.example_shapes import EYE_CORNERS
-from torchface.capture.webcam.landmark_equations import LandmarkEquations
+from torchface.capture.webcam.examples.example_shapes import EYE_CORNERS
+from torchface.capture.webcam.examples.landmark_equations import LandmarkEquations
 
 _BROWS = slice(17, 27)
 _SMALLEST = 1e-6

@@ -9,13 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.capture.webcam.example_methods import AllAtOnce, ExampleMethod, Regional
-from torchface.capture.webcam.example_shapes import ExampleShapes
-from torchface.capture.webcam.expression_regions import shape_regions
-from torchface.capture.webcam.landmark_equations import LandmarkEquations
-from torchface.capture.webcam.landmark_model import LandmarkModel
-from torchface.capture.webcam.landmark_objectives import Distances, SquaredDistances
-from torchface.capture.webcam.landmark_placement import LandmarkBoxes, Placement, PlacementModel, SolvedSimilarity
+from torchface.capture.webcam.examples.example_methods import AllAtOnce, ExampleMethod, Regional
+from torchface.capture.webcam.examples.example_shapes import ExampleShapes
+from torchface.capture.webcam.examples.expression_regions import shape_regions
+from torchface.capture.webcam.examples.landmark_equations import LandmarkEquations
+from torchface.capture.webcam.examples.landmark_model import LandmarkModel
+from torchface.capture.webcam.examples.landmark_objectives import Distances, SquaredDistances
+from torchface.capture.webcam.examples.landmark_placement import (
+    LandmarkBoxes,
+    Placement,
+    PlacementModel,
+    SolvedSimilarity,
+)
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 
 _OBJECTIVES = {"squared_distances": SquaredDistances, "distances": Distances}

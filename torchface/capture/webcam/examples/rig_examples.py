@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam.example_expressions import (
+from torchface.capture.webcam.examples.example_expressions import (
     NEUTRAL,
     ExampleExpression,
     character_matrix,
     paper_expressions,
 )
-from torchface.capture.webcam.example_shapes import ExampleShapes
+from torchface.capture.webcam.examples.example_shapes import ExampleShapes
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam.example_expressions import NEUTRAL, paper_expressions
-from torchface.capture.webcam.example_shapes import ExampleShapes
-from torchface.capture.webcam.expression_regions import HEAD_LANDMARKS
+from torchface.capture.webcam.examples.example_expressions import NEUTRAL, paper_expressions
+from torchface.capture.webcam.examples.example_shapes import ExampleShapes
+from torchface.capture.webcam.examples.expression_regions import HEAD_LANDMARKS
 from torchface.errors import NameMismatchError, ShapeError
 
 _LEFT, _RIGHT = (

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic, ridge_term, sparsity_term
-from torchface.capture.webcam.landmark_equations import LandmarkEquations, Unknowns
+from torchface.capture.webcam.examples.landmark_equations import LandmarkEquations, Unknowns
 from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.optim import box_qp
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import ridge_term, sparsity_term
-from torchface.capture.webcam.example_shapes import EYE_CORNERS, ExampleShapes
-from torchface.capture.webcam.landmark_equations import LandmarkEquations, Unknowns
+from torchface.capture.webcam.examples.example_shapes import EYE_CORNERS, ExampleShapes
+from torchface.capture.webcam.examples.landmark_equations import LandmarkEquations, Unknowns
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import BoxQP

@@ -8,9 +8,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
-from torchface.capture.webcam.landmark_equations import LandmarkEquations, Unknowns
-from torchface.capture.webcam.landmark_objectives import LandmarkObjective, SquaredDistances
+from torchface.capture.webcam.examples.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
+from torchface.capture.webcam.examples.landmark_equations import LandmarkEquations, Unknowns
+from torchface.capture.webcam.examples.landmark_objectives import LandmarkObjective, SquaredDistances
 
 
 class ExampleMethod(Protocol):

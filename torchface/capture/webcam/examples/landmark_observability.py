@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchface.capture.webcam.example_solver import ExampleSolver
+from torchface.capture.webcam.examples.example_solver import ExampleSolver
 from torchface.capture.weight_observability import Observability, weight_observability
 
 
