@@ -325,10 +325,8 @@ def test_controls_reach_the_graph(opened: Open, recorded: Recorded) -> None:
     )
     driver.execute_script(slide, "gain", 1.5)
     driver.execute_script(slide, "smoothing", 0)
-    until(lambda: driver.execute_script("return watched.sent.length") > count + 4)
-    sent = watched(page, f"watched.sent.slice({count})")
-    assert sum(one["reset"] for one in sent) == 1
-    assert (sent[-1]["gain"], sent[-1]["smoothing"]) == (1.5, 0)
+    until(lambda: driver.execute_script("const e = watched.sent.at(-1); return e.gain === 1.5 && e.smoothing === 0"))
+    assert sum(one["reset"] for one in watched(page, f"watched.sent.slice({count})")) == 1
     assert page.text("gain-value") == "1.5"
 
 
