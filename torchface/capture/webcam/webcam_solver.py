@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import torch
@@ -13,7 +12,6 @@ from torch.nn.functional import pad
 from torchface.capture.priors import ShapePrior
 from torchface.capture.priors.student_groups import StudentGroups
 from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
-from torchface.capture.video.landmark_offsets import lid_pairs
 from torchface.capture.video.reprojection import HeadState, Linearised, linearise
 from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.webcam.eye_signals import (
@@ -24,8 +22,10 @@ from torchface.capture.webcam.eye_signals import (
     openness_rows,
     seen_gaze,
 )
+from torchface.capture.webcam.guided_gains import gain_factors, gain_groups, highest_weights, learned_gains
 from torchface.capture.webcam.person_filter import frame_information, lasting_precision
 from torchface.capture.webcam.person_prior import PersonPrior
+from torchface.capture.webcam.rig_tables import CONTOUR_TRUST, arkit_names, closing, owners, tells
 from torchface.capture.webcam.webcam_settings import WebcamSettings
 from torchface.capture.webcam.webcam_state import StateLayout, WebcamControls, WebcamState
 from torchface.capture.webcam.weight_filter import one_euro_step
@@ -60,11 +60,6 @@ _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
 _LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
-_CONTOUR_TRUST = 0.5
-_GROUPS = (("jawOpen",), ("mouthSmileLeft", "mouthSmileRight"), ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"))
-_LEAST_GAIN, _MOST_GAIN = 0.6, 1.8
-_REACTION, _GAIN_MEMORY, _ASKED = 0.8, 2.0, 0.25  # seconds, and the weight from which a pose counts as held
-_RANGE_TIME = 2.0  # seconds in which a range grows that is left
 
 
 class WebcamSolver(nn.Module):
@@ -153,7 +148,7 @@ class WebcamSolver(nn.Module):
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
         self.strength = self.settings.prior_strength
         groups = StudentGroups.of(prior, len(rig.names), points.rest)
-        called = _arkit_names(rig.names)
+        called = arkit_names(rig.names)
         rows, usual = openness_rows(points.rest[:LANDMARKS], points.basis[:LANDMARKS], called)
         for name, value in {
             "rest": points.rest,
@@ -161,11 +156,11 @@ class WebcamSolver(nn.Module):
             "rows": points.rows,
             "valid": points.valid,
             "side": points.side,
-            "owner": _owners(points),
+            "owner": owners(points),
             "person_basis": person.basis,
             "person_remainder": person.remainder,
-            "closing_basis": _closing(person.basis, rig.names)[0],
-            "closing_shapes": _closing(person.basis, rig.names)[1],
+            "closing_basis": closing(person.basis, rig.names)[0],
+            "closing_shapes": closing(person.basis, rig.names)[1],
             "lid_ridge": torch.tensor(
                 [_LID_RIDGE.get(n.removesuffix("Left").removesuffix("Right"), 0.0) for n in called]
             ),
@@ -173,13 +168,13 @@ class WebcamSolver(nn.Module):
             "freedoms": groups.freedoms,
             "sizes": groups.sizes,
             "to_arkit": to_arkit,
-            "tells": _tells(points),
+            "tells": tells(points),
             "open_rows": rows,
             "usual_openness": usual,
             "look_shapes": mapping(LOOKS, rig.names).double(),
-            "gain_shapes": torch.stack([mapping(group, rig.names).double().amax(1) for group in _GROUPS]),
+            "gain_shapes": gain_groups(rig.names),
             "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
-            "landmark_weights": torch.tensor([_CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW)),
+            "landmark_weights": torch.tensor([CONTOUR_TRUST] * JAW + [1.0] * (LANDMARKS - JAW)),
             "identity": torch.eye(max(len(rig.names) + 6, self.settings.coefficients)),
             "camera": torch.eye(3),
             "look_eyes": torch.tensor(_LOOK_EYES),
@@ -317,8 +312,8 @@ class WebcamSolver(nn.Module):
             (self.settings.noise * eyes).square() + (0.5 * spread).square() + self.person_remainder * unit**2
         ).sqrt()
         precision = trust.sqrt() / noise
-        gains = self._gains_of(before.gains)
-        upper = self._upper(gains, pose)
+        gains = gain_factors(before.gains, self.gain_shapes)
+        upper = highest_weights(gains, self.gain_shapes, pose)
         looking, look_trust = (
             self.look_shapes @ look_weights(signals.gaze),
             self.look_shapes @ signals.gaze_trust[self.look_eyes],
@@ -358,7 +353,9 @@ class WebcamSolver(nn.Module):
         error = self._error(at, precision, eyes, trust)
         good = learns * (shown > _SETTLED) * (error < _LOST_FIT)
         person, information, evidence = self._learned_person(at, head, before, interval, pose, good)
-        gains_after, gains_seen = self._learned_gains(weights, before, interval, pose, (freeze <= 0).double())
+        gains_after, gains_seen = learned_gains(
+            weights, self.gain_shapes, before, interval, pose, (freeze <= 0).double()
+        )
         learned = (before.learned + good * interval).clamp(max=self.settings.learning)
         return replace(
             before,
@@ -462,36 +459,6 @@ class WebcamSolver(nn.Module):
         person, information, evidence, _ = given[-4:]
         return person.clone(), information.clone(), evidence.clone()
 
-    def _gains_of(self, gains: Tensor) -> Tensor:
-        """Of each shape, (N,)."""
-        return torch.exp(gains @ self.gain_shapes)
-
-    def _upper(self, gains: Tensor, pose: Tensor) -> Tensor:
-        """How far weights may go before gains, (N,): a little beyond the person's known range, further if asked to."""
-        asked = self._asked(pose) @ self.gain_shapes
-        grows = self.gain_shapes.amax(0)
-        return torch.where(asked > 0, _MOST_GAIN, torch.where(grows > 0, 1.1 * gains.clamp(min=1.0), 1.0))
-
-    def _asked(self, pose: Tensor) -> Tensor:
-        """Which groups of shapes a pose asks for, (3,)."""
-        return ((pose - 2 - torch.arange(len(_GROUPS))).abs() < 0.5).to(pose)
-
-    def _learned_gains(
-        self, weights: Tensor, before: WebcamState, interval: Tensor, pose: Tensor, learns: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Logarithms of gains, and for how long each has been asked for, (3,)."""
-        reached = (self.gain_shapes @ weights) / self.gain_shapes.sum(1)
-        asked = learns * self._asked(pose)
-        seen = before.gains_seen + asked * interval
-        held = asked * (seen > _REACTION) * (reached > _ASKED)
-        since = (seen - _REACTION).clamp(min=0, max=_GAIN_MEMORY)
-        aim = reached.clamp(_LEAST_GAIN, _MOST_GAIN).log()
-        rate = held * (interval / (since + interval)) * torch.where(aim < before.gains, 0.5, 1.0)
-        gains = before.gains + rate * (aim - before.gains)
-        # Without being asked a range grows where it is left, and never shrinks.
-        beyond = learns * (1 - asked) * (aim - gains).clamp(min=0) * (aim > 0)
-        return gains + beyond * interval / _RANGE_TIME, seen
-
     def _lost(self, before: WebcamState, interval: Tensor) -> WebcamState:
         """The state of a frame without a face: as it was, then on its way to rest."""
         lost = before.lost + interval
@@ -520,7 +487,7 @@ class WebcamSolver(nn.Module):
         smoothing: Tensor,
     ) -> WebcamState:
         """The state with its outputs: weights by ARKit's names with gains, calmed."""
-        gains = self._gains_of(after.gains)
+        gains = gain_factors(after.gains, self.gain_shapes)
         weights = (gain * (self.to_arkit @ (after.shapes / gains))).clamp(0, 1)
         pose = after.pose
         first = (before.pose.abs().sum() < 1e-9) | (after.shown < 1.5 * interval)
@@ -557,37 +524,3 @@ def _double(state: WebcamState) -> WebcamState:
 def _chosen(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
     names = [part.name for part in fields(WebcamState)]
     return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in names))
-
-
-def _arkit_names(names: Sequence[str]) -> list[str]:
-    """What ARKit calls each shape; its own name where ARKit knows none."""
-    called = mapping(names, ARKIT)
-    return [
-        ARKIT[int(column.argmax())] if bool(column.any()) else name
-        for name, column in zip(names, called.T, strict=True)
-    ]
-
-
-def _owners(points: FacePoints) -> Tensor:
-    """The landmark whose displacement each point takes, (P,): those of a contour landmark's curve take its."""
-    owner = torch.arange(len(points.rest))
-    for landmark, (row, valid) in enumerate(zip(points.rows, points.valid, strict=True)):  # curves have own lengths
-        owner[row[valid]] = landmark
-    return owner
-
-
-def _closing(basis: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """What displacements (68,3,D) take of the lids' way as an eye shuts, (2,68,3,D); the shapes that shut, (2,N)."""
-    made, shapes = torch.zeros(2, *basis.shape, dtype=basis.dtype), torch.zeros(2, len(names), dtype=basis.dtype)
-    for upper, lower, closing in lid_pairs(names):
-        eye = 0 if upper < 42 else 1
-        apart = 0.5 * (basis[upper] - basis[lower])
-        made[eye, upper], made[eye, lower], shapes[eye] = apart, -apart, closing.double()
-    return made, shapes
-
-
-def _tells(points: FacePoints) -> Tensor:
-    """How much of what could tell of each shape each landmark is, (68,N)."""
-    moved = points.basis[:LANDMARKS].square().sum(1)
-    moved[:JAW] *= _CONTOUR_TRUST
-    return moved / moved.sum(0).clamp(min=1e-6)
