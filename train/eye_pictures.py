@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, fields
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor
 
-from torchface.files.content_keys import content_key
-from torchface.files.whole_files import make_folder, write_file
 from torchface.landmarks.images.eyes.eye_augmentation import EyeLabels
-from torchface.progress import Progress, silent
+from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
 from train.face_pictures import head_kinds
+from train.rendered_files import Rendering, rendered_files
 
 PART = 200
 """Pictures in a file: what a killed run loses at most."""
-_METHOD = "eye pictures/1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +67,8 @@ def render_eye_pictures(
         workers: processes.
         progress: called with each step and how far it is.
     """
-    progress = progress or silent
-    make_folder(folder)
-    key = content_key(_METHOD, seed=seed, ict=None if ict is None else ict.name)[:12]
-    paths = [folder / f"eyes_{key}_{number:04d}.safetensors" for number in range(-(-count // PART))]
-    parts = [(path, number, seed, ict) for number, path in enumerate(paths) if not path.is_file()]
-    with ExitStack() as stack:
-        done: Iterable[None] = map(_render_part, parts)
-        if workers > 1:
-            # Spawned: what a process inherits of torch's threads may not survive a fork.
-            pool = ProcessPoolExecutor(workers, get_context("spawn"))
-            done = stack.enter_context(pool).map(_render_part, parts)
-        for number, _ in enumerate(done):
-            progress("rendering eyes", PART * (len(paths) - len(parts) + number + 1), PART * len(paths))
+    rendering = Rendering(_render, "eye pictures/1", "eyes", "eyes", PART)
+    paths = rendered_files(rendering, folder, count, seed, ict, workers, progress)
     return read_eye_pictures(paths)
 
 
@@ -95,9 +78,7 @@ def read_eye_pictures(paths: list[Path]) -> EyePictures:
     return EyePictures(*(torch.cat([part[field.name] for part in read]) for field in fields(EyePictures)))
 
 
-def _render_part(part: tuple[Path, int, int, Path | None]) -> None:
-    path, number, seed, ict = part
-    torch.set_num_threads(1)
-    pictures = draw_eye_pictures(*head_kinds(ict), PART * number, PART, seed)
+def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
+    pictures = draw_eye_pictures(*head_kinds(ict), first, count, seed)
     names = [field.name for field in fields(EyePictures)]
-    write_file(path, save({name: torch.stack([getattr(one, name) for one in pictures]) for name in names}))
+    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in names}

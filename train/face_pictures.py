@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor
 
-from torchface.files.content_keys import content_key
-from torchface.files.whole_files import make_folder, write_file
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
-from torchface.progress import Progress, silent
+from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind
+from train.rendered_files import Rendering, rendered_files
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""
-_METHOD = "face pictures/3"
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
@@ -58,19 +52,8 @@ def render_pictures(
         workers: processes.
         progress: called with each step and how far it is.
     """
-    progress = progress or silent
-    make_folder(folder)
-    key = content_key(_METHOD, seed=seed, ict=None if ict is None else ict.name)[:12]
-    paths = [folder / f"pictures_{key}_{number:04d}.safetensors" for number in range(-(-count // PART))]
-    parts = [(path, number, seed, ict) for number, path in enumerate(paths) if not path.is_file()]
-    with ExitStack() as stack:
-        done: Iterable[None] = map(_render_part, parts)
-        if workers > 1:
-            # Spawned: what a process inherits of torch's threads may not survive a fork.
-            pool = ProcessPoolExecutor(workers, get_context("spawn"))
-            done = stack.enter_context(pool).map(_render_part, parts)
-        for number, _ in enumerate(done):
-            progress("rendering faces", PART * (len(paths) - len(parts) + number + 1), PART * len(paths))
+    rendering = Rendering(_render, "face pictures/3", "pictures", "faces", PART)
+    paths = rendered_files(rendering, folder, count, seed, ict, workers, progress)
     return read_pictures(paths)
 
 
@@ -90,14 +73,9 @@ def read_pictures(paths: list[Path]) -> FacePictures:
     return found
 
 
-def _render_part(part: tuple[Path, int, int, Path | None]) -> None:
-    path, number, seed, ict = part
-    torch.set_num_threads(1)
-    pictures = draw_pictures(*head_kinds(ict), PART * number, PART, seed)
-    tensors = {
-        name: torch.stack([getattr(picture, name) for picture in pictures]) for name in ("rgba", "landmarks", "visible")
-    }
-    write_file(path, save(tensors))
+def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
+    pictures = draw_pictures(*head_kinds(ict), first, count, seed)
+    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in ("rgba", "landmarks", "visible")}
 
 
 @lru_cache(maxsize=2)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from torchface.errors import ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.progress import Progress
 
@@ -19,24 +21,55 @@ _CHECK = 200  # steps from checkpoint to checkpoint
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class DescentSettings(Protocol):
-    """What a descent needs to know: steps, the largest rate, the weights' decay, the running mean's share, workers."""
+@dataclass(frozen=True)
+class DescentSettings:
+    """How a network descends.
 
-    @property
-    def steps(self) -> int: ...
-    @property
-    def rate(self) -> float: ...
-    @property
-    def decay(self) -> float: ...
-    @property
-    def average(self) -> float: ...
-    @property
-    def workers(self) -> int: ...
+    Args:
+        steps: of gradient descent.
+        batch: crops a step.
+        rate: largest learning rate, reached after a twentieth of the steps; it ends at zero as a cosine.
+        decay: of the weights.
+        average: share of the running mean of weights that stays in each step.
+        workers: processes that draw crops.
+        seed: draws crops and the first weights.
+    """
+
+    steps: int = 8000
+    batch: int = 64
+    rate: float = 2e-3
+    decay: float = 1e-4
+    average: float = 0.998
+    workers: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.steps >= 1 and self.batch >= 2 and 0 < self.rate < 1 and 0 <= self.average < 1):
+            raise ValueRangeError(
+                f"network settings: found {self.steps} steps, batch {self.batch}, rate {self.rate}, average "
+                f"{self.average}; expected at least 1, at least 2, (0,1), [0,1)"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Batches(IterableDataset):
+    """Batches of step ``first`` and on; what a step draws depends on its number alone."""
+
+    draw: Callable[[torch.Generator], Any]
+    first: int
+    settings: DescentSettings
+
+    def __iter__(self) -> Iterator[Any]:
+        torch.set_num_threads(1)
+        worker = get_worker_info()
+        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for step in range(self.first + offset, self.settings.steps, stride):
+            yield self.draw(torch.Generator().manual_seed(1_000_003 * self.settings.seed + step))
 
 
 def descend(
     network: Network,
-    batches: Callable[[int], IterableDataset],
+    draw: Callable[[torch.Generator], Any],
     loss: Callable[[Any, float], tuple[Tensor, float]],
     settings: DescentSettings,
     key: str,
@@ -49,7 +82,7 @@ def descend(
 
     Args:
         network: goes on from its weights.
-        batches: from a step's number, the batches of that step and of those after it.
+        draw: a batch, of nothing but the generator.
         loss: of a batch and the share of steps done; with the mean distance from the truth, pixels, for the progress.
         settings: how many steps, and how.
         key: of all that decides the result; a checkpoint of another key is not taken up.
@@ -66,7 +99,9 @@ def descend(
     optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
     first = _resume(checkpoint, key, network, mean, optimiser)
     workers = settings.workers
-    loader = DataLoader(batches(first), batch_size=None, num_workers=workers, prefetch_factor=4 if workers else None)
+    loader = DataLoader(
+        _Batches(draw, first, settings), batch_size=None, num_workers=workers, prefetch_factor=4 if workers else None
+    )
     begin, shown = time.monotonic(), 0.0
     for step, batch in enumerate(loader, first):
         for group in optimiser.param_groups:

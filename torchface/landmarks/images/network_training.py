@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.utils.data import IterableDataset, get_worker_info
 
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
-from torchface.landmarks.images.network_descent import descend
+from torchface.landmarks.images.network_descent import DescentSettings, descend
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, Crops, augmented
 from torchface.progress import Progress, silent
 
@@ -25,64 +24,19 @@ _HEAT = 1.0  # standard deviation of the heat map asked for, cells
 
 
 @dataclass(frozen=True)
-class NetworkSettings:
+class NetworkSettings(DescentSettings):
     """How a landmark network is trained.
 
     Args:
-        steps: of gradient descent.
-        batch: crops a step.
-        rate: largest learning rate, reached after a twentieth of the steps; it ends at zero as a cosine.
-        decay: of the weights.
-        average: share of the running mean of weights that stays in each step.
         pair: weight of distances between landmarks, such as between lids.
         heat: weight of the heat maps' form, which fades over the first half.
-        workers: processes that draw crops.
-        seed: draws crops and the first weights.
         augmentation: how widely crops are drawn.
     """
 
-    steps: int = 8000
-    batch: int = 64
-    rate: float = 2e-3
-    decay: float = 1e-4
-    average: float = 0.998
+    workers: int = 1
     pair: float = 1.0
     heat: float = 0.5
-    workers: int = 1
-    seed: int = 0
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
-
-    def __post_init__(self) -> None:
-        if not (self.steps >= 1 and self.batch >= 2 and 0 < self.rate < 1 and 0 <= self.average < 1):
-            raise ValueRangeError(
-                f"network settings: found {self.steps} steps, batch {self.batch}, rate {self.rate}, average "
-                f"{self.average}; expected at least 1, at least 2, (0,1), [0,1)"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class _Batches(IterableDataset):
-    """Crops of step ``first`` and on; what a step draws depends on its number alone."""
-
-    rgba: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    size: int
-    margin: float
-    first: int
-    settings: NetworkSettings
-
-    def __iter__(self) -> Iterator[Crops]:
-        torch.set_num_threads(1)
-        worker = get_worker_info()
-        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for step in range(self.first + offset, self.settings.steps, stride):
-            generator = torch.Generator().manual_seed(1_000_003 * self.settings.seed + step)
-            rows = torch.randint(len(self.rgba), (self.settings.batch,), generator=generator)
-            yield augmented(
-                self.rgba[rows], self.landmarks[rows], self.visible[rows], self.size, self.margin, generator,
-                self.settings.augmentation,
-            )  # fmt: skip
 
 
 def fit_network(
@@ -136,14 +90,25 @@ def fit_network(
         network = LandmarkNetwork()
     chosen = network
 
-    def drawn(first: int) -> _Batches:
-        return _Batches(rgba, landmarks, visible, chosen.size, chosen.margin, first, settings)
-
     def loss(crops: Crops, share: float) -> tuple[Tensor, float]:
         return _loss(chosen, crops, settings, share, device)
 
     key = content_key(_METHOD, settings=settings, config=network.config)
-    return descend(network, drawn, loss, settings, key, "training the network", progress, checkpoint, device)
+    draw = partial(_crops, rgba, landmarks, visible, network.size, network.margin, settings)
+    return descend(network, draw, loss, settings, key, "training the network", progress, checkpoint, device)
+
+
+def _crops(
+    rgba: Tensor,
+    landmarks: Tensor,
+    visible: Tensor,
+    size: int,
+    margin: float,
+    settings: NetworkSettings,
+    generator: torch.Generator,
+) -> Crops:
+    rows = torch.randint(len(rgba), (settings.batch,), generator=generator)
+    return augmented(rgba[rows], landmarks[rows], visible[rows], size, margin, generator, settings.augmentation)
 
 
 def _loss(

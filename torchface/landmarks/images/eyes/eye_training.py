@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
-from torch.utils.data import IterableDataset, get_worker_info
 
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, EyeCrops, EyeLabels, augmented_eyes
 from torchface.landmarks.images.eyes.eye_network import STRIDE, EyeFindings, EyeNetwork
-from torchface.landmarks.images.network_descent import descend
+from torchface.landmarks.images.network_descent import DescentSettings, descend
 from torchface.progress import Progress, silent
 
 _METHOD = "eye network/1"
@@ -25,62 +24,21 @@ _NARROW = 0.03  # of the lids' opening: errors below count with their square
 
 
 @dataclass(frozen=True)
-class EyeSettings:
+class EyeSettings(DescentSettings):
     """How an eye network is trained.
 
     Args:
-        steps: of gradient descent.
-        batch: crops a step.
-        rate: largest learning rate, reached after a twentieth of the steps; it ends at zero as a cosine.
-        decay: of the weights.
-        average: share of the running mean of weights that stays in each step.
         gap: weight of the distance between the lids.
         heat: weight of the heat maps' form, which fades over the first half.
-        workers: processes that draw crops.
-        seed: draws crops and the first weights.
         augmentation: how widely crops are drawn.
     """
 
     steps: int = 5000
     batch: int = 128
     rate: float = 3e-3
-    decay: float = 1e-4
-    average: float = 0.998
     gap: float = 1.5
     heat: float = 0.5
-    workers: int = 0
-    seed: int = 0
     augmentation: EyeAugmentation = field(default_factory=EyeAugmentation)
-
-    def __post_init__(self) -> None:
-        if not (self.steps >= 1 and self.batch >= 2 and 0 < self.rate < 1 and 0 <= self.average < 1):
-            raise ValueRangeError(
-                f"eye settings: found {self.steps} steps, batch {self.batch}, rate {self.rate}, average "
-                f"{self.average}; expected at least 1, at least 2, (0,1), [0,1)"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class _Batches(IterableDataset):
-    """Crops of step ``first`` and on; what a step draws depends on its number alone."""
-
-    rgba: Tensor
-    labels: EyeLabels
-    size: tuple[int, int]
-    first: int
-    settings: EyeSettings
-
-    def __iter__(self) -> Iterator[EyeCrops]:
-        torch.set_num_threads(1)
-        worker = get_worker_info()
-        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for step in range(self.first + offset, self.settings.steps, stride):
-            generator = torch.Generator().manual_seed(1_000_003 * self.settings.seed + step)
-            rows = torch.randint(len(self.rgba), (self.settings.batch,), generator=generator)
-            eyes = torch.randint(2, (self.settings.batch,), generator=generator)
-            yield augmented_eyes(
-                self.rgba[rows], self.labels.rows(rows), eyes, *self.size, generator, self.settings.augmentation
-            )
 
 
 def fit_eyes(
@@ -128,14 +86,20 @@ def fit_eyes(
         network = EyeNetwork()
     chosen = network
 
-    def drawn(first: int) -> _Batches:
-        return _Batches(rgba, labels, (chosen.width, chosen.height), first, settings)
-
     def loss(crops: EyeCrops, share: float) -> tuple[Tensor, float]:
         return _loss(chosen, crops, settings, share, device)
 
     key = content_key(_METHOD, settings=settings, config=network.config)
-    return descend(network, drawn, loss, settings, key, "training on eyes", progress, checkpoint, device)
+    draw = partial(_crops, rgba, labels, (network.width, network.height), settings)
+    return descend(network, draw, loss, settings, key, "training on eyes", progress, checkpoint, device)
+
+
+def _crops(
+    rgba: Tensor, labels: EyeLabels, size: tuple[int, int], settings: EyeSettings, generator: torch.Generator
+) -> EyeCrops:
+    rows = torch.randint(len(rgba), (settings.batch,), generator=generator)
+    eyes = torch.randint(2, (settings.batch,), generator=generator)
+    return augmented_eyes(rgba[rows], labels.rows(rows), eyes, *size, generator, settings.augmentation)
 
 
 def _loss(
