@@ -1,0 +1,1 @@
+"""A coarse animation gets a captured actor's fine detail and timing."""
