@@ -93,9 +93,9 @@ def test_it_agrees_with_a_solve_of_its_own(operator: bool, monkeypatch: pytest.M
     expected = own_solution(
         vertices, faces, points, (1.0, 50.0), wanted.permute(1, 0, 2).reshape(40, 6).double().numpy()
     )
-    torch.testing.assert_close(
-        found, torch.from_numpy(expected).float().reshape(-1, 2, 3).transpose(0, 1), atol=2e-3, rtol=0
-    )
+    expected = torch.from_numpy(expected).float().reshape(-1, 2, 3).transpose(0, 1)
+    assert expected.abs().max() > 15
+    torch.testing.assert_close(found, expected, atol=1e-3 if operator else 1e-2, rtol=0)
     torch.testing.assert_close(points.on(faces, found), wanted, atol=1e-5 if operator else 1e-3, rtol=0)
 
 
