@@ -17,6 +17,7 @@ from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.capture.video.video_solver import VideoSolver
 from torchface.capture.webcam.examples.example_solver import ExampleSolver
+from torchface.enhancement.enhancement_model import EnhancementModel
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.model_roots import MODEL_NAME, is_folder, is_model, model_names, model_roots
 from torchface.files.models import DESCRIPTION, STATE, ModelRecord, model_fault, read_model, read_record, write_model
@@ -34,6 +35,7 @@ KINDS: dict[str, type[nn.Module]] = {
     "action_units": ActionUnitClassifier,
     "appearance": AppearanceModel,
     "dynamics_prior": DynamicsPrior,
+    "enhancement": EnhancementModel,
     "example_solver": ExampleSolver,
     "expression_regression": ExpressionRegression,
     "eye_network": EyeNetwork,

@@ -55,6 +55,9 @@ class SparseCholesky:
         if not (self._factor.factors()[1] > 0).all():
             raise ValueRangeError("SparseCholesky: the matrix is not positive definite")
 
+    def __deepcopy__(self, memo: dict[int, object]) -> SparseCholesky:
+        return self  # it never changes
+
     def solve(self, rhs: Array) -> Array:
         """The solution x of A x = b.
 

@@ -1,0 +1,72 @@
+"""Frames of any rigid place, laid on the neutral and back; what is of another size or mesh is refused."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchface.enhancement.sparse_operator import SparseOperator
+from torchface.errors import AlignmentError, TopologyError
+from torchface.geometry.similarity import Similarity, similarity_transform
+
+_SCALES = (0.5, 2.0)
+_MOST_RESIDUAL = 0.35  # of the head's size: beyond, vertices are not where they should be
+
+
+class FrameAlignment:
+    """Lays frames on the neutral by the means over patches: Horn's alignment, translation and rotation.
+
+    Args:
+        neutral: (V,3), millimetres.
+        means: takes the means over patches, (P,V).
+    """
+
+    def __init__(self, neutral: Tensor, means: SparseOperator) -> None:
+        self.neutral, self._means = neutral, means
+        self._points = means(neutral.double())
+
+    def laid_on_neutral(self, frames: Tensor, name: str) -> tuple[Tensor, Similarity]:
+        """Displacements from the neutral of frames laid on it, and how they were laid.
+
+        Args:
+            frames: (B,V,3), millimetres; differentiable.
+            name: what a message calls them.
+
+        Returns:
+            Displacements (B,V,3), and the similarity of scale 1 from where the frames were.
+
+        Raises:
+            AlignmentError: their size is not the neutral's: another unit.
+            TopologyError: their vertices do not lie as the neutral's: another order.
+        """
+        count, vertices, _ = frames.shape
+        # The first vertex goes to the origin before any rounding to means.
+        begin = frames[:, :1].detach()
+        near = (frames - begin).permute(1, 0, 2).reshape(vertices, 3 * count)
+        points = self._means(near).view(-1, count, 3).transpose(0, 1).double()
+        target = self._points.to(points).expand_as(points)
+        self._check(points.detach(), target, name)
+        pose = similarity_transform(points, target, scale=False)
+        rotation = pose.rotation
+        translation = pose.translation - (rotation @ begin.double().transpose(1, 2))[..., 0]
+        turned = (frames - begin) @ rotation.transpose(1, 2).to(frames) + pose.translation.to(frames)[:, None]
+        return turned - self.neutral.to(frames), Similarity(pose.scale, rotation, translation)
+
+    def _check(self, points: Tensor, target: Tensor, name: str) -> None:
+        fitted = similarity_transform(points, target)
+        size = (target - target.mean(1, keepdim=True)).square().sum((-1, -2)).sqrt()
+        own = (points - points.mean(1, keepdim=True)).square().sum((-1, -2)).sqrt()
+        residual = (fitted.apply(points) - target).square().sum((-1, -2)).sqrt() / size
+        worst = int(residual.argmax())
+        if float(residual[worst]) > _MOST_RESIDUAL:
+            raise TopologyError(
+                f"{name}: frame {worst} lies {100 * float(residual[worst]):.0f} % of the head's size away from the "
+                f"neutral, expected at most {100 * _MOST_RESIDUAL:.0f} %: its vertices are in another order, or it is "
+                "another mesh"
+            )
+        ratio = own / size
+        odd = ((ratio < _SCALES[0]) | (ratio > _SCALES[1])).nonzero()[:, 0]
+        if len(odd):
+            raise AlignmentError(
+                f"{name}: frame {int(odd[0])} is {float(ratio[odd[0]]):.3g} times as large as the neutral, expected "
+                f"{_SCALES[0]} to {_SCALES[1]}: the unit is not millimetres"
+            )

@@ -1,0 +1,132 @@
+"""What a thousand frames' details have in common: few components in half precision, learned a block at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError
+
+_CHUNK = 2**15  # numbers of a component that are worked on at a time
+_NUMBERS = 2**28  # that a basis has at most while it is learned, where twice its rank would be more
+_NEGLIGIBLE = 1e-12  # of a block's energy
+
+
+class StreamingBasis:
+    r"""The best components of rows that come a block at a time, and every row's coefficients in them.
+
+    Keeps twice as many components as are asked for, so that what is dropped on the way is next to nothing. Rows are
+    not centred: a row of zeros has coefficients of zero.
+
+    Args:
+        size: n, numbers a row.
+        rank: r, how many components are wanted.
+
+    Source: Brand 2006, Fast low-rank modifications of the thin singular value decomposition, for blocks.
+    """
+
+    def __init__(self, size: int, rank: int) -> None:
+        self.rank = rank
+        self._kept = min(2 * rank, max(rank, _NUMBERS // size))
+        self._basis = torch.zeros(0, size)
+        self._coefficients = torch.zeros(0, 0, dtype=torch.float64)
+        self._energies = torch.zeros(0, dtype=torch.float64)
+
+    @property
+    def state(self) -> dict[str, Tensor]:
+        """Everything it has learned so far."""
+        return {"basis": self._basis, "coefficients": self._coefficients, "energies": self._energies}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on where another one was."""
+        self._basis, self._coefficients = state["basis"], state["coefficients"]
+        self._energies = state["energies"]
+
+    def add(self, rows: Tensor) -> None:
+        """Learns from more rows, (B,n) float32, whose memory it uses."""
+        if rows.ndim != 2 or rows.shape[1] != self._basis.shape[1]:
+            raise ShapeError(f"rows: found {tuple(rows.shape)}, expected (B,{self._basis.shape[1]})")
+        energy = rows.square().sum(1, dtype=torch.float64)
+        inside = rows @ self._basis.T
+        rest = rows.addmm_(inside, self._basis, alpha=-1)
+        again = rest @ self._basis.T  # once more: rounding leaves a part that is not orthogonal
+        rest.addmm_(again, self._basis, alpha=-1)
+        values, vectors = torch.linalg.eigh((rest @ rest.T).double())
+        new = values > _NEGLIGIBLE * float(energy.sum())
+        roots = values[new].sqrt()
+        own = vectors[:, new] * roots
+        old = len(self._basis)
+        known = self._coefficients
+        stacked = torch.zeros(len(known) + len(rows), old + len(roots), dtype=torch.float64)
+        stacked[: len(known), :old] = known
+        stacked[len(known) :, :old] = (inside + again).double()
+        stacked[len(known) :, old:] = own
+        _, turned = torch.linalg.eigh(stacked.T @ stacked)
+        turned = turned[:, -self._kept :].flip(1)
+        lift = (vectors[:, new] / roots).T.float()
+        to_old, to_new = turned[:old].T.float(), turned[old:].T.float() @ lift
+        basis = torch.empty(turned.shape[1], rows.shape[1])
+        for begin in range(0, rows.shape[1], _CHUNK):
+            some = slice(begin, begin + _CHUNK)
+            basis[:, some] = to_old @ self._basis[:, some] + to_new @ rest[:, some]
+        self._basis, self._coefficients = basis, stacked @ turned
+        self._energies = torch.cat([self._energies, energy])
+
+    def finished(self) -> LearnedBasis:
+        """The components of the rows so far."""
+        count = min(self.rank, len(self._basis))
+        # Entries near 1, not near 1 / sqrt(n), which half precision would not hold to its full digits.
+        unit = self._basis.shape[1] ** 0.5
+        coefficients = self._coefficients[:, :count]
+        kept, total = coefficients.square().sum(1), self._energies
+        lost = (1 - kept / total.clamp(min=1e-30)).clamp(min=0)
+        share = float(1 - kept.sum() / total.sum()) if float(total.sum()) > 0 else 0.0
+        components = (self._basis[:count] * unit).half()
+        return LearnedBasis(components, (coefficients / unit).float(), lost.float(), max(0.0, share))
+
+
+class LearnedBasis:
+    """Components and coefficients of what was learned.
+
+    Args:
+        components: (r,n), half precision, root mean square 1 each.
+        coefficients: of every row, (K,r), in the rows' unit.
+        lost: the share of each row's energy that the components do not hold, (K,).
+        lost_share: the same of all rows together.
+    """
+
+    def __init__(self, components: Tensor, coefficients: Tensor, lost: Tensor, lost_share: float) -> None:
+        self.components, self.coefficients = components, coefficients
+        self.lost, self.lost_share = lost, lost_share
+
+
+def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor:
+    r"""Rows of several regions, blended where their borders are soft.
+
+    .. math:: b_{tcs} = \sum_r \omega_{rs} \sum_k c_{trk} \, U_{kcs}
+
+    Args:
+        components: U, (k,n) in half precision or any, n = C·S: channels, then sites.
+        coefficients: c, (T,R,k).
+        weights: of the regions at every site, (R,S), of sum 1.
+
+    Returns:
+        (T,n), of the coefficients' dtype; differentiable in the coefficients.
+
+    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, equation 4.
+    """
+    frames, regions, rank = coefficients.shape
+    sites = weights.shape[1]
+    channels = components.shape[1] // sites
+    flat = coefficients.flatten(0, 1)
+    pieces = []
+    step = max(1, _CHUNK // max(1, frames))
+    planes = components.view(rank, channels, sites)
+    for begin in range(0, sites, step):
+        own = weights[:, begin : begin + step].to(coefficients)
+        some = planes[:, :, begin : begin + step].to(coefficients.dtype).flatten(1)
+        rows = (flat @ some).view(frames, regions, channels, -1)
+        pieces.append((rows * own[None, :, None]).sum(1))
+    return torch.cat(pieces, dim=2).flatten(1)

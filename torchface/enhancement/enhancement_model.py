@@ -1,0 +1,412 @@
+"""An actor's captured performance as a model that gives its fine detail to coarse animations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchface.enhancement.aligned_frames import FrameAlignment
+from torchface.enhancement.detail_basis import StreamingBasis, blended
+from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.low_pass import WAVELENGTH, LowPass, vertex_areas
+from torchface.enhancement.model_training import (
+    Encoder,
+    check_sequences,
+    check_topology,
+    learn_frames,
+    warn_without_neutral,
+)
+from torchface.enhancement.surface_frames import SurfaceFrames
+from torchface.enhancement.whole_face import RegionProjection, Regions, grow_patches
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.files.content_keys import content_key
+from torchface.geometry.meshes.operators import triangle_areas
+from torchface.geometry.similarity import Similarity
+from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
+from torchface.optim.prepared_tensors import Prepared
+from torchface.progress import Progress, silent
+
+_NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
+_OUTSIDE = 1.0  # of a projection's distance, whose unit is the database's own spread
+_COLOR_RANK = 32
+DetailKind = Literal["displacements"]
+_DETAILS = {"displacements": DisplacementDetail}
+
+
+@dataclass(frozen=True, eq=False)
+class Enhancement:
+    """Enhanced frames, and what they were made of.
+
+    Args:
+        vertices: (T,V,3), millimetres, in the input's place.
+        weights: of the database's frames in each region, (T,R,K), of sum 1.
+        distances: of the input from the nearest blend of database frames, by region, (T,R), in units of the
+            database's own spread.
+        outside: (T,R) bool, whether the input is so far from the database that its detail is but the nearest.
+    """
+
+    vertices: Tensor
+    weights: Tensor
+    distances: Tensor
+    outside: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What follows from the neutral and its triangles."""
+
+    alignment: FrameAlignment
+    low_pass: LowPass
+    encoder: Encoder
+
+
+class EnhancementModel(nn.Module):
+    r"""Gives coarse animations of a dense head the wrinkles, creases and colours of a captured actor.
+
+    A frame a is laid on the neutral and split, :math:`\ell = d_0 + \mathrm{LowPass}(a - d_0)`. The deformation
+    gradients of :math:`\ell`, in the mean over patches, are projected by region onto convex combinations of the
+    database's; the same combinations of the database's details, blended over the regions' soft borders, go onto
+    :math:`\ell` in the place of what a itself had beyond it.
+
+    Made by :meth:`fit`. The constructor makes an empty model for a state to be loaded into.
+
+    Args:
+        vertices, triangles, patches, frames, rank: V, F, P, K and r.
+        region_names: of the R regions.
+        voluntary: whether the actor moves each at will.
+        fps: of the database.
+        wavelength: of the low-pass filter, millimetres.
+        color_rank: components of the colours; 0 without colours.
+        detail: how detail is encoded: "displacements".
+        lost_share: of the details' energy, by their compression.
+
+    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
+    works on displacements, alignment and averages by patches; detail is of low rank.
+    """
+
+    neutral: Tensor
+    faces: Tensor
+    patches: Tensor
+    region_weights: Tensor
+    sequences: Tensor
+    database_features: Tensor
+    components: Tensor
+    coefficients: Tensor
+    mean_color: Tensor
+    color_components: Tensor
+    color_coefficients: Tensor
+
+    def __init__(
+        self,
+        vertices: int,
+        triangles: int,
+        patches: int,
+        frames: int,
+        rank: int,
+        region_names: Sequence[str],
+        voluntary: Sequence[bool],
+        fps: float = 30.0,
+        wavelength: float = WAVELENGTH,
+        color_rank: int = 0,
+        detail: DetailKind = "displacements",
+        lost_share: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if detail not in _DETAILS:
+            raise ValueRangeError(f"detail: found {detail!r:.40}, expected one of {', '.join(_DETAILS)}")
+        self.region_names = tuple(region_names)
+        self.voluntary = tuple(bool(value) for value in voluntary)
+        self.fps = checked_number("fps", fps, MIN_FPS, MAX_FPS)
+        self.wavelength = checked_number("wavelength", wavelength, above=True, most=1e6)
+        self.detail: DetailKind = detail
+        self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
+        regions = len(self.region_names)
+        self.register_buffer("neutral", torch.zeros(vertices, 3))
+        self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
+        self.register_buffer("patches", torch.zeros(triangles, dtype=torch.int64))
+        self.register_buffer("region_weights", torch.zeros(regions, triangles))
+        self.register_buffer("sequences", torch.zeros(frames, dtype=torch.int64))
+        self.register_buffer("database_features", torch.zeros(frames, patches, 9))
+        size = _DETAILS[detail].CHANNELS * vertices
+        self.register_buffer("components", torch.zeros(rank, size, dtype=torch.float16))
+        self.register_buffer("coefficients", torch.zeros(frames, rank))
+        colored = vertices if color_rank else 0
+        self.register_buffer("mean_color", torch.zeros(colored, 3))
+        self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
+        self.register_buffer("color_coefficients", torch.zeros(frames if color_rank else 0, color_rank))
+        self._parts: Prepared[_Parts] = Prepared()
+        self._vertex_weights: Prepared[Tensor] = Prepared()
+        self._projection: Prepared[RegionProjection] = Prepared()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What the constructor needs: plain values only."""
+        return {
+            "vertices": len(self.neutral),
+            "triangles": len(self.faces),
+            "patches": self.database_features.shape[1],
+            "frames": len(self.sequences),
+            "rank": len(self.components),
+            "region_names": list(self.region_names),
+            "voluntary": list(self.voluntary),
+            "fps": self.fps,
+            "wavelength": self.wavelength,
+            "color_rank": len(self.color_components),
+            "detail": self.detail,
+            "lost_share": self.lost_share,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> EnhancementModel:
+        """A model of zeros for the state to be loaded into."""
+        return cls(**config)
+
+    @classmethod
+    def fit(
+        cls,
+        frames: Tensor | MeshSequence,
+        faces: Tensor,
+        sequences: Tensor,
+        neutral: Tensor,
+        *,
+        fps: float = 30.0,
+        wavelength: float = WAVELENGTH,
+        patch_size: int = 100,
+        region_count: int = 13,
+        rank: int = 64,
+        colors: Tensor | None = None,
+        landmarks: Tensor | None = None,
+        detail: DetailKind = "displacements",
+        seed: int = 0,
+        folder: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> EnhancementModel:
+        """Learns from a captured performance.
+
+        Args:
+            frames: (K,V,3), millimetres, each in any rigid place; or on disk.
+            faces: (F,3) int64.
+            sequences: the number of each frame's sequence, (K,) int64; a sequence goes from the neutral to an extreme
+                expression and back.
+            neutral: (V,3), millimetres.
+            fps: of the frames.
+            wavelength: of which the smooth part keeps half the amplitude, millimetres.
+            patch_size: vertices a patch.
+            region_count: how many regions are looked for.
+            rank: components of the detail.
+            colors: of the frames' vertices, in [0,1], (K,V,3).
+            landmarks: vertex ids of the 68 iBUG landmarks, which name the regions and set the eyes apart.
+            detail: how detail is encoded.
+            seed: of patches and regions.
+            folder: where a run that is killed finds what it has learned; of this run alone.
+            progress: told of frames.
+
+        Returns:
+            The model. ``lost_share`` says what part of the details' energy its components do not hold.
+
+        Raises:
+            TopologyError: frames are of another mesh, or their vertices in another order.
+            ValueRangeError: NaN, no frames, sequences in pieces.
+            AlignmentError: frames of another unit.
+            FileFormatError: the disk is full.
+        """
+        progress = silent if progress is None else progress
+        check_topology(frames, faces, neutral)
+        check_sequences(sequences, len(frames))
+        checked_count("rank", rank, 1)
+        if colors is not None and colors.shape != (len(frames), len(neutral), 3):
+            raise ShapeError(f"colors: found {tuple(colors.shape)}, expected {(len(frames), len(neutral), 3)}")
+        neutral = neutral.detach().float()
+        progress("preparing the mesh")
+        patches = grow_patches(faces, neutral, patch_size)
+        parts = _parts(neutral, faces, patches, wavelength, detail)
+        settings = content_key(
+            "enhancement/1", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
+        )
+        folder = None if folder is None else Path(folder)
+        size = _DETAILS[detail].CHANNELS * len(neutral)
+        learned = learn_frames(frames, parts.encoder, rank, size, settings, folder, progress)
+        warn_without_neutral(learned.motion)
+        regions = Regions(("face",), torch.ones(1, len(faces)), torch.ones(1, dtype=torch.bool))
+        hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
+        model = cls(
+            len(neutral),
+            len(faces),
+            learned.features.shape[1],
+            len(frames),
+            len(learned.basis.components),
+            regions.names,
+            regions.voluntary.tolist(),
+            fps,
+            wavelength,
+            0 if hue is None else hue.rank,
+            detail,
+            learned.basis.lost_share,
+        )
+        model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
+        model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
+        model.database_features = learned.features
+        model.components, model.coefficients = learned.basis.components, learned.basis.coefficients
+        if hue is not None and colors is not None:
+            model.mean_color = colors.float().mean(0)
+            for some in colors.split(32):
+                hue.add((some.float() - model.mean_color).transpose(1, 2).flatten(1).contiguous())
+            found = hue.finished()
+            model.color_components[: len(found.components)] = found.components
+            model.color_coefficients[:, : found.coefficients.shape[1]] = found.coefficients
+        return model.eval()
+
+    @property
+    def regions(self) -> Regions:
+        """The regions of the face."""
+        return Regions(self.region_names, self.region_weights, torch.tensor(self.voluntary))
+
+    def forward(self, coarse: Tensor) -> Tensor:
+        """Enhanced frames (T,V,3) of coarse ones (T,V,3), millimetres, where they are; differentiable."""
+        return self.enhance(coarse).vertices
+
+    def enhance(self, coarse: Tensor, previous: Tensor | None = None) -> Enhancement:
+        """Enhanced frames, with what they were made of.
+
+        Args:
+            coarse: (T,V,3), millimetres, in this mesh and any rigid place.
+            previous: weights of the frame before, (R,K), towards which those of the first are damped.
+
+        Raises:
+            TopologyError: another number of vertices, or another order.
+            AlignmentError: another unit.
+            ValueRangeError: NaN or infinity.
+        """
+        self._check_frames(coarse)
+        pieces = []
+        for some in coarse.split(max(1, _NUMBERS // len(self.neutral))):
+            pieces.append(self._enhanced(some, previous))
+            previous = pieces[-1].weights[-1].detach()
+        if not pieces:
+            regions, frames = len(self.region_names), len(self.sequences)
+            none = coarse.new_zeros(0, regions)
+            return Enhancement(coarse, coarse.new_zeros(0, regions, frames), none, none.bool())
+        return Enhancement(
+            torch.cat([piece.vertices for piece in pieces]),
+            torch.cat([piece.weights for piece in pieces]),
+            torch.cat([piece.distances for piece in pieces]),
+            torch.cat([piece.outside for piece in pieces]),
+        )
+
+    def features(self, coarse: Tensor) -> Tensor:
+        """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
+        self._check_frames(coarse)
+        return self._prepared().encoder.gradients.features(self._smooth(coarse)[0])
+
+    def low(self, coarse: Tensor) -> Tensor:
+        """The smooth part of frames (T,V,3), laid on the neutral."""
+        self._check_frames(coarse)
+        return self.neutral.to(coarse) + self._smooth(coarse)[0]
+
+    def colors(self, weights: Tensor) -> Tensor:
+        """Colours of the vertices, (T,V,3), for weights (T,R,K) of :meth:`enhance`.
+
+        Raises:
+            ValueRangeError: the model has learned none.
+        """
+        if len(self.mean_color) == 0:
+            raise ValueRangeError("colors: the model has learned none; fit it with colors")
+        offsets = blended(self.color_components, weights @ self.color_coefficients.to(weights), self.vertex_weights)
+        return (self.mean_color.to(weights) + offsets.unflatten(1, (3, -1)).transpose(1, 2)).clamp(0, 1)
+
+    def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
+        """This actor's detail for another head of the same mesh.
+
+        Args:
+            neutral: the other head, (V,3), millimetres.
+            scale: of the detail.
+
+        Raises:
+            TopologyError: another number of vertices.
+        """
+        checked_number("scale", scale)
+        if neutral.shape != self.neutral.shape:
+            raise TopologyError(f"neutral: found {tuple(neutral.shape)}, expected {tuple(self.neutral.shape)}")
+        if not bool(torch.isfinite(neutral).all()):
+            raise ValueRangeError("neutral: found NaN or infinite vertices, expected none")
+        other = copy.deepcopy(self)
+        sizes = [float(vertex_areas(head, self.faces).sum()) ** 0.5 for head in (neutral, self.neutral)]
+        other.wavelength = self.wavelength * sizes[0] / sizes[1]
+        other.neutral = neutral.detach().to(self.neutral)
+        other.coefficients = self.coefficients * scale
+        return other
+
+    @property
+    def vertex_weights(self) -> Tensor:
+        """The share of each region in each vertex, (R,V)."""
+        return self._vertex_weights.get(
+            (self.region_weights, self.faces), lambda: self.regions.vertex_weights(self.faces, len(self.neutral))
+        )
+
+    def check_state(self) -> None:
+        """Refuses a state whose numbers do not make a model.
+
+        Raises:
+            TopologyError: a triangle or a patch is none.
+        """
+        if not 0 <= int(self.faces.min()) <= int(self.faces.max()) < len(self.neutral):
+            raise TopologyError(f"faces: found vertices beyond the {len(self.neutral)} there are")
+        if not 0 <= int(self.patches.min()) <= int(self.patches.max()) < self.database_features.shape[1]:
+            raise TopologyError(f"patches: found some beyond the {self.database_features.shape[1]} there are")
+
+    def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
+        smooth, pose = self._smooth(coarse)
+        encoder = self._prepared().encoder
+        matched = self._matching().project(encoder.gradients.features(smooth), previous)
+        coefficients = matched.weights @ self.coefficients.to(matched.weights)
+        weights = encoder.detail.site_weights(self.vertex_weights)
+        details = blended(self.components, coefficients, weights)
+        vertices = encoder.detail.compose(self.neutral.to(smooth) + smooth, details)
+        return Enhancement(
+            pose.inverse().apply(vertices), matched.weights, matched.distances, matched.distances > _OUTSIDE
+        )
+
+    def _smooth(self, coarse: Tensor) -> tuple[Tensor, Similarity]:
+        """The smooth part's displacements from the neutral, and how the frames were laid on it."""
+        parts = self._prepared()
+        displacements, pose = parts.alignment.laid_on_neutral(coarse, "coarse")
+        return parts.low_pass(displacements), pose
+
+    def _prepared(self) -> _Parts:
+        return self._parts.get(
+            (self.neutral, self.faces, self.patches, self.wavelength),
+            lambda: _parts(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
+        )
+
+    def _matching(self) -> RegionProjection:
+        def made() -> RegionProjection:
+            areas = triangle_areas(self.neutral, self.faces)
+            return RegionProjection(self.database_features, self.regions.patch_weights(self.patches, areas))
+
+        return self._projection.get((self.database_features, self.region_weights, self.neutral), made)
+
+    def _check_frames(self, coarse: Tensor) -> None:
+        if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:
+            raise TopologyError(
+                f"coarse: found {tuple(coarse.shape)}, expected (T,{len(self.neutral)},3): frames of the model's own "
+                "mesh; what is of another reaches it by a thin shell"
+            )
+        bad = (~torch.isfinite(coarse.detach())).any(-1).any(-1).nonzero()[:, 0]
+        if len(bad):
+            raise ValueRangeError(f"coarse: frame {int(bad[0])} holds NaN or infinite vertices, expected none")
+
+
+def _parts(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> _Parts:
+    frames = SurfaceFrames(neutral, faces)
+    gradients = frames.patch_gradients(patches, faces, neutral)
+    alignment = FrameAlignment(neutral, gradients.means)
+    low_pass = LowPass(neutral, faces, wavelength)
+    encoder = Encoder(alignment, low_pass, gradients, _DETAILS[detail](neutral, faces, frames))
+    return _Parts(alignment, low_pass, encoder)

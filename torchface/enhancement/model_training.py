@@ -1,0 +1,189 @@
+"""Learning an actor's detail from frames in memory or on disk, a few at a time; a killed run continues."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.enhancement.aligned_frames import FrameAlignment
+from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
+from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.low_pass import LowPass
+from torchface.enhancement.surface_frames import PatchGradients
+from torchface.errors import TopologyError, ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
+from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.progress import Progress
+
+_NUMBERS = 2**23  # of the frames that are worked on at a time
+_SECONDS = 60.0  # between checkpoints: at 500,000 vertices one takes ten
+_FAR_NEUTRAL = 0.5  # millimetres, root mean square over the head
+CHECKPOINT = "learning.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Encoder:
+    """What turns frames into smooth parts, features and details.
+
+    Args:
+        alignment: lays frames on the neutral.
+        low_pass: smooths their displacements.
+        gradients: takes the features of patches.
+        detail: encodes what the smooth part lacks.
+    """
+
+    alignment: FrameAlignment
+    low_pass: LowPass
+    gradients: PatchGradients
+    detail: DisplacementDetail
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedFrames:
+    """What was learned of a database.
+
+    Args:
+        features: of every frame, (K,P,9).
+        motion: mean displacements of the patches' smooth part, (K,P,3), millimetres.
+        basis: of the details.
+        colors: of the colours, where there are any.
+    """
+
+    features: Tensor
+    motion: Tensor
+    basis: LearnedBasis
+
+
+def learn_frames(
+    frames: Tensor | MeshSequence,
+    encoder: Encoder,
+    rank: int,
+    size: int,
+    key: str,
+    folder: Path | None,
+    progress: Progress,
+) -> LearnedFrames:
+    """Goes through a database once.
+
+    Args:
+        frames: (K,V,3), millimetres, any rigid pose each.
+        encoder: for their mesh.
+        rank: components of the detail to keep at most.
+        size: numbers of one frame's detail.
+        key: of the settings; with the frames' own content it tells whether a checkpoint is of this run.
+        folder: of the checkpoint; none is kept if absent.
+        progress: told of frames.
+
+    Raises:
+        ValueRangeError: a frame holds NaN.
+        TopologyError: a frame does not look like the neutral's mesh.
+        FileFormatError: the disk is full, or the frames' file cannot be read.
+    """
+    count = len(frames)
+    path = None if folder is None else folder / CHECKPOINT
+    whole = content_key("learn_frames/1", settings=key, frames=_identity(frames), rank=rank)
+    basis = StreamingBasis(size, min(rank, count))
+    features, motion, done = [], [], 0
+    if path is not None and (found := read_checkpoint(path, whole)) is not None:
+        basis.load(found)
+        features, motion, done = [found["features"]], [found["motion"]], len(found["features"])
+    block = max(1, min(32, _NUMBERS // size * 4))
+    saved = time.monotonic()
+    with torch.no_grad():
+        while done < count:
+            some = frames[done : done + block] if isinstance(frames, Tensor) else frames.read(done, done + block)
+            _check_finite(some, done)
+            displacements, _ = encoder.alignment.laid_on_neutral(some.float(), f"frames from {done} on")
+            smooth = encoder.low_pass(displacements)
+            features.append(encoder.gradients.features(smooth))
+            motion.append(encoder.gradients.motion(smooth))
+            neutral = encoder.alignment.neutral
+            basis.add(encoder.detail.encode(neutral + smooth, neutral + displacements))
+            done += len(some)
+            progress("learning detail", done, count)
+            if path is not None and done < count and time.monotonic() - saved >= _SECONDS:
+                parts = {"features": torch.cat(features), "motion": torch.cat(motion)}
+                write_checkpoint(path, {**basis.state, **parts}, whole)
+                saved = time.monotonic()
+    learned = LearnedFrames(torch.cat(features), torch.cat(motion), basis.finished())
+    if path is not None:
+        path.unlink(missing_ok=True)
+    return learned
+
+
+def warn_without_neutral(motion: Tensor) -> None:
+    """Warns where no frame of a database is near its neutral; motion is that of patches, (K,P,3), millimetres."""
+    distances = motion.square().sum(-1).mean(-1).sqrt()
+    if float(distances.min()) > _FAR_NEUTRAL:
+        warnings.warn(
+            f"frames: found none nearer to the neutral than {float(distances.min()):.1f} mm (root mean square), "
+            f"expected one within {_FAR_NEUTRAL} mm: sequences begin and end there; without, faces at rest get the "
+            "detail of the frame that is nearest",
+            stacklevel=3,
+        )
+
+
+def _check_finite(frames: Tensor, first: int) -> None:
+    bad = (~torch.isfinite(frames)).any(-1).any(-1).nonzero()[:, 0]
+    if len(bad):
+        raise ValueRangeError(
+            f"frames: frame {first + int(bad[0])} holds NaN or infinite vertices, expected none; leave the frame out "
+            "or repair it"
+        )
+
+
+def _identity(frames: Tensor | MeshSequence) -> object:
+    if isinstance(frames, Tensor):
+        return frames
+    # A thousand dense meshes take a minute to read: their file is known by name, size and time.
+    told = frames.path.stat()
+    return [str(frames.path.resolve()), frames.key, list(frames.shape), told.st_size, told.st_mtime_ns]
+
+
+def check_sequences(sequences: Tensor, count: int) -> None:
+    """Raises or warns where the sequences (K,) do not fit a database.
+
+    Raises:
+        ValueRangeError: not one number a frame, or a sequence in pieces.
+    """
+    if sequences.shape != (count,) or sequences.is_floating_point():
+        raise ValueRangeError(
+            f"sequences: found {sequences.dtype} {tuple(sequences.shape)}, expected ({count},) int64: the number of "
+            "each frame's sequence"
+        )
+    pieces = 1 + int((sequences[1:] != sequences[:-1]).sum())
+    found = len(sequences.unique())
+    if pieces != found:
+        raise ValueRangeError(f"sequences: found {found} sequences in {pieces} pieces, expected each in one piece")
+    if found < 2:
+        warnings.warn(
+            f"sequences: found 1 of {count} frames, expected several, from the neutral to an extreme and back each: "
+            "detail and timing of what it does not show are missing",
+            stacklevel=3,
+        )
+
+
+def check_topology(frames: Tensor | MeshSequence, faces: Tensor, neutral: Tensor) -> None:
+    """Raises where frames, triangles and neutral are not of one topology.
+
+    Raises:
+        TopologyError: they are not.
+        ValueRangeError: there are fewer than two frames, or the neutral is not finite.
+    """
+    shape = tuple(frames.shape)
+    if neutral.ndim != 2 or neutral.shape[1] != 3 or not bool(torch.isfinite(neutral).all()):
+        raise ValueRangeError(f"neutral: found {tuple(neutral.shape)}, expected (V,3), finite")
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or int(faces.max()) >= len(neutral):
+        raise TopologyError(f"faces: found {tuple(faces.shape)}, expected (F,3) between {len(neutral)} vertices")
+    if len(shape) != 3 or shape[1:] != (len(neutral), 3):
+        raise TopologyError(f"frames: found {shape}, expected (K,{len(neutral)},3) as the neutral's vertices")
+    if isinstance(frames, MeshSequence) and not torch.equal(frames.faces, faces.cpu()):
+        raise TopologyError(f"{frames.path}: found other triangles than the neutral's, expected the same")
+    if shape[0] < 2:
+        raise ValueRangeError(f"frames: found {shape[0]}, expected sequences of frames, 2 at the very least")
