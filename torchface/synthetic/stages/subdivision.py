@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torchface.mesh import Mesh
@@ -22,7 +23,7 @@ def finely_coloured(mesh: Mesh, edge: float) -> Mesh:
     """
     polygons = mesh.faces if mesh.polygons is None else mesh.polygons
     vertices, colors = mesh.vertices.double(), mesh.colors
-    uvs = _corner_uvs(mesh, polygons)
+    uvs = corner_uvs(mesh, polygons)
     control = vertices
     for _ in range(_INTERPOLATION_ITERATIONS):
         coarse, quads, _ = catmull_clark(control, polygons)
@@ -56,56 +57,105 @@ def catmull_clark(
     Returns:
         Values (V',D), the first V of them the old vertices', quads (Q,4), and corner values (Q,4,E).
     """
-    count, valid = len(values), polygons >= 0
-    sides = valid.sum(1)
-    width = polygons.shape[1]
-    slot = torch.arange(width)
-    after = torch.where(slot + 1 < sides[:, None], slot + 1, 0)
-    before = torch.where(slot > 0, slot - 1, sides[:, None] - 1)
-    successor = polygons.gather(1, after)
-    face_of = torch.arange(len(polygons))[:, None].expand(-1, width)[valid]
-    start, end = polygons[valid], successor[valid]
-    keys, edge = (torch.minimum(start, end) * count + torch.maximum(start, end)).unique(return_inverse=True)
-    ends = torch.stack([keys // count, keys % count], dim=1)
-    face_value = _mean(values[start], face_of, len(polygons))
-    middle = values[ends].mean(1)
-    edge_face, uses = _mean(face_value[face_of], edge, len(ends)), edge.bincount(minlength=len(ends))
-    inner = (uses == 2)[:, None]
-    edge_value = torch.where(inner, (middle + edge_face) / 2, middle)
-    valence = start.bincount(minlength=count).clamp(min=1)[:, None]
-    around = _mean(face_value[face_of], start, count)
-    beside = _mean(middle.repeat_interleave(2, 0), ends.flatten(), count)
-    smooth = (around + 2 * beside + (valence - 3) * values) / valence
-    rim = ends[uses == 1]
-    on_rim = torch.zeros(count, dtype=torch.bool)
-    on_rim[rim.flatten()] = True
-    rim_beside = _mean(middle[uses == 1].repeat_interleave(2, 0), rim.flatten(), count)
-    moved = torch.where(on_rim[:, None], (values + rim_beside) / 2, smooth)
-    free = torch.ones(count, dtype=torch.bool)
-    free[start] = False
-    moved[free] = values[free]
-    edge_ids = torch.full_like(polygons, -1)
-    edge_ids[valid] = edge + count
-    previous = edge_ids.gather(1, before)
-    middle_ids = (torch.arange(len(polygons)) + count + len(ends))[:, None].expand(-1, width)
-    quads = torch.stack([polygons, edge_ids, middle_ids, previous], dim=-1)[valid]
-    result = torch.cat([moved, edge_value, face_value])
+    operator, quads = subdivision_operator(polygons, len(values))
+    result = torch.from_numpy(operator @ values.double().numpy()).to(values.dtype)
     if corner_values is None:
         return result, quads, None
+    return result, quads, divided_corner_values(polygons, corner_values)
+
+
+def divided_corner_values(polygons: Tensor, corner_values: Tensor) -> Tensor:
+    """Values at the corners of the quads that a round makes of each polygon, divided linearly.
+
+    Args:
+        polygons: (P,K) int64, padded with -1.
+        corner_values: (P,K,E).
+
+    Returns:
+        (Q,4,E), in the order of the quads.
+    """
+    after, before, sides, valid = _neighbouring_slots(polygons)
     corner = corner_values.masked_fill(~valid[..., None], 0.0)
     centre = (corner.sum(1) / sides[:, None])[:, None].expand_as(corner)
     spread = corner.shape[-1]
     forward = (corner + corner.gather(1, after[..., None].expand(-1, -1, spread))) / 2
     backward = (corner + corner.gather(1, before[..., None].expand(-1, -1, spread))) / 2
-    return result, quads, torch.stack([corner, forward, centre, backward], dim=2)[valid]
+    return torch.stack([corner, forward, centre, backward], dim=2)[valid]
 
 
-def _mean(values: Tensor, groups: Tensor, count: int) -> Tensor:
-    total = torch.zeros(count, values.shape[1], dtype=values.dtype).index_add_(0, groups, values)
-    return total / groups.bincount(minlength=count).clamp(min=1)[:, None]
+def subdivision_operator(polygons: Tensor, count: int) -> tuple[sparse.csr_array, Tensor]:
+    """What one round does to values at the vertices, as a matrix: the round is linear in them.
+
+    Args:
+        polygons: (P,K) int64, padded with -1.
+        count: how many vertices there are, V.
+
+    Returns:
+        The matrix (V',V), float64, and quads (Q,4). Rows are the old vertices, then a point an edge, then a point a
+        polygon; a quad holds an old vertex, the point of the edge after it, the polygon's, that of the edge before it.
+    """
+    after, before, _, valid = _neighbouring_slots(polygons)
+    width = polygons.shape[1]
+    successor = polygons.gather(1, after)
+    face_of = torch.arange(len(polygons))[:, None].expand(-1, width)[valid]
+    start, end = polygons[valid], successor[valid]
+    keys, edge = (torch.minimum(start, end) * count + torch.maximum(start, end)).unique(return_inverse=True)
+    ends = torch.stack([keys // count, keys % count], dim=1)
+    uses = edge.bincount(minlength=len(ends))
+    edge_row = torch.arange(len(ends))
+    face_point = _averages(face_of, start, len(polygons), count)
+    middle = _averages(edge_row.repeat_interleave(2), ends.flatten(), len(ends), count)
+    inner = (uses == 2).double()
+    edge_point = _scaled(1 - inner / 2, middle) + _scaled(
+        inner / 2, _averages(edge, face_of, len(ends), len(polygons)) @ face_point
+    )
+    valence = start.bincount(minlength=count).clamp(min=1).double()
+    around = _averages(start, face_of, count, len(polygons)) @ face_point
+    beside = _averages(ends.flatten(), edge_row.repeat_interleave(2), count, len(ends)) @ middle
+    rim = ends[uses == 1]
+    on_rim = torch.zeros(count, dtype=torch.bool)
+    on_rim[rim.flatten()] = True
+    rim_row = edge_row[uses == 1].repeat_interleave(2)
+    rim_beside = _averages(rim.flatten(), rim_row, count, len(ends)) @ middle
+    free = torch.ones(count, dtype=torch.bool)
+    free[start] = False
+    bends = (~on_rim & ~free).double()
+    kept = bends * (valence - 3) / valence + 0.5 * on_rim.double() + free.double()
+    moved = (
+        sparse.diags_array(kept.numpy())
+        + _scaled(bends / valence, around)
+        + _scaled(2 * bends / valence, beside)
+        + _scaled(0.5 * on_rim.double(), rim_beside)
+    )
+    edge_ids = torch.full_like(polygons, -1)
+    edge_ids[valid] = edge + count
+    previous = edge_ids.gather(1, before)
+    middle_ids = (torch.arange(len(polygons)) + count + len(ends))[:, None].expand(-1, width)
+    quads = torch.stack([polygons, edge_ids, middle_ids, previous], dim=-1)[valid]
+    return sparse.vstack([moved, edge_point, face_point], format="csr"), quads
 
 
-def _corner_uvs(mesh: Mesh, polygons: Tensor) -> Tensor | None:
+def _neighbouring_slots(polygons: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where each corner's successor and predecessor stand, (P,K) twice, corners a polygon (P,), and which are any."""
+    valid = polygons >= 0
+    sides = valid.sum(1)
+    slot = torch.arange(polygons.shape[1])
+    after = torch.where(slot + 1 < sides[:, None], slot + 1, 0)
+    before = torch.where(slot > 0, slot - 1, sides[:, None] - 1)
+    return after, before, sides, valid
+
+
+def _averages(row: Tensor, column: Tensor, rows: int, columns: int) -> sparse.csr_array:
+    """The matrix whose rows are means over the columns that are named beside them."""
+    share = 1 / row.bincount(minlength=rows).clamp(min=1).double()
+    return sparse.csr_array((share[row].numpy(), (row.numpy(), column.numpy())), shape=(rows, columns))
+
+
+def _scaled(factors: Tensor, matrix: sparse.csr_array) -> sparse.csr_array:
+    return sparse.diags_array(factors.numpy()) @ matrix
+
+
+def corner_uvs(mesh: Mesh, polygons: Tensor) -> Tensor | None:
     """Texture coordinates at polygon corners (P,K,2), read off the fan triangles."""
     if mesh.uvs is None or mesh.uv_faces is None:
         return None
