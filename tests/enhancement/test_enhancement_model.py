@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import copy
+import errno
 import math
 
 import pytest
 import torch
 
 from torchface.enhancement import EnhancementModel
-from torchface.errors import AlignmentError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.zoo import get_model, save_model
 
 
@@ -29,6 +31,68 @@ def test_smooth_frames_get_the_wrinkles_of_the_database(model, database):
     found = model(database.smooth)
     left = (found - database.frames).square().mean().sqrt()
     assert float(left) < 0.4 * float((database.smooth - database.frames).square().mean().sqrt())
+
+
+def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
+    other = EnhancementModel.fit(
+        database.frames,
+        database.faces,
+        database.sequences,
+        database.neutral,
+        rank=36,
+        patch_size=20,
+        detail="gradients",
+    )
+    displaced = model(database.smooth[3:6])
+    by_gradients = other(database.smooth[3:6])
+    given = (database.frames - database.smooth)[3:6].square().mean().sqrt()
+    assert float((by_gradients - displaced).square().mean().sqrt()) < 0.3 * float(given)
+
+
+def test_a_run_that_is_killed_continues_to_the_same_model(database, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchface.enhancement.model_training._SECONDS", 0.0)
+    monkeypatch.setattr("torchface.enhancement.model_training._LARGEST_BLOCK", 5)
+    given = database.frames, database.faces, database.sequences, database.neutral
+    whole = EnhancementModel.fit(*given, rank=6, patch_size=20)
+    steps = []
+
+    def killed(step, done=0, total=0):
+        steps.append(done)
+        if done == 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        EnhancementModel.fit(*given, rank=6, patch_size=20, folder=tmp_path, progress=killed)
+    first, steps = steps, []
+    again = EnhancementModel.fit(
+        *given, rank=6, patch_size=20, folder=tmp_path, progress=lambda step, done=0, total=0: steps.append(done)
+    )
+    assert max(first) == 20
+    assert min(done for done in steps if done) == 20
+    kept = zip(whole.state_dict().values(), again.state_dict().values(), strict=True)
+    assert all(torch.equal(one, two) for one, two in kept)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_on_disk_give_the_same_model(model, database, tmp_path):
+    with MeshSequenceWriter(tmp_path / "frames.safetensors", 36, len(database.neutral), database.faces) as writer:
+        writer.append(database.frames)
+    sequence = MeshSequence(tmp_path / "frames.safetensors")
+    found = EnhancementModel.fit(sequence, database.faces, database.sequences, database.neutral, rank=36, patch_size=20)
+    assert torch.equal(found(database.smooth[3:5]), model(database.smooth[3:5]))
+
+
+def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchface.enhancement.model_training._SECONDS", 0.0)
+
+    def full(handle, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("torchface.files.whole_files.os.write", full)
+    with pytest.raises(FileFormatError, match="the disk is full"):
+        EnhancementModel.fit(
+            database.frames, database.faces, database.sequences, database.neutral, rank=6, folder=tmp_path
+        )
 
 
 def test_a_copy_and_a_saved_model_give_the_same(model, database, tmp_path):

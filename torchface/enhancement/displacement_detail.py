@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchface.enhancement.surface_frames import SurfaceFrames
+from torchface.enhancement.surface_frames import SurfaceFrames, TurnedFrames
 
 
 class DisplacementDetail:
@@ -19,28 +19,27 @@ class DisplacementDetail:
         frames: those of the mesh, where they are known.
     """
 
-    CHANNELS = 3
-
     def __init__(self, neutral: Tensor, faces: Tensor, frames: SurfaceFrames | None = None) -> None:
         self._frames = SurfaceFrames(neutral, faces) if frames is None else frames
         self._neutral = neutral
 
-    def encode(self, low: Tensor, frames: Tensor) -> Tensor:
+    def encode(self, low: Tensor, frames: Tensor, turned: TurnedFrames | None = None) -> Tensor:
         """The detail of frames.
 
         Args:
             low: their smooth parts, (B,V,3), millimetres.
             frames: (B,V,3).
+            turned: how the smooth parts' surface is turned, where that is known.
 
         Returns:
             (B,3V), millimetres.
         """
-        turned = self._frames.turned(low - self._neutral.to(low))
+        turned = self._frames.turned(low - self._neutral.to(low)) if turned is None else turned
         return turned.to_local(frames - low).reshape(len(low), -1)
 
-    def compose(self, low: Tensor, details: Tensor) -> Tensor:
-        """Frames (B,V,3) of smooth parts (B,V,3) and details (B,3V)."""
-        turned = self._frames.turned(low - self._neutral.to(low))
+    def compose(self, low: Tensor, details: Tensor, turned: TurnedFrames | None = None) -> Tensor:
+        """Frames (B,V,3) of smooth parts (B,V,3) and details (B,3V); ``turned`` as for :meth:`encode`."""
+        turned = self._frames.turned(low - self._neutral.to(low)) if turned is None else turned
         return low + turned.to_world(details.unflatten(1, (3, -1)))
 
     def site_weights(self, vertex_weights: Tensor) -> Tensor:

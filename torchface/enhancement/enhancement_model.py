@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchface.enhancement.aligned_frames import FrameAlignment
 from torchface.enhancement.detail_basis import StreamingBasis, blended
 from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.gradient_detail import GradientDetail
 from torchface.enhancement.low_pass import WAVELENGTH, LowPass, vertex_areas
 from torchface.enhancement.model_training import (
     Encoder,
@@ -36,8 +37,8 @@ from torchface.progress import Progress, silent
 _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
 _OUTSIDE = 1.0  # of a projection's distance, whose unit is the database's own spread
 _COLOR_RANK = 32
-DetailKind = Literal["displacements"]
-_DETAILS = {"displacements": DisplacementDetail}
+DetailKind = Literal["displacements", "gradients"]
+_DETAILS: tuple[DetailKind, ...] = ("displacements", "gradients")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +59,6 @@ class Enhancement:
     outside: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """What follows from the neutral and its triangles."""
-
-    alignment: FrameAlignment
-    low_pass: LowPass
-    encoder: Encoder
-
-
 class EnhancementModel(nn.Module):
     r"""Gives coarse animations of a dense head the wrinkles, creases and colours of a captured actor.
 
@@ -84,7 +76,7 @@ class EnhancementModel(nn.Module):
         fps: of the database.
         wavelength: of the low-pass filter, millimetres.
         color_rank: components of the colours; 0 without colours.
-        detail: how detail is encoded: "displacements".
+        detail: how detail is encoded: as "displacements" from the smooth part or as "gradients" of its triangles.
         lost_share: of the details' energy, by their compression.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
@@ -134,14 +126,14 @@ class EnhancementModel(nn.Module):
         self.register_buffer("region_weights", torch.zeros(regions, triangles))
         self.register_buffer("sequences", torch.zeros(frames, dtype=torch.int64))
         self.register_buffer("database_features", torch.zeros(frames, patches, 9))
-        size = _DETAILS[detail].CHANNELS * vertices
+        size = 3 * vertices if detail == "displacements" else 9 * triangles
         self.register_buffer("components", torch.zeros(rank, size, dtype=torch.float16))
         self.register_buffer("coefficients", torch.zeros(frames, rank))
         colored = vertices if color_rank else 0
         self.register_buffer("mean_color", torch.zeros(colored, 3))
         self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
         self.register_buffer("color_coefficients", torch.zeros(frames if color_rank else 0, color_rank))
-        self._parts: Prepared[_Parts] = Prepared()
+        self._encoder: Prepared[Encoder] = Prepared()
         self._vertex_weights: Prepared[Tensor] = Prepared()
         self._projection: Prepared[RegionProjection] = Prepared()
 
@@ -226,13 +218,13 @@ class EnhancementModel(nn.Module):
         neutral = neutral.detach().float()
         progress("preparing the mesh")
         patches = grow_patches(faces, neutral, patch_size)
-        parts = _parts(neutral, faces, patches, wavelength, detail)
+        encoder = _encoder(neutral, faces, patches, wavelength, detail)
         settings = content_key(
             "enhancement/1", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
         )
         folder = None if folder is None else Path(folder)
-        size = _DETAILS[detail].CHANNELS * len(neutral)
-        learned = learn_frames(frames, parts.encoder, rank, size, settings, folder, progress)
+        size = 3 * len(neutral) if detail == "displacements" else 9 * len(faces)
+        learned = learn_frames(frames, encoder, rank, size, settings, folder, progress)
         warn_without_neutral(learned.motion)
         regions = Regions(("face",), torch.ones(1, len(faces)), torch.ones(1, dtype=torch.bool))
         hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
@@ -303,7 +295,8 @@ class EnhancementModel(nn.Module):
     def features(self, coarse: Tensor) -> Tensor:
         """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
         self._check_frames(coarse)
-        return self._prepared().encoder.gradients.features(self._smooth(coarse)[0])
+        smooth, encoder = self._smooth(coarse)[0], self._prepared()
+        return encoder.gradients.features(smooth, encoder.frames.turned(smooth))
 
     def low(self, coarse: Tensor) -> Tensor:
         """The smooth part of frames (T,V,3), laid on the neutral."""
@@ -363,26 +356,27 @@ class EnhancementModel(nn.Module):
 
     def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
         smooth, pose = self._smooth(coarse)
-        encoder = self._prepared().encoder
-        matched = self._matching().project(encoder.gradients.features(smooth), previous)
+        encoder = self._prepared()
+        turned = encoder.frames.turned(smooth)
+        matched = self._matching().project(encoder.gradients.features(smooth, turned), previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         weights = encoder.detail.site_weights(self.vertex_weights)
         details = blended(self.components, coefficients, weights)
-        vertices = encoder.detail.compose(self.neutral.to(smooth) + smooth, details)
+        vertices = encoder.detail.compose(self.neutral.to(smooth) + smooth, details, turned)
         return Enhancement(
             pose.inverse().apply(vertices), matched.weights, matched.distances, matched.distances > _OUTSIDE
         )
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Similarity]:
         """The smooth part's displacements from the neutral, and how the frames were laid on it."""
-        parts = self._prepared()
-        displacements, pose = parts.alignment.laid_on_neutral(coarse, "coarse")
-        return parts.low_pass(displacements), pose
+        encoder = self._prepared()
+        displacements, pose = encoder.alignment.laid_on_neutral(coarse, "coarse")
+        return encoder.low_pass(displacements), pose
 
-    def _prepared(self) -> _Parts:
-        return self._parts.get(
+    def _prepared(self) -> Encoder:
+        return self._encoder.get(
             (self.neutral, self.faces, self.patches, self.wavelength),
-            lambda: _parts(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
+            lambda: _encoder(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
         )
 
     def _matching(self) -> RegionProjection:
@@ -403,10 +397,10 @@ class EnhancementModel(nn.Module):
             raise ValueRangeError(f"coarse: frame {int(bad[0])} holds NaN or infinite vertices, expected none")
 
 
-def _parts(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> _Parts:
+def _encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> Encoder:
     frames = SurfaceFrames(neutral, faces)
     gradients = frames.patch_gradients(patches, faces, neutral)
     alignment = FrameAlignment(neutral, gradients.means)
     low_pass = LowPass(neutral, faces, wavelength)
-    encoder = Encoder(alignment, low_pass, gradients, _DETAILS[detail](neutral, faces, frames))
-    return _Parts(alignment, low_pass, encoder)
+    kept = DisplacementDetail(neutral, faces, frames) if detail == "displacements" else GradientDetail(neutral, faces)
+    return Encoder(alignment, low_pass, frames, gradients, kept)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from torchface.enhancement.sparse_operator import solved
 from torchface.errors import ShapeError
 from torchface.geometry.meshes.deformation import gradient_operator
 from torchface.geometry.meshes.operators import components, triangle_areas
@@ -74,22 +73,8 @@ class LowPass:
             raise ShapeError(f"low_pass: found {tuple(displacements.shape)}, expected (B,{len(self._masses)},C)")
         count, _, channels = displacements.shape
         columns = displacements.transpose(0, 1).flatten(1)
-        smooth: Tensor = _Smoothed.apply(columns, self._masses, self._factor)
+        smooth = solved(self._factor, columns * self._masses.to(columns)[:, None])
         return smooth.unflatten(1, (count, channels)).transpose(0, 1)
-
-
-class _Smoothed(torch.autograd.Function):
-    """Columns times A⁻¹ M; A is symmetric, so the gradient is M A⁻¹ times the result's."""
-
-    @staticmethod
-    def forward(ctx: Any, columns: Tensor, masses: Tensor, factor: SparseCholesky) -> Tensor:
-        ctx.masses, ctx.factor = masses, factor
-        return factor.solve(columns * masses.to(columns)[:, None])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.factor.solve(gradients[0]) * ctx.masses.to(gradients[0])[:, None], None, None
 
 
 def vertex_areas(neutral: Tensor, faces: Tensor) -> Tensor:

@@ -13,15 +13,17 @@ from torch import Tensor
 from torchface.enhancement.aligned_frames import FrameAlignment
 from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
 from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.gradient_detail import GradientDetail
 from torchface.enhancement.low_pass import LowPass
-from torchface.enhancement.surface_frames import PatchGradients
+from torchface.enhancement.surface_frames import PatchGradients, SurfaceFrames
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.progress import Progress
 
-_NUMBERS = 2**23  # of the frames that are worked on at a time
+_NUMBERS = 2**25  # of the details that are learned from at a time
+_LARGEST_BLOCK = 32  # frames
 _SECONDS = 60.0  # between checkpoints: at 500,000 vertices one takes ten
 _FAR_NEUTRAL = 0.5  # millimetres, root mean square over the head
 CHECKPOINT = "learning.safetensors"
@@ -34,14 +36,16 @@ class Encoder:
     Args:
         alignment: lays frames on the neutral.
         low_pass: smooths their displacements.
+        frames: turns the vertices' frames with their smooth part.
         gradients: takes the features of patches.
         detail: encodes what the smooth part lacks.
     """
 
     alignment: FrameAlignment
     low_pass: LowPass
+    frames: SurfaceFrames
     gradients: PatchGradients
-    detail: DisplacementDetail
+    detail: DisplacementDetail | GradientDetail
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,6 @@ class LearnedFrames:
         features: of every frame, (K,P,9).
         motion: mean displacements of the patches' smooth part, (K,P,3), millimetres.
         basis: of the details.
-        colors: of the colours, where there are any.
     """
 
     features: Tensor
@@ -93,7 +96,7 @@ def learn_frames(
     if path is not None and (found := read_checkpoint(path, whole)) is not None:
         basis.load(found)
         features, motion, done = [found["features"]], [found["motion"]], len(found["features"])
-    block = max(1, min(32, _NUMBERS // size * 4))
+    block = max(1, min(_LARGEST_BLOCK, _NUMBERS // size))
     saved = time.monotonic()
     with torch.no_grad():
         while done < count:
@@ -101,10 +104,11 @@ def learn_frames(
             _check_finite(some, done)
             displacements, _ = encoder.alignment.laid_on_neutral(some.float(), f"frames from {done} on")
             smooth = encoder.low_pass(displacements)
-            features.append(encoder.gradients.features(smooth))
+            turned = encoder.frames.turned(smooth)
+            features.append(encoder.gradients.features(smooth, turned))
             motion.append(encoder.gradients.motion(smooth))
             neutral = encoder.alignment.neutral
-            basis.add(encoder.detail.encode(neutral + smooth, neutral + displacements))
+            basis.add(encoder.detail.encode(neutral + smooth, neutral + displacements, turned))
             done += len(some)
             progress("learning detail", done, count)
             if path is not None and done < count and time.monotonic() - saved >= _SECONDS:

@@ -10,7 +10,9 @@ from torch.autograd.function import once_differentiable
 
 from torchface.geometry.rotations import cross_matrix, rotation_matrix, rotation_vector
 
-_ITERATIONS = 9
+_ITERATIONS = 12
+_SETTLED = 0.1  # times the precision: the square of a change, after which one more would change nothing
+_SCALED = 6  # iterations
 _SINGULAR = 1e-5  # of the determinant to the norm's cube: Newton's iteration needs more
 
 
@@ -103,8 +105,12 @@ def _by_newton(matrices: Tensor) -> Tensor:
         det = torch.where(det.abs() > 1e-30, det, 1e-30)
         # Scaled by the norms of matrix and inverse at first, which makes few steps of a stretch of any size.
         own, other = _square(x), _square(cofactors) / det.square()
-        scale = (other / own.clamp(min=1e-30)).clamp(1e-20, 1e20).pow(0.25) if step < _ITERATIONS - 3 else 1.0
-        x = [0.5 * (scale * one + two / (scale * det)) for one, two in zip(x, cofactors, strict=True)]
+        scale = (other / own.clamp(min=1e-30)).clamp(1e-20, 1e20).pow(0.25) if step < _SCALED else 1.0
+        now = [0.5 * (scale * one + two / (scale * det)) for one, two in zip(x, cofactors, strict=True)]
+        change = _square([one - two for one, two in zip(x, now, strict=True)])
+        x = now
+        if change.numel() == 0 or float(change.max()) < _SETTLED * torch.finfo(det.dtype).eps:
+            break
     return torch.stack(x, dim=-1).unflatten(-1, (3, 3))
 
 

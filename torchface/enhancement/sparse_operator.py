@@ -1,4 +1,4 @@
-"""A sparse matrix that multiplies many columns at once, in their own precision, with derivatives."""
+"""Sparse products and solves of many columns at once, with derivatives."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 from scipy import sparse
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from torchface.optim.sparse import SparseCholesky
 
 
 class SparseOperator:
@@ -43,6 +45,24 @@ class SparseOperator:
         if key not in self._prepared:
             self._prepared[key] = _as_tensor(self._matrix.T.tocsr() if transposed else self._matrix, columns)
         return self._prepared[key] @ columns.contiguous()
+
+
+def solved(factor: SparseCholesky, columns: Tensor) -> Tensor:
+    """The solutions (V,C) of a factored system for columns (V,C); differentiable, as it is symmetric."""
+    solution: Tensor = _Solution.apply(columns, factor)
+    return solution
+
+
+class _Solution(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, columns: Tensor, factor: SparseCholesky) -> Tensor:
+        ctx.factor = factor
+        return factor.solve(columns)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return ctx.factor.solve(gradients[0]), None
 
 
 class _Product(torch.autograd.Function):

@@ -66,14 +66,9 @@ class SurfaceFrames:
         # A surface that collapses has no tangents: its frame shrinks to nothing instead of growing without bound.
         root = (E * G - F * F).clamp(min=1e-8).sqrt()
         scale = 1 / (root * (E + G + 2 * root).sqrt())
-        normal = torch.linalg.cross(first, second, dim=0) / root
+        normal = _cross(first, second) / root
         axes = (first * (G + root) - second * F) * scale, (second * (E + root) - first * F) * scale, normal
         return TurnedFrames(torch.stack(axes))
-
-    def normals(self, displacements: Tensor) -> Tensor:
-        """Unit normals alone, (3,V,B)."""
-        normal = torch.linalg.cross(*self._images(displacements), dim=0)
-        return normal / _dot(normal, normal).clamp(min=1e-8).sqrt()
 
     def patch_gradients(self, patches: Tensor, faces: Tensor, neutral: Tensor) -> PatchGradients:
         """What takes the mean gradients over patches of triangles."""
@@ -103,7 +98,7 @@ class PatchGradients:
     """
 
     def __init__(self, frames: SurfaceFrames, shares: sparse.csr_array, tangents: sparse.csr_array) -> None:
-        self._frames, self.count = frames, shares.shape[0]
+        self.count = shares.shape[0]
         vertices = shares.shape[1]
         axes = frames.rest_axes.numpy()
         by_axis = [
@@ -121,11 +116,16 @@ class PatchGradients:
         self._rest_normals = frames.rest_axes[2]
         self.means = SparseOperator(shares)
 
-    def features(self, displacements: Tensor) -> Tensor:
-        """Rotation vector and stretch of every patch, (B,P,9), of displacements (B,V,3); zeros at rest."""
+    def features(self, displacements: Tensor, turned: TurnedFrames) -> Tensor:
+        """Rotation vector and stretch of every patch, (B,P,9); zeros at rest.
+
+        Args:
+            displacements: (B,V,3), millimetres; differentiable.
+            turned: the frames under them.
+        """
         count, vertices, _ = displacements.shape
         columns = displacements.permute(1, 2, 0).reshape(vertices, 3 * count)
-        normals = self._frames.normals(displacements) - self._rest_normals.T.to(displacements)[..., None]
+        normals = turned.axes[2] - self._rest_normals.T.to(displacements)[..., None]
         change = self._tangential(columns) + self._normal(normals.permute(1, 0, 2).reshape(vertices, 3 * count))
         # Rows are rest axes, columns coordinates: the transpose is the gradient.
         gradients = change.view(3, self.count, 3, count).permute(3, 1, 2, 0)
@@ -140,6 +140,11 @@ class PatchGradients:
 
 def _dot(first: Tensor, second: Tensor) -> Tensor:
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    (a, b, c), (d, e, f) = first, second
+    return torch.stack([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def _rest_axes(normals: Tensor) -> Tensor:
