@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import trimesh
+from headless_chromium import headless_chromium
 
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-
-_SWITCHES = (
-    "--headless=new",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1280,900",
-)
 
 
 def ball(subdivisions: int, radius: float, centre: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -69,17 +54,5 @@ def ball_rig(two_balls: Mesh) -> BlendshapeRig:
 def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A driver of Debian's Chromium, without the network."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("chromium or chromedriver not found; on Debian: apt-get install chromium chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    profile: Path = tmp_path_factory.mktemp("profile")
-    for switch in (*_SWITCHES, f"--user-data-dir={profile}"):
-        options.add_argument(switch)
-    environment = {**os.environ, "SE_OFFLINE": "true"}
-    service = webdriver.ChromeService(executable_path=driver, env=environment)
-    running = webdriver.Chrome(options=options, service=service)
-    yield running
-    running.quit()
+    with headless_chromium(tmp_path_factory.mktemp("profile"), size=(1280, 900)) as running:
+        yield running

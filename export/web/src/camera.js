@@ -10,7 +10,7 @@ const WORDS = {
   NotReadableError: "The camera cannot be opened; another program may be using it. Close that, then try again.",
   AbortError: "The camera stopped before it gave a picture. Try again.",
 };
-const PATIENCE = 8000; // milliseconds until a camera that gives no picture is given up
+const PATIENCE = 15_000; // milliseconds until a camera that gives no picture is given up
 
 /**
  * Opens the camera into a video element.
@@ -54,7 +54,7 @@ function firstPicture(video) {
     const silent = new CameraError("The camera gives no pictures. Open its cover, unplug it and plug it in, or restart.");
     const timer = setTimeout(() => reject(silent), PATIENCE);
     const done = () => (clearTimeout(timer), resolve());
-    onFrame(video, done);
+    video.addEventListener("loadeddata", done, { once: true }); // in a hidden tab too, where no frame is shown
     video.play().catch(() => {}); // one that may not play gives no picture, which the timer tells
   });
 }

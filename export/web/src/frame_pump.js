@@ -28,6 +28,7 @@ export function pumpFrames(video, solver, controls, show, fail) {
       while (running && newest !== null && !document.hidden) {
         const time = newest;
         newest = null;
+        if (video.readyState < HTMLMediaElement.HAVE_CURRENT_DATA) continue; // a camera that changes its size
         const picture = await createImageBitmap(video);
         const solved = await solver.solve(picture, time, controls());
         if (running) show(solved);

@@ -35,16 +35,25 @@ async function start() {
   hideProblem("camera");
   try {
     showStatus("Asking for the camera…");
+    const loaded = loadedSolver(); // while the user is asked
+    loaded.catch(() => {}); // said once the camera is there
     stream = await openCamera(element("video"), () => stop("The camera was unplugged or taken away."));
     element("invitation").hidden = true;
     showStatus("Loading the solver…");
-    await loadedSolver();
-    pump = pumpFrames(element("video"), solver, controls, show, (error) => stop(`The solver stopped: ${error.message}`));
-    setRunning(true);
+    await loaded;
+    if (stream !== null) run(); // else it was taken away meanwhile
   } catch (error) {
     stop(error.message);
   }
   element("start").disabled = false;
+}
+
+function run() {
+  pump = pumpFrames(element("video"), solver, controls, show, (error) => {
+    forgetSolver();
+    stop(`The solver stopped: ${error.message}`);
+  });
+  setRunning(true);
 }
 
 /** The solver, which is loaded once; after a failure once more. */
@@ -53,9 +62,14 @@ async function loadedSolver() {
   try {
     await loading;
   } catch (error) {
-    loading = null;
+    forgetSolver();
     throw new Error(`The solver could not be loaded: ${error.message}.`);
   }
+}
+
+function forgetSolver() {
+  solver?.close();
+  solver = loading = null;
 }
 
 function stop(problem = null) {
@@ -83,7 +97,8 @@ function show(solved) {
   const seen = solved.presence > SEEN;
   if (seen) lastSeen = performance.now();
   const gone = performance.now() - lastSeen > GONE;
-  showStatus(gone ? "No face is seen. Move into the picture, with light on your face." : "Your face is followed.");
+  if (!document.hidden) // else this is the picture that was under way, and the pause has been said
+    showStatus(gone ? "No face is seen. Move into the picture, with light on your face." : "Your face is followed.");
   rate.add(solved.milliseconds);
   drawFace(element("overlay"), seen ? solved : null);
   stage?.pose(solved);
@@ -143,7 +158,7 @@ for (const id of ["gain", "smoothing"])
   element(id).addEventListener("input", ({ target }) => (element(`${id}-value`).value = Number(target.value).toFixed(1)));
 document.addEventListener("keydown", ({ key }) => key === "Escape" && endCalibration());
 document.addEventListener("visibilitychange", () => {
-  if (document.hidden) showStatus("Paused while this tab is hidden.");
+  if (pump !== null) showStatus(document.hidden ? "Paused while this tab is hidden." : "");
   lastSeen = performance.now();
 });
 setInterval(showRate, 500);

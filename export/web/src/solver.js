@@ -16,7 +16,13 @@ export class Solver {
 
   constructor() {
     this.#worker.onmessage = ({ data }) => this.#settle(data);
-    this.#worker.onerror = (event) => this.#settle({ failed: event.message || "the worker could not be started" });
+    this.#worker.onerror = (event) => this.#failAll(event.message || "the worker could not be started");
+  }
+
+  /** Ends the worker; what was asked of it fails. */
+  close() {
+    this.#worker.terminate();
+    this.#failAll("it was closed");
   }
 
   /** Reads the graph; the answer says which engine runs it, and on how many threads. */
@@ -45,6 +51,11 @@ export class Solver {
     const waiting = this.#waiting.shift(); // answers come in the order of what was asked
     if ("failed" in answer) waiting?.reject(new Error(answer.failed));
     else waiting?.resolve(answer);
+  }
+
+  /** Of a worker that has ended no answer comes, and nobody may wait for one. */
+  #failAll(words) {
+    for (const { reject } of this.#waiting.splice(0)) reject(new Error(words));
   }
 }
 

@@ -2,19 +2,26 @@
 
 import * as THREE from "three";
 
+import { DrawingPace, drawn, pause } from "./drawing_pace.js";
+
 const FIELD = 24; // degrees; a portrait lens
 const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // WebGL without a graphics card
+const SOFTWARE_PIXELS = 0.5; // for one of the page's
 
 export class Stage {
   #renderer;
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
   #character = null;
+  #software = drawsInSoftware();
+  #pace = new DrawingPace(1);
   #asked = false;
+  #drawing = false;
 
   /** @param {HTMLCanvasElement} canvas whose size the page's layout says; throws where there is no WebGL. */
   constructor(canvas) {
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.#software, alpha: true });
     this.#renderer.toneMapping = THREE.NeutralToneMapping;
     const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);
     key.position.set(-0.6, 0.8, 1);
@@ -36,20 +43,39 @@ export class Stage {
     this.draw();
   }
 
-  /** Draws with the screen's next picture. */
+  /** Draws with one of the screen's next pictures: when the drawing before is done, and has left the solver its time. */
   draw() {
-    if (this.#asked) return;
     this.#asked = true;
-    requestAnimationFrame(() => {
-      this.#asked = false;
-      this.#renderer.render(this.#scene, this.#camera);
-    });
+    if (!this.#drawing) this.#drawWhileAsked();
+  }
+
+  async #drawWhileAsked() {
+    this.#drawing = true;
+    try {
+      while (this.#asked) {
+        await new Promise(requestAnimationFrame);
+        this.#asked = false;
+        await pause(this.#pace.rest(await this.#drawnNow()));
+      }
+    } finally {
+      this.#drawing = false;
+    }
+  }
+
+  /** Milliseconds that drawing took. */
+  async #drawnNow() {
+    const began = performance.now();
+    if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#renderer.setPixelRatio(this.#pace.ratio);
+    this.#renderer.render(this.#scene, this.#camera);
+    await drawn(this.#renderer.getContext());
+    return performance.now() - began;
   }
 
   #fit() {
     const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
     if (width === 0 || height === 0) return;
-    this.#renderer.setPixelRatio(Math.min(MOST_PIXELS, window.devicePixelRatio));
+    this.#pace = new DrawingPace(this.#software ? SOFTWARE_PIXELS : Math.min(MOST_PIXELS, window.devicePixelRatio));
+    this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#camera.aspect = width / height;
     if (this.#character !== null) {
@@ -64,4 +90,13 @@ export class Stage {
     this.#camera.updateProjectionMatrix();
     this.draw();
   }
+}
+
+function drawsInSoftware() {
+  const context = new OffscreenCanvas(1, 1).getContext("webgl2");
+  if (context === null) return false;
+  const names = context.getExtension("WEBGL_debug_renderer_info");
+  const name = String(context.getParameter(names?.UNMASKED_RENDERER_WEBGL ?? context.RENDERER));
+  context.getExtension("WEBGL_lose_context")?.loseContext();
+  return SOFTWARE.test(name);
 }

@@ -1,12 +1,9 @@
-"""The app's folder on a local server, and a Chromium whose camera is a film; both tell what was asked for."""
+"""The app's folder on a local server, and its page in a Chromium whose camera is a film."""
 
 from __future__ import annotations
 
-import os
-import shutil
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,21 +11,8 @@ from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, Thread
 from pathlib import Path
 from typing import Any
 
-import pytest
+from headless_chromium import until
 
-_SWITCHES = (
-    "--headless=new",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-features=OptimizationHints,MediaRouter,Translate",
-    "--autoplay-policy=no-user-gesture-required",
-)
 _ISOLATED = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp"}
 
 
@@ -103,39 +87,9 @@ def elsewhere() -> Iterator[Server]:
         yield found
 
 
-@contextmanager
-def chromium(profile: Path, *switches: str, size: tuple[int, int] = (800, 700)) -> Iterator[Any]:
-    """A driver of Debian's Chromium; skips visibly where it is not installed."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("chromium or chromedriver not found; on Debian: apt-get install chromium chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    own = (f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}")
-    for switch in (*_SWITCHES, *own, *switches):
-        options.add_argument(switch)
-    service = webdriver.ChromeService(executable_path=driver, env={**os.environ, "SE_OFFLINE": "true"})
-    running = webdriver.Chrome(options=options, service=service)
-    running.set_script_timeout(60)
-    try:
-        yield running
-    finally:
-        running.quit()
-
-
 def film_camera(film: Path) -> tuple[str, ...]:
     """The switches by which Chromium's camera plays a film."""
     return ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={film}")
-
-
-def until(found: Callable[[], Any], seconds: float = 90.0) -> Any:
-    """Waits for something true, and returns it."""
-    end = time.monotonic() + seconds
-    while not (value := found()):
-        assert time.monotonic() < end, "the page did not get there in time"
-        time.sleep(0.05)
-    return value
 
 
 class Page:
@@ -166,6 +120,24 @@ class Page:
             self.click("start")
         until(lambda: self.text("status").startswith(("Your face", "No face")) or self.problem)
         assert not self.problem, self.problem
+
+    @property
+    def recorded_frames(self) -> int:
+        """How many frames the page says that it has recorded."""
+        return int(self.text("recorded").split()[2])
+
+    @contextmanager
+    def held_pictures(self) -> Iterator[None]:
+        """Lets no picture through to the page's worker."""
+        self.driver.execute_script("watched.held = []")
+        try:
+            yield
+        finally:
+            self.let_pictures_go()
+
+    def let_pictures_go(self) -> None:
+        """Lets those through that were held, and all that come."""
+        self.driver.execute_script("const held = watched.held ?? []; watched.held = null; held.forEach(go => go())")
 
     def stop(self) -> None:
         """Stops the camera."""

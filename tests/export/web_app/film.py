@@ -28,13 +28,13 @@ def write_y4m(path: Path, frames: NDArray[np.uint8], fps: int = 30) -> None:
 
 
 def planted_film(frames: int = 60, unseen: range = range(0)) -> NDArray[np.uint8]:
-    """Grey frames (T,240,320) whose blocks rise and fall, each at its own speed; without a face in ``unseen``."""
+    """Small grey frames (T,128,160) whose blocks rise and fall, each at its own speed; without a face in ``unseen``."""
     time, block = np.arange(frames)[:, None] / frames, np.arange(COLUMNS * COLUMNS)
     values = 0.5 + 0.4 * np.sin(2 * np.pi * (time * (1 + block % 5) + block / 9))
     values[:, PRESENCE] = 0.95
-    values[:, YAW] = 0.5 + 0.3 * np.sin(2 * np.pi * time[:, 0])
+    values[:, YAW] = 0.5 + 0.3 * np.sin(2 * np.pi * 4 * time[:, 0])
     values[list(unseen), PRESENCE] = 0.05
-    film = np.full((frames, 240, 320), 128, np.uint8)
+    film = np.full((frames, BLOCK * COLUMNS, 160), 128, np.uint8)
     blocks = np.kron(values.reshape(-1, COLUMNS, COLUMNS), np.ones((1, BLOCK, BLOCK)))
-    film[:, : BLOCK * COLUMNS, : BLOCK * COLUMNS] = (255 * blocks).round().astype(np.uint8)
+    film[:, :, : BLOCK * COLUMNS] = (255 * blocks).round().astype(np.uint8)
     return film

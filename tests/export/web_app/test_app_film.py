@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from app_browser import Page, chromium, film_camera, static_host, until
+from app_browser import Page, film_camera, static_host
 from film import write_y4m
+from headless_chromium import headless_chromium, until
 from PIL import Image
 from test_app_in_chromium import WATCH, allow_camera, assert_same_weights, record
 
@@ -42,7 +43,7 @@ def opened(app: Path, frames: np.ndarray, folder: Path, isolated: bool = False) 
     write_y4m(folder / "film.y4m", frames)
     with (
         static_host(app, isolated) as host,
-        chromium(folder / "profile", *film_camera(folder / "film.y4m")) as driver,
+        headless_chromium(folder / "profile", *film_camera(folder / "film.y4m"), size=(800, 700)) as driver,
     ):
         driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
         allow_camera(driver, "granted")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from app_browser import Page, Server, chromium, elsewhere, film_camera, static_host, until
+from app_browser import Page, Server, elsewhere, film_camera, static_host
 from film import planted_film, write_y4m
+from headless_chromium import headless_chromium, until
 from planted_graph import write_planted_graph
 from rig_samples import quad_sheet
 from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
@@ -29,7 +31,8 @@ from torchface.workflows.track.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
 WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
-FRAMES = 90
+FRAMES, RATE = 48, 15
+WINDOW = (480, 360)
 BROWSERS_OWN = ("google.com", "googleapis.com", "gstatic.com", "duckduckgo.com")
 """Where Chromium calls by itself, whatever page is open."""
 
@@ -72,13 +75,15 @@ class Open:
 def opened(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
     """The app in Chromium; the film has no face in its second half."""
     folder = tmp_path_factory.mktemp("camera")
-    write_y4m(folder / "film.y4m", planted_film(FRAMES, range(FRAMES // 2, FRAMES)))
+    write_y4m(folder / "film.y4m", planted_film(FRAMES, range(FRAMES // 2, FRAMES)), RATE)
     switches = film_camera(folder / "film.y4m")
     with (
         static_host(app) as host,
         elsewhere() as outside,
-        # Drawing in software takes ten seconds to begin with, and test_app_film.py looks at that.
-        chromium(folder / "profile", *switches, "--disable-3d-apis", f"--proxy-server={outside.url}") as driver,
+        # Drawing in software takes seconds to begin with, and test_app_film.py looks at that.
+        headless_chromium(
+            folder / "profile", *switches, "--disable-3d-apis", f"--proxy-server={outside.url}", size=WINDOW
+        ) as driver,
     ):
         driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
         allow_camera(driver, "granted")
@@ -129,11 +134,11 @@ def recorded(opened: Open, tmp_path_factory: pytest.TempPathFactory) -> Recorded
 
 
 def record(page: Page, folder: Path, frames: int) -> Recorded:
-    """Starts the camera, records about so many frames, stops both, and downloads what the page made of it."""
+    """Starts the camera, records so many frames or a few more, stops both, and downloads what the page made of it."""
     page.driver.execute_script("watched.keep = true")
     page.start()
     page.click("record")
-    until(lambda: page.driver.execute_script("return watched.solved.length") >= frames)
+    until(lambda: page.recorded_frames >= frames)
     page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
     page.driver.execute_script("watched.keep = false")
     script = """
@@ -264,7 +269,9 @@ def bare(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
     with (
         static_host(app) as host,
         elsewhere() as outside,
-        chromium(folder / "profile", "--disable-3d-apis", f"--proxy-server={outside.url}") as driver,
+        headless_chromium(
+            folder / "profile", "--disable-3d-apis", f"--proxy-server={outside.url}", size=WINDOW
+        ) as driver,
     ):
         yield Open(Page(driver), host, outside)
 
@@ -297,22 +304,50 @@ def test_a_refused_camera_is_explained_and_may_be_allowed_then(opened: Open, rec
 def test_a_face_is_lost_and_found(opened: Open, recorded: Recorded) -> None:
     page = opened.page
     page.start()
-    until(lambda: page.text("status").startswith("No face is seen"))
-    until(lambda: page.text("status") == "Your face is followed.")
+    said = "return watched.said"
+    count = len(page.driver.execute_script(said))
+
+    def lost_then_found() -> bool:
+        words = page.driver.execute_script(said)[count:]
+        lost = [i for i, one in enumerate(words) if one.startswith("No face is seen")]
+        return bool(lost) and "Your face is followed." in words[lost[0] :]
+
+    until(lost_then_found)
 
 
 def test_a_hidden_tab_pauses_and_goes_on_when_it_is_shown(opened: Open, recorded: Recorded) -> None:
     page, driver = opened.page, opened.page.driver
     page.start()
     count = "return watched.solved.length"
-    driver.minimize_window()
-    until(lambda: page.text("status").startswith("Paused"))
-    before = driver.execute_script(count)
-    driver.execute_async_script("setTimeout(arguments[0], 600)")
-    assert driver.execute_script(count) <= before + 1  # the one that was under way
-    driver.set_window_size(800, 700)
+    with minimized(driver):
+        until(lambda: page.text("status").startswith("Paused"))
+        before = driver.execute_script(count)
+        driver.execute_async_script("setTimeout(arguments[0], 600)")
+        assert driver.execute_script(count) <= before + 1  # the one that was under way
     until(lambda: driver.execute_script(count) > before + 3)
     until(lambda: not page.text("status").startswith("Paused"))
+
+
+def test_an_answer_that_comes_when_the_tab_is_hidden_does_not_end_the_pause(opened: Open, recorded: Recorded) -> None:
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    with page.held_pictures():
+        until(lambda: driver.execute_script("return watched.held.length"))
+        before = driver.execute_script("return watched.solved.length")
+        with minimized(driver):
+            until(lambda: page.text("status").startswith("Paused"))
+            page.let_pictures_go()
+            until(lambda: driver.execute_script("return watched.solved.length") > before)
+            assert page.text("status").startswith("Paused")
+
+
+@contextmanager
+def minimized(driver: Any) -> Iterator[None]:
+    driver.minimize_window()
+    try:
+        yield
+    finally:
+        driver.set_window_size(*WINDOW)
 
 
 def test_controls_reach_the_graph(opened: Open, recorded: Recorded) -> None:
@@ -336,10 +371,11 @@ def test_calibration_is_spoken_and_left_with_escape(opened: Open, recorded: Reco
     page, driver = opened.page, opened.page.driver
     page.start()
     count = driver.execute_script("return watched.sent.length")
-    page.click("calibrate")
-    assert page.text("prompt-words") == "1 of 5: Look into the camera with a resting face."
-    assert page.text("spoken") == "Look into the camera with a resting face."
-    assert driver.switch_to.active_element.get_attribute("id") == "prompt-stop"
+    with page.held_pictures():  # so the first step lasts while it is looked at
+        page.click("calibrate")
+        assert page.text("prompt-words") == "1 of 5: Look into the camera with a resting face."
+        assert page.text("spoken") == "Look into the camera with a resting face."
+        assert driver.switch_to.active_element.get_attribute("id") == "prompt-stop"
     until(lambda: 1 in [one["pose"] for one in watched(page, f"watched.sent.slice({count})")])
     driver.switch_to.active_element.send_keys(Keys.ESCAPE)
     assert not driver.find_element("id", "prompt").is_displayed()

@@ -1,5 +1,6 @@
-// Runs in the page before its own scripts: keeps what goes to the worker and what comes back, and what is downloaded.
-window.watched = { sent: [], solved: [], workers: [], blobs: [] };
+// Runs in the page before its own scripts: keeps what goes to the worker and what comes back, what is downloaded, and what
+// the page says of itself. While `held` is a list, pictures for the worker wait there.
+window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held: null };
 {
   const post = Worker.prototype.postMessage, made = URL.createObjectURL, Original = window.Worker;
   window.Worker = class extends Original {
@@ -17,8 +18,15 @@ window.watched = { sent: [], solved: [], workers: [], blobs: [] };
       const image = context.getImageData(0, 0, picture.width, picture.height);
       watched.sent.push({ ...rest, width: picture.width, height: picture.height, pixels: watched.keep ? image.data : null });
     }
-    return post.call(this, message, given);
+    const go = () => post.call(this, message, given);
+    if (message.frame && watched.held) watched.held.push(go);
+    else go();
   };
+  document.addEventListener("DOMContentLoaded", () => {
+    const status = document.getElementById("status");
+    const keep = () => watched.said.push(status.textContent);
+    if (status) new MutationObserver(keep).observe(status, { childList: true, characterData: true, subtree: true });
+  });
   URL.createObjectURL = (blob) => (watched.blobs.push(blob), made.call(URL, blob));
   watched.text = async (bytes) => {
     const address = await new Promise((done) => {

@@ -2,13 +2,14 @@
 
 import io
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from headless_chromium import until
 from PIL import Image
 from torch import Tensor
 
@@ -40,15 +41,6 @@ _THUMB = """
 const label = [...document.querySelectorAll('label')].filter(e => e.textContent.trim() === arguments[0])[arguments[1]];
 return label ? document.getElementById(label.getAttribute('for')).querySelector('[role=slider]') : null;
 """
-
-
-def until(found: Callable[[], Any], seconds: float = 30.0) -> Any:
-    """Waits for something true, and returns it."""
-    end = time.monotonic() + seconds
-    while not (value := found()):
-        assert time.monotonic() < end, "the page did not get there in time"
-        time.sleep(0.05)
-    return value
 
 
 def shown(chromium: Any, node: str) -> tuple[int, Tensor]:

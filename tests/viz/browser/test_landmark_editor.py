@@ -1,8 +1,7 @@
 """The annotation page as a user meets it: the frame is the right way up, a dot is dragged, Save writes its files."""
 
 import io
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from headless_chromium import until
 from PIL import Image
 from torch import Tensor
 
@@ -28,15 +28,6 @@ camera.updateMatrixWorld(); node.updateWorldMatrix(true, false);
 const p = node.position.clone().set(...arguments[1]).applyMatrix4(node.matrixWorld).project(camera);
 return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
 """
-
-
-def until(found: Callable[[], Any], seconds: float = 30.0) -> Any:
-    """Waits for something true, and returns it."""
-    end = time.monotonic() + seconds
-    while not (value := found()):
-        assert time.monotonic() < end, "the page did not get there in time"
-        time.sleep(0.05)
-    return value
 
 
 def face(shift: float) -> Tensor:

@@ -2,13 +2,14 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from headless_chromium import until
 from planted_faces import JAW, Endless, ShadeSolver
 
 from torchface.io import load_take, save_rig
@@ -31,15 +32,6 @@ _THUMB = """
 const label = [...document.querySelectorAll('label')].find(e => e.textContent.trim() === arguments[0]);
 return label ? document.getElementById(label.getAttribute('for')).querySelector('[role=slider]') : null;
 """
-
-
-def until(found: Callable[[], Any], seconds: float = 100.0) -> Any:
-    """Waits for something true, and returns it."""
-    end = time.monotonic() + seconds
-    while not (value := found()):
-        assert time.monotonic() < end, "the page did not get there in time"
-        time.sleep(0.05)
-    return value
 
 
 class Slow(Endless):

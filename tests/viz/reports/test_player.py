@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -41,8 +40,8 @@ def test_it_plays_from_disk_and_colours_the_distance(chromium: Any, ball_rig: Bl
 
     def picture(frame: int) -> torch.Tensor:
         script = "const p = document.getElementById('performance').player; p.toggle(false); p.seek(arguments[0]);"
-        chromium.execute_script(script, frame)
-        time.sleep(0.2)
+        shown = "requestAnimationFrame(() => requestAnimationFrame(arguments[1]))"
+        chromium.execute_async_script(script + shown, frame)
         canvas = chromium.find_element("css selector", "#performance .stage canvas")
         with Image.open(BytesIO(canvas.screenshot_as_png)) as image:
             return torch.from_numpy(np.asarray(image.convert("RGB")).copy()).float()
