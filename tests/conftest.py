@@ -46,6 +46,25 @@ LONGEST = (
 """Where the longest tests lie, which go first: then the processes of a run end together."""
 
 
+BROWSERS = ("export/web_app/test_app_in_chromium", "viz/browser", "viz/reports/test_player")
+"""The tests of Chromium, all for one process: two browsers beside each other would take the time from one another."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Distributes files as ``--dist loadfile`` does, those of Chromium together as one."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class BrowsersTogether(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "browsers" if file.removeprefix("tests/").startswith(BROWSERS) else file
+
+    return BrowsersTogether(config, log)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def disk_without_waiting() -> Iterator[None]:
     """No test's files need survive a power cut: what waits for the disk does not."""

@@ -34,6 +34,13 @@ const jobs = {
     return { seconds: take.seconds, rate: take.rate };
   },
 
+  /** Rest after each of these drawings' milliseconds, and the pixels drawn for one of the page's, from two on. */
+  async pace() {
+    const { DrawingPace } = await load("drawing_pace");
+    const pace = new DrawingPace(2);
+    return JSON.parse(input).map((took) => [pace.rest(took), pace.ratio]);
+  },
+
   /** What is said of a character that cannot be used. */
   async refusal() {
     const { checkCharacter } = await load("character_check");

@@ -84,6 +84,17 @@ def test_times_rise_and_the_rate_is_a_usual_one(run: Run) -> None:
     assert told["rate"] == 30
 
 
+def test_slow_drawing_takes_a_third_of_the_time_at_most_and_becomes_coarser(run: Run) -> None:
+    quick, slow = [3.0] * 50, [60.0] * 40
+    rests, ratios = np.array(run("pace", [*quick, 5000.0, *quick, *slow])).T
+    assert not rests[:50].any()
+    assert rests[50] < 1000  # the first drawing takes seconds, and the character is awaited
+    assert (ratios[:101] == 2).all()  # one slow drawing is none
+    assert (60 / (60 + rests[101:])).max() < 1 / 3
+    assert ratios[-1] == 0.5
+    assert (np.diff(ratios) <= 0).all()
+
+
 def sheet(path: Path, names: tuple[str, ...]) -> Path:
     mesh = quad_sheet()
     deltas = torch.randn(len(names), len(mesh.vertices), 3, generator=torch.Generator().manual_seed(0))

@@ -1,8 +1,10 @@
 """The pages as a user meets them: Chromium renders them, a slider is dragged, the head is clicked on."""
 
 import io
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +39,17 @@ camera.updateMatrixWorld(); node.updateWorldMatrix(true, false);
 const p = node.position.clone().set(...arguments[1]).applyMatrix4(node.matrixWorld).project(camera);
 return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
 """
+_STILL = """
+const done = arguments[0], camera = window.__viserMutable.camera;
+let before = "", same = 0;
+const look = () => {
+    const now = camera.matrixWorld.elements.join();
+    same = now === before ? same + 1 : 0;
+    before = now;
+    if (same < 6) requestAnimationFrame(look); else done();
+};
+look();
+"""
 _THUMB = """
 const label = [...document.querySelectorAll('label')].filter(e => e.textContent.trim() === arguments[0])[arguments[1]];
 return label ? document.getElementById(label.getAttribute('for')).querySelector('[role=slider]') : null;
@@ -68,7 +81,7 @@ _BOX = "return arguments[0].closest('[id]').parentElement.querySelector('input[i
 @pytest.fixture(scope="module")
 def viewer(chromium: Any, ball_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigViewer]:
     ramp = torch.linspace(0, 1, 240)[:, None, None]
-    take = Take(60.0, weights=Track(("jawOpen",), ramp))
+    take = Take(20.0, weights=Track(("jawOpen",), ramp))  # long: a slow machine looks seldom while it plays
     opened = RigViewer(ball_rig, take, tmp_path_factory.mktemp("out") / "edited.csv", label="two balls", port=0)
     chromium.get(opened.url)
     shown(chromium, "/head/part0")
@@ -167,11 +180,8 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
         visible = "return (n => n ? n.visible : null)(window.__viserMutable?.nodeRefFromName['/head/textured'])"
         until(lambda: chromium.execute_script(visible) is True)
 
-        def dragged_bare() -> bool:
-            opened.set_weight("jawOpen", time.monotonic() % 1.0)
-            return chromium.execute_script(visible) is False
-
-        until(dragged_bare)
+        with dragged(opened):
+            until(lambda: chromium.execute_script(visible) is False)
         expected = opened.rig(opened.editor.pose[None])[0]
         until(lambda: chromium.execute_script(visible) is True)
         until(lambda: (1000 * shown(chromium, "/head/textured")[1] - expected).abs().max() < 1e-3)
@@ -180,6 +190,24 @@ def test_the_texture_is_hidden_in_motion_and_shown_at_rest(chromium: Any, ball_r
     finally:
         chromium.get("about:blank")
         opened.stop()
+
+
+@contextmanager
+def dragged(viewer: RigViewer) -> Iterator[None]:
+    """The jaw moves all the time, however slowly the browser is looked at."""
+    ended = threading.Event()
+
+    def drag() -> None:
+        while not ended.wait(0.08):
+            viewer.set_weight("jawOpen", time.monotonic() % 1.0)
+
+    hand = threading.Thread(target=drag)
+    hand.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        hand.join()
 
 
 @pytest.fixture
@@ -193,6 +221,12 @@ def picker(chromium: Any, two_balls: Mesh, tmp_path) -> Iterator[Picker]:
     yield opened
     chromium.get("about:blank")
     opened.stop()
+
+
+def settle(chromium: Any) -> None:
+    """Waits until the camera has glided to its place: until it has stood still for some of the page's frames."""
+    time.sleep(1.0)
+    chromium.execute_async_script(_STILL)
 
 
 def click_on(chromium: Any, node: str, point: Tensor) -> None:
@@ -211,7 +245,7 @@ def front_vertices(mesh: Mesh) -> list[int]:
 
 
 def test_a_click_picks_the_vertex_under_the_cursor(chromium: Any, picker: Picker, two_balls: Mesh) -> None:
-    time.sleep(1.0)  # the camera glides to its place
+    settle(chromium)
     first, second = front_vertices(two_balls)
     click_on(chromium, "/head/part0", two_balls.vertices[first])
     until(lambda: picker.session.picks.landmarks[0] is not None)
@@ -227,7 +261,7 @@ def test_a_click_picks_the_vertex_under_the_cursor(chromium: Any, picker: Picker
 
 
 def test_clicks_on_head_and_scan_make_a_pair(chromium: Any, picker: Picker, two_balls: Mesh) -> None:
-    time.sleep(1.0)
+    settle(chromium)
     picker._mode.value = "correspondences"
     vertex, other = front_vertices(two_balls)
     scan = picker.session.scan

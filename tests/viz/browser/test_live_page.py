@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +40,18 @@ class Slow(Endless):
 
     def __init__(self) -> None:
         super().__init__(1, 12.0)
-        self.jaw, self.open = 0.0, True
+        self.jaw, self.open, self.stepped = 0.0, True, False
+        self.steps = threading.Semaphore(0)  # while it is stepped a frame comes for each release
         self.begin = threading.Event()  # a browser without a graphics card loads a page slowly that moves already
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         number = 0
         self.begin.wait(300)
         while self.open:
+            if self.stepped and not self.steps.acquire(timeout=1):
+                continue
             number += 1
-            time.sleep(0.04)
+            time.sleep(0 if self.stepped else 0.04)
             yield number / 12, np.full((48, 64, 3), round(40 + 200 * self.jaw), np.uint8)
 
 
@@ -117,10 +121,16 @@ def test_the_character_moves_with_the_camera_and_by_the_gain(chromium: Any, live
 
 @pytest.mark.browser
 def test_the_calibrate_button_goes_through_its_faces(chromium: Any, live: Opened) -> None:
+    def steps_to(prompt: str) -> bool:
+        live.source.steps.release()  # time goes on as often as the page is looked at, however slow that is
+        return prompt in words(chromium)
+
+    live.source.stepped = True
     click(chromium, "Calibrate")
     for prompt in ("1 of 5: Look into the camera", "2 of 5: Open your mouth", "5 of 5: Shut your eyes"):
-        until(lambda prompt=prompt: prompt in words(chromium))
-    until(lambda: "100 %" in words(chromium) and "of 5" not in words(chromium))
+        until(partial(steps_to, prompt))
+    until(lambda: steps_to("100 %") and "of 5" not in words(chromium))
+    live.source.stepped = False
     click(chromium, "Forget this person")
     until(lambda: live.solver.resets == 1)
 
