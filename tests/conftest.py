@@ -126,7 +126,7 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 def coarse_figures() -> Iterator[None]:
     """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
     figures = ("face_views", "marker_maps", "registration_views", "wireframe", "site_views")
-    pages = ("workflows.solve.solve_page", "workflows.register_scans")
+    pages = ("workflows.solve.solve_page", "workflows.register_scans", "workflows.enhance.enhance_views")
 
     def coarse(mesh: Mesh, camera: Camera, *rest: Any, **more: Any) -> torch.Tensor:
         given = inspect.signature(render).bind(mesh, camera, *rest, **more)

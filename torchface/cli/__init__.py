@@ -20,6 +20,7 @@ from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
 from torchface.cli.demo import demo
+from torchface.cli.enhance import enhance
 from torchface.cli.evaluate import evaluate
 from torchface.cli.examples import examples
 from torchface.cli.exit_messages import plain_errors
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "examples": examples,
     "live": live,
     "retarget": retarget,
+    "enhance": enhance,
     "evaluate": evaluate,
     "calibrate": calibrate,
     "render": render,

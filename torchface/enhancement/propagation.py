@@ -136,7 +136,7 @@ class ThinShell:
             found[torch.from_numpy(rows)] = dense.reshape(len(self.neutral), len(rows), 3).transpose(0, 1)
         return found.to(displacements.device)
 
-    def follow(self, points: Tensor) -> Tensor:
+    def follow(self, points: Tensor, rest: Tensor | None = None) -> Tensor:
         """Every vertex where the points take it, the head's rigid motion included.
 
         Each frame's motion is that of the points that move together: those that a face moves by itself count the less
@@ -144,6 +144,7 @@ class ThinShell:
 
         Args:
             points: seen places, (T,M,3), millimetres; NaN rows were not seen.
+            rest: where they are seen with the head at rest in the neutral's place, (M,3); on its surface if absent.
 
         Returns:
             (T,V,3), millimetres; NaN in frames where fewer than 12 points were seen.
@@ -151,16 +152,16 @@ class ThinShell:
         Raises:
             ShapeError: not (T,M,3).
         """
-        seen = torch.isfinite(points).all(-1)
+        seen = torch.isfinite(points).all(-1).cpu()
         self._check(points, seen)
-        enough = (seen.cpu() & self.used).sum(-1) >= LEAST_POINTS
+        still = (self.rest if rest is None else rest.cpu()).double()
+        enough = (seen & self.used).sum(-1) >= LEAST_POINTS
         found = torch.full((len(points), *self.neutral.shape), torch.nan)
         if enough.any():
-            shown = points[enough.to(points.device)].detach().cpu().double()
-            pose = rigid_motion(self.rest.double(), shown)
-            still = pose.inverse().apply(shown)
-            vertices = self.spread((still - self.rest.double()).float()).double() + self.neutral.double()
-            found[enough] = pose.apply(vertices).float()
+            shown = points.detach().cpu().double()[enough]
+            pose = rigid_motion(still, shown)
+            moved = self.spread((pose.inverse().apply(shown) - still).float()).double()
+            found[enough] = pose.apply(moved + self.neutral.double()).float()
         return found.to(points.device)
 
     def _check(self, points: Tensor, seen: Tensor) -> None:

@@ -15,7 +15,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
 from torchface.progress import Progress
 from torchface.registration import register_corpus
-from torchface.workflows.evaluate.animated_meshes import AnimatedMesh
+from torchface.workflows.animated_meshes import AnimatedMesh
 
 NEAR = 2.0
 """Millimetres; a vertex that came to lie further from the scan, or on its border, only followed its neighbours."""

@@ -1,0 +1,78 @@
+"""A small actor: the performer's face with folds that deepen as it moves, learned, and a take of it in every form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import zoo
+from torchface.attachment import Attachment
+from torchface.enhancement import EnhancementModel
+from torchface.io import save_rig, save_take
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.take import Take, Track
+
+FPS = 30.0
+FRAMES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """Files of one actor.
+
+    Args:
+        model: name of the folder of the learned model.
+        rig: coarse, of the model's topology.
+        mesh: at rest.
+        weights: of the take, (T,N), from rest.
+        attachment: of 60 markers on the rig.
+        folder: of all files.
+    """
+
+    model: str
+    rig: BlendshapeRig
+    mesh: Mesh
+    weights: Tensor
+    attachment: Attachment
+    folder: Path
+
+    @property
+    def frames(self) -> Tensor:
+        """The take's meshes, coarse."""
+        return self.rig(self.weights)
+
+
+def folded(frames: Tensor, neutral: Tensor) -> Tensor:
+    """Frames with folds across the face that deepen with the motion below them."""
+    amount = (frames - neutral).norm(dim=-1, keepdim=True).clamp(max=6.0) / 6
+    return frames + amount * 0.4 * torch.sin(neutral[:, 1:2]) * torch.tensor([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="package")
+def actor(tmp_path_factory: pytest.TempPathFactory) -> Actor:
+    folder = tmp_path_factory.mktemp("actor")
+    whole = performer(texture=False)
+    assert whole.neutral.annotations is not None
+    rig = whole.part(whole.neutral.annotations.regions["face"])
+    generator = torch.Generator().manual_seed(0)
+    extremes = torch.rand(4, len(rig.names), generator=generator) ** 5
+    ramp = torch.tensor([0.0, 0.5, 1.0, 0.5])
+    learned = (extremes[:, None] * ramp[:, None]).flatten(0, 1)
+    with torch.no_grad():
+        database = folded(rig(learned), rig.vertices)
+    sequences = torch.arange(4).repeat_interleave(4)
+    model = EnhancementModel.fit(database, rig.neutral.faces, sequences, rig.vertices, fps=FPS, rank=8)
+    zoo.save_model(model, folder / "model", licence="MIT", data="made", metrics={}, recipe="here")
+    weights = torch.linspace(0, 1, FRAMES)[:, None] * (0.6 * extremes[0] + 0.4 * extremes[1])
+    attachment = place_markers(rig, 60)
+    save_rig(rig, folder / "rig.glb")
+    attachment.save(folder / "attachment.json")
+    save_take(Take(FPS, weights=Track(rig.names, weights[..., None])), folder / "weights.csv")
+    return Actor(str(folder / "model"), rig, rig.neutral, weights, attachment, folder)

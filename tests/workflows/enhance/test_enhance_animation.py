@@ -1,0 +1,300 @@
+"""Every kind of input through the whole job; killed runs, full disks, and input that does not fit."""
+
+from __future__ import annotations
+
+import errno
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.workflows.enhance.conftest import FPS, FRAMES, Actor
+from torchface import zoo
+from torchface.attachment import Attachment
+from torchface.enhancement import EnhancementModel
+from torchface.errors import (
+    AlignmentError,
+    FileFormatError,
+    NameMismatchError,
+    ShapeError,
+    TopologyError,
+    ValueRangeError,
+)
+from torchface.geometry.rotations import rotation_matrix
+from torchface.geometry.similarity import similarity_transform
+from torchface.io import MeshSequence, load_rig, load_take, save_animation, save_mesh, save_take
+from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io.landmarks.picks import Correspondences, save_correspondences
+from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
+from torchface.mesh import Mesh
+from torchface.progress import silent
+from torchface.registration import Registration
+from torchface.take import Take, Track
+from torchface.workflows.enhance import enhanced_frames, head_correspondence
+from torchface.workflows.enhance.animation_targets import animation_targets
+from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
+from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
+from torchface.workflows.enhance.enhance_page import write_enhance_page
+
+PLAIN = EnhanceSettings(glb=False, video=False)
+
+
+@pytest.fixture(scope="module")
+def expected(actor: Actor) -> torch.Tensor:
+    with torch.no_grad():
+        return zoo.get_model(Path(actor.model)).enhance(actor.frames).vertices
+
+
+def written(path: Path, frames: torch.Tensor, faces: torch.Tensor) -> Path:
+    with MeshSequenceWriter(path, len(frames), frames.shape[1], faces) as writer:
+        writer.append(frames)
+    return path
+
+
+def coarse(actor: Actor, path: Path, state: Path, **given: Any) -> Any:
+    return read_coarse(path, actor.mesh, InputSettings(**given), state, silent)
+
+
+def shuffled(actor: Actor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Another order of the vertices, and the triangles in it."""
+    order = torch.randperm(len(actor.mesh.vertices), generator=torch.Generator().manual_seed(1))
+    return order, order.argsort()[actor.mesh.faces]
+
+
+def test_weights_become_meshes_an_animation_a_video_and_a_report(
+    actor: Actor, expected: torch.Tensor, tmp_path: Path, coarse_figures: None
+) -> None:
+    settings = EnhanceSettings(InputSettings(rig=actor.folder / "rig.glb"), meshes="ply")
+    done = enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    found = MeshSequence(tmp_path / "enhanced.safetensors").read(0, FRAMES)
+    torch.testing.assert_close(found, expected, atol=2e-3, rtol=0)
+    rig, take = load_rig(tmp_path / "enhanced.glb"), played(tmp_path / "enhanced.glb")
+    torch.testing.assert_close(rig(take), found, atol=2e-3, rtol=0)
+    assert len(list((tmp_path / "meshes").glob("*.ply"))) == FRAMES
+    page = write_enhance_page(done, tmp_path, height=64).read_text()
+    assert "comparison.mp4" in page
+    assert "frames.png" in page
+    assert f"{FRAMES} frames of meshes of the model&#x27;s topology" in page
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["residual_mm"] < 0.01
+    assert summary["frames"] == FRAMES
+    assert summary["fps"] == FPS
+
+
+def played(path: Path) -> torch.Tensor:
+    take = read_gltf_weights(path)
+    assert take is not None
+    assert take.weights is not None
+    return take.weights.values[..., 0]
+
+
+def test_all_files_of_one_animation_give_the_same(actor: Actor, tmp_path: Path) -> None:
+    frames = actor.frames
+    sequence = written(tmp_path / "meshes.safetensors", frames, actor.mesh.faces)
+    save_animation(actor.rig, load_take(actor.folder / "weights.csv"), tmp_path / "animation.glb")
+    for folder in ("objs", "tracked"):
+        (tmp_path / folder).mkdir()
+    for t in range(FRAMES):
+        save_mesh(Mesh(frames[t], actor.mesh.faces), tmp_path / "objs" / f"frame_{t:02d}.obj")
+    save_animation(actor.rig, load_take(actor.folder / "weights.csv"), tmp_path / "tracked" / "animation.glb")
+    (tmp_path / "tracked" / "summary.json").write_text("{}")
+    for path in (sequence, tmp_path / "animation.glb", tmp_path / "objs", tmp_path / "tracked"):
+        found = coarse(actor, path, tmp_path)
+        torch.testing.assert_close(found.read(3, 7), frames[3:7], atol=2e-3, rtol=0)
+        assert found.fps == FPS
+    assert "30 a second are assumed" in " ".join(coarse(actor, sequence, tmp_path).notes)
+
+
+def test_markers_in_any_place_move_the_face_as_the_rig_did(actor: Actor, tmp_path: Path) -> None:
+    turn = rotation_matrix(torch.tensor([0.1, 0.6, -0.2]))
+    points = actor.attachment.on(actor.mesh.faces, actor.frames)
+    points[2, 5:9] = torch.nan
+    points[6] = torch.nan
+    markers = Track(actor.attachment.labels or (), points @ turn.T + torch.tensor([40.0, 1500.0, 7.0]))
+    save_take(Take(FPS, markers=markers), tmp_path / "take.c3d")
+    given = {"attachment": actor.folder / "attachment.json", "rig": actor.folder / "rig.glb"}
+    rows = [t for t in range(FRAMES) if t != 6]
+    for own in ({**given, "neutral": 0}, {**given, "rig": None}):
+        found = coarse(actor, tmp_path / "take.c3d", tmp_path, **own)
+        moved, true = (actor.attachment.on(actor.mesh.faces, x)[rows] for x in (found.read(0, FRAMES), actor.frames))
+        laid = similarity_transform(moved, true, scale=False).apply(moved)
+        assert float((laid - true).norm(dim=-1).mean()) < 0.3
+        steps, wanted = (x[:, 1:6] - x[:, :5] for x in (found.read(0, 6)[None], actor.frames[None, :6]))
+        assert float((steps - wanted).norm(dim=-1).mean()) < 0.4 * float(wanted.norm(dim=-1).mean())
+        assert any("1 of 12 frames (the first 6) show fewer than 12 markers" in line for line in found.notes)
+        assert found.shown(2, 3)[0, 5:9].isnan().all()
+
+
+@pytest.mark.parametrize("ending", ["csv", "json"])
+def test_pairs_lay_another_topology_on_the_model(actor: Actor, tmp_path: Path, ending: str) -> None:
+    order, faces = shuffled(actor)
+    path = written(tmp_path / "other.safetensors", actor.frames[:, order] + torch.tensor([5.0, -90.0, 0.0]), faces)
+    chosen = torch.arange(0, len(order), 9)
+    pairs = tmp_path / f"pairs.{ending}"
+    if ending == "csv":
+        rows = [f"{i},{int(order[i])}" for i in chosen.tolist()]
+        pairs.write_text("\n".join(["input,model", *rows]))
+    else:
+        labels = tuple(f"p{i}" for i in chosen.tolist())
+        save_correspondences(Correspondences(chosen, actor.mesh.vertices[order[chosen]], labels), pairs)
+    found = coarse(actor, path, tmp_path, pairs=pairs)
+    error = found.read(0, FRAMES) - actor.frames
+    assert float(error.norm(dim=-1).mean()) < 0.1
+    assert "pairs of pairs" in " ".join(found.notes)
+
+
+def test_registration_is_asked_once(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order, faces = shuffled(actor)
+    path = written(tmp_path / "other.safetensors", actor.frames[:, order], faces)
+    asked = []
+
+    def register(head: Mesh, model: Mesh, *rest: Any, **more: Any) -> Registration:
+        asked.append(len(head.vertices))
+        laid = model.vertices[order]
+        pose = similarity_transform(head.vertices[None].double(), laid[None].double())
+        known = torch.ones(len(laid), dtype=torch.bool)
+        return Registration(Mesh(laid, head.faces), pose, torch.zeros(len(laid)), known, None)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(head_correspondence, "register", register)
+    for _ in range(2):
+        found = coarse(actor, path, tmp_path)
+        error = found.read(0, FRAMES) - actor.frames
+        assert float(error.norm(dim=-1).mean()) < 0.1
+    assert asked == [len(order)]
+
+
+@pytest.fixture
+def killed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Has the third piece of four frames end the run; gives the frames that went through the model."""
+    monkeypatch.setattr(enhanced_frames, "_MOST_A_PIECE", 4)
+    seen: list[int] = []
+    whole = EnhancementModel.enhance
+
+    def enhance(self: EnhancementModel, frames: torch.Tensor, previous: torch.Tensor | None = None) -> Any:
+        if len(seen) == 8:
+            seen.append(0)
+            raise KeyboardInterrupt
+        seen.extend([1] * len(frames))
+        return whole(self, frames, previous)
+
+    monkeypatch.setattr(EnhancementModel, "enhance", enhance)
+    return seen
+
+
+def test_a_killed_run_goes_on(actor: Actor, expected: torch.Tensor, tmp_path: Path, killed: list[int]) -> None:
+    settings = replace(PLAIN, given=InputSettings(rig=actor.folder / "rig.glb"))
+    with pytest.raises(KeyboardInterrupt):
+        enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    assert not (tmp_path / "enhanced.safetensors").exists()
+    done = enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    assert done.frames.enhanced == FRAMES - 8
+    torch.testing.assert_close(done.frames.sequence.read(0, FRAMES), expected, atol=2e-3, rtol=0)
+    assert done.frames.distances.shape == (FRAMES, len(done.model.regions.names))
+    again = enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    assert again.frames.enhanced == 0
+    torch.testing.assert_close(again.frames.distances, done.frames.distances)
+    other = enhance_animation(
+        written(tmp_path / "other.safetensors", actor.frames[:4], actor.mesh.faces), actor.model, tmp_path, PLAIN
+    )
+    assert other.frames.enhanced == 4
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_half(
+    actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(PLAIN, given=InputSettings(rig=actor.folder / "rig.glb"))
+    with monkeypatch.context() as patch:
+        patch.setattr(enhanced_frames.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
+        with pytest.raises(FileFormatError, match=r"found 0.0 GB free, expected 0.0 for 12 frames"):
+            enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    monkeypatch.setattr(enhanced_frames, "_MOST_A_PIECE", 4)
+    appended = MeshSequenceWriter.append
+
+    def full(self: MeshSequenceWriter, vertices: torch.Tensor) -> None:
+        if self.done >= 4:
+            self._file.close()
+            raise FileFormatError(f"{self.path}: cannot be written ({errno.errorcode[errno.ENOSPC]})")
+        appended(self, vertices)
+
+    monkeypatch.setattr(MeshSequenceWriter, "append", full)
+    with pytest.raises(FileFormatError, match=r"enhanced.safetensors: cannot be written"):
+        enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
+    assert not (tmp_path / "enhanced.safetensors").exists()
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_long_animations_are_shown_by_components(actor: Actor, tmp_path: Path) -> None:
+    sequence = MeshSequence(written(tmp_path / "meshes.safetensors", actor.frames, actor.mesh.faces))
+    each = 24 * len(actor.mesh.vertices) / 1e6
+    targets = animation_targets(sequence, actor.mesh.vertices, 4.5 * each, silent)
+    assert targets.kind == "components"
+    assert len(targets.deltas) <= 4
+    shown = actor.mesh.vertices + torch.einsum("tn,nvc->tvc", targets.weights, targets.deltas)
+    off = (shown - actor.frames).square().sum(-1).mean().sqrt()
+    assert float(off) == pytest.approx(targets.rms, rel=1e-2, abs=1e-4)
+    assert float(off) < 0.05  # two extremes span the take
+    with pytest.raises(ValueRangeError, match="expected at least"):
+        animation_targets(sequence, actor.mesh.vertices, 0.5 * each, silent)
+
+
+def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> None:
+    faces = actor.mesh.faces
+    large = written(tmp_path / "large.safetensors", 10 * actor.frames, faces)
+    with pytest.raises(AlignmentError, match=r"10\.\d times too large"):
+        coarse(actor, large, tmp_path)
+    broken = actor.frames.clone()
+    broken[5, 3] = torch.nan
+    with pytest.raises(ValueRangeError, match="NaN or infinity in frame 5"):
+        coarse(actor, written(tmp_path / "nan.safetensors", broken, faces), tmp_path)
+    order, _ = shuffled(actor)
+    with pytest.raises(AlignmentError, match="stand in another order"):
+        coarse(actor, written(tmp_path / "order.safetensors", actor.frames[:, order], faces), tmp_path)
+    wider = actor.frames * torch.tensor([1.15, 1.0, 0.9])
+    notes = coarse(actor, written(tmp_path / "wider.safetensors", wider, faces), tmp_path).notes
+    assert any(line.startswith("warning: ") and "another person" in line for line in notes)
+    with pytest.raises(NameMismatchError, match=r"\(--rig\)"):
+        coarse(actor, actor.folder / "weights.csv", tmp_path)
+    with pytest.raises(ValueRangeError, match="found --attachment and no markers"):
+        coarse(actor, large, tmp_path, attachment=actor.folder / "attachment.json")
+    with pytest.raises(FileFormatError, match="no such file"):
+        coarse(actor, tmp_path / "nothing.glb", tmp_path)
+    few = tmp_path / "few.csv"
+    few.write_text("input,model\n" + "\n".join(f"{i},{i}" for i in range(11)))
+    other = written(tmp_path / "other.safetensors", actor.frames[:, order], shuffled(actor)[1])
+    with pytest.raises(ShapeError, match="found 11 pairs, expected at least 12"):
+        coarse(actor, other, tmp_path, pairs=few)
+
+
+def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None:
+    points = actor.attachment.on(actor.mesh.faces, actor.frames)
+    take, sites = tmp_path / "take.trc", actor.folder / "attachment.json"
+    labels = actor.attachment.labels or ()
+    save_take(Take(FPS, markers=Track(labels, points)), take)
+    with pytest.raises(NameMismatchError, match=r"\(--attachment\)"):
+        coarse(actor, take, tmp_path)
+    eleven = tmp_path / "eleven.json"
+    actor.attachment.select(labels[:11]).save(eleven)
+    with pytest.raises(ShapeError, match="found 11 markers, expected at least 12"):
+        coarse(actor, take, tmp_path, attachment=eleven)
+    foreign = tmp_path / "foreign.json"
+    Attachment(actor.attachment.triangles, actor.attachment.barycentric, labels, None, "9-0123456789abcdef").save(
+        foreign
+    )
+    with pytest.raises(TopologyError, match=r"expected the model's.*\(--rig\)"):
+        coarse(actor, take, tmp_path, attachment=foreign)
+    large = tmp_path / "large.trc"
+    save_take(Take(FPS, markers=Track(labels, 10 * points)), large)
+    with pytest.raises(AlignmentError, match=r"10\.\d times too large.*--unit"):
+        coarse(actor, large, tmp_path, attachment=sites)
+    mixed = tmp_path / "mixed.trc"
+    save_take(Take(FPS, markers=Track(labels, points[:, torch.randperm(60)])), mixed)
+    with pytest.raises(AlignmentError):
+        coarse(actor, mixed, tmp_path, attachment=sites)
+
+
+def test_a_model_of_another_kind_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NameMismatchError, match="expected an EnhancementModel"):
+        enhance_animation(tmp_path / "take.c3d", "shape_prior", tmp_path / "out", PLAIN)

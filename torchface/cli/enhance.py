@@ -1,0 +1,81 @@
+"""``torchface enhance``: a coarse animation gets an actor's wrinkles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
+
+
+def enhance(
+    animation: Annotated[Positional[Path], arg(metavar="INPUT")],
+    *,
+    model: str,
+    out: Path = Path("out/enhanced"),
+    rig: Path | None = None,
+    attachment: Path | None = None,
+    pairs: Path | None = None,
+    part: str | None = None,
+    neutral: int | None = None,
+    fps: float | None = None,
+    labels: Path | None = None,
+    unit: Literal["mm", "cm", "m", "in"] | None = None,
+    flip: Literal["x", "y", "z"] | None = None,
+    meshes: Literal["none", "obj", "ply"] = "none",
+    no_glb: bool = False,
+    glb_megabytes: float = 200.0,
+    no_video: bool = False,
+    height: int = 380,
+    quiet: Quiet = False,
+) -> None:
+    """Enhance a coarse animation with the wrinkles, creases and pores of a captured actor.
+
+    INPUT is markers (.c3d, .trc, .csv, with --attachment), weights (.csv, with --rig), an animated .glb, a mesh
+    sequence (.safetensors), a folder of meshes, a frame each, or the folder of `torchface track`. Meshes of the model's
+    topology pass straight; others are laid on the model by registration, or by --pairs.
+
+    Writes into OUT: enhanced.safetensors (every frame's mesh), enhanced.glb, comparison.mp4, frames.csv (how near the
+    model comes, by region), summary.json and the report index.html. Killed and started again, it goes on where it was.
+
+    Args:
+        animation: What is to be enhanced.
+        model: The actor's model, by name or folder; see `python -m train.enhancement`.
+        out: Folder for everything.
+        rig: The rig that weights move, that meshes belong to, or on which the attachment's markers sit.
+        attachment: Where the markers sit, on the rig or on the model's own mesh, as JSON; at least 12.
+        pairs: Where vertices of the input's topology lie on the model: a .csv with columns input and model, vertex
+            numbers from 0, or a .json of `torchface pick` (input as template, model as scan); at least 12.
+        part: Keep this region of the rig only, such as face.
+        neutral: A frame of the markers with the face at rest; motion counts from it. From the sites if absent.
+        fps: Frames a second of meshes; 30 if absent.
+        labels: What the take's labels are called in the attachment; see `torchface solve`.
+        unit: What the markers' coordinates are in; what the file says if absent.
+        flip: Negate this axis of the markers' coordinates.
+        meshes: Also write every frame as a mesh file of this kind.
+        no_glb: Do not write enhanced.glb.
+        glb_megabytes: What its morph targets may take; a long animation is shown by principal components.
+        no_video: Do not write comparison.mp4.
+        height: Of each view of a face in the report, pixels.
+        quiet: Show no progress.
+    """
+    from torchface.files.job_lock import job_lock
+    from torchface.number_checks import checked_count
+    from torchface.viz.figures.face_views import PICTURE_HEIGHTS
+    from torchface.workflows.enhance.coarse_input import InputSettings
+    from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
+    from torchface.workflows.enhance.enhance_page import write_enhance_page
+    from torchface.workflows.marker_input import MarkerOptions
+
+    checked_count("--height", height, *PICTURE_HEIGHTS)
+    given = InputSettings(rig, attachment, pairs, part, neutral, fps, MarkerOptions(unit, labels, None, flip))
+    settings = EnhanceSettings(given, meshes, not no_glb, glb_megabytes, not no_video)
+    with job_lock(out), progress_bars(quiet) as progress:
+        done = enhance_animation(animation, model, out, settings, progress)
+        progress("writing the report")
+        page = write_enhance_page(done, out, height)
+    print_lines(done.lines())
+    for path in (*done.products.values(), page):
+        print_path(path)

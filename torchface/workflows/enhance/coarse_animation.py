@@ -1,0 +1,144 @@
+"""What is to be enhanced: an animation in the vertices of the model's dense mesh, whatever it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import AlignmentError, ValueRangeError
+from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, similarity_transform
+from torchface.mesh import Mesh
+from torchface.workflows.animated_meshes import AnimatedMesh
+
+DEFAULT_FPS = 30.0
+OTHER_ACTOR_MM, NO_HEAD_MM = 4.0, 20.0
+_SAMPLED = 24
+_UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseAnimation:
+    """An animation of the model's dense mesh, without its fine detail.
+
+    Args:
+        path: where it came from.
+        kind: what that is, in words.
+        count: of frames.
+        read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
+        fps: frames a second.
+        shown: what the file itself holds of these frames, in the same place: (t,N,3), NaN where a point was not seen.
+        shown_faces: triangles of that, (G,3); None where it is points.
+        residual: root mean square distance of its face at rest from the model's, laid on one another, millimetres; None
+            where it holds no face at rest.
+        notes: lines for people to read; warnings begin with ``warning: ``.
+    """
+
+    path: Path
+    kind: str
+    count: int
+    read: Callable[[int, int], Tensor]
+    fps: float
+    shown: Callable[[int, int], Tensor]
+    shown_faces: Tensor | None
+    residual: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
+    """An animation that has the model's vertices and triangles already.
+
+    Raises:
+        AlignmentError: it is of another size, or another head.
+        ValueRangeError: a frame holds NaN.
+    """
+    step = max(1, animated.count // _SAMPLED)
+    some = torch.cat([animated.read(t, t + 1) for t in range(0, animated.count, step)])
+    check_finite(some, animated.path, step)
+    at_rest = animated.neutral.vertices[None] if animated.rig is not None else some
+    target = model.vertices.expand_as(at_rest)
+    check_scale(float((_size(target) / _size(at_rest).clamp(min=1e-9)).median()), animated.path)
+    laid = similarity_transform(at_rest, target)
+    left = (laid.apply(at_rest) - target).square().sum(-1).mean(-1).sqrt()
+    residual = float(left.min())  # without a rest pose, of the frame that comes nearest to one
+    notes = residual_notes(residual, animated.path)
+
+    def read(begin: int, end: int) -> Tensor:
+        vertices = animated.read(begin, end).float()
+        check_finite(vertices, animated.path, 1, begin)
+        return vertices
+
+    return CoarseAnimation(
+        animated.path,
+        "meshes of the model's topology",
+        animated.count,
+        read,
+        known_rate(animated, fps),
+        read,
+        model.faces,
+        residual,
+        (*rate_notes(animated, fps), *notes),
+    )
+
+
+def _size(vertices: Tensor) -> Tensor:
+    """Root mean square distance from the middle, which no order of the vertices changes, (t,)."""
+    return (vertices - vertices.mean(1, keepdim=True)).square().sum(-1).mean(-1).sqrt()
+
+
+def known_rate(animated: AnimatedMesh, fps: float | None) -> float:
+    """Frames a second: as asked for, else as the file has them, else 30."""
+    return fps or animated.fps or DEFAULT_FPS
+
+
+def rate_notes(animated: AnimatedMesh, fps: float | None) -> list[str]:
+    """Says where a rate was assumed."""
+    if fps is not None or animated.fps is not None:
+        return []
+    return [f"{animated.path.name} has no frame rate; {DEFAULT_FPS:g} a second are assumed (--fps)"]
+
+
+def check_finite(vertices: Tensor, path: Path, step: int, begin: int = 0) -> None:
+    """Raises ``ValueRangeError`` for vertices (t,N,3) that hold NaN or infinity, every ``step``-th frame from one."""
+    wrong = ~torch.isfinite(vertices).all(-1)
+    if wrong.any():
+        frame = int(wrong.any(-1).nonzero()[0, 0])
+        raise ValueRangeError(
+            f"{path}: found NaN or infinity in frame {begin + frame * step} ({int(wrong[frame].sum())} of "
+            f"{wrong.shape[1]} vertices), expected numbers; leave such frames out, or repair them first"
+        )
+
+
+def check_scale(scale: float, path: Path) -> None:
+    """Raises ``AlignmentError`` where an input had to be scaled by more than heads differ to lie on the model."""
+    if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
+        return
+    unit = next((name for factor, name in _UNITS if 0.75 < scale / factor < 1.33), None)
+    size = f"{scale:.3g} times too small" if scale > 1 else f"{1 / scale:.3g} times too large"
+    why = f"it seems to be in {unit}" if unit else "its unit is another one, or it is no head of this model"
+    raise AlignmentError(
+        f"{path}: found a head {size} for the model, expected millimetres and a factor of {MIN_HEAD_SCALE} to "
+        f"{MAX_HEAD_SCALE}; {why} (--unit for markers; convert meshes first)"
+    )
+
+
+def residual_notes(residual: float, path: Path) -> list[str]:
+    """What the distance of an input's face at rest from the model's says.
+
+    Raises:
+        AlignmentError: they are not of one head, or their vertices stand in another order.
+    """
+    if residual > NO_HEAD_MM:
+        raise AlignmentError(
+            f"{path}: found vertices {residual:.1f} mm (root mean square) from the model's at rest, laid on one "
+            f"another, expected at most {NO_HEAD_MM:g}; they stand in another order, or it is another head"
+        )
+    if residual > OTHER_ACTOR_MM:
+        return [
+            f"warning: at rest the vertices lie {residual:.1f} mm (root mean square) from the model's; it seems to be "
+            "another person, whose wrinkles will be the model's"
+        ]
+    return []

@@ -1,0 +1,259 @@
+"""The whole job: read, enhance, write meshes, an animated ``.glb``, a video, tables and a summary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from torchface import zoo
+from torchface.enhancement import EnhancementModel
+from torchface.errors import NameMismatchError
+from torchface.files.content_keys import content_key
+from torchface.files.documents import write_json
+from torchface.files.job_lock import within_job
+from torchface.files.whole_files import all_or_none, make_folder
+from torchface.io import save_mesh
+from torchface.io.tables.csv_table import write_table
+from torchface.io.video import write_video
+from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
+from torchface.workflows.enhance.animation_targets import MEGABYTES, animation_targets, write_targets
+from torchface.workflows.enhance.coarse_animation import CoarseAnimation
+from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
+from torchface.workflows.enhance.enhance_views import drawn_frames, framed_model
+from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames, enhance_frames
+
+STATE = "state"
+GLB, VIDEO, FRAMES, SUMMARY, MESHES = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json", "meshes"
+_METHOD = "enhance/1"
+_FORMAT = "torchface.enhance-summary/1"
+_MANY_OUTSIDE = 0.25
+_BADLY_SHOWN_MM = 0.1
+
+
+@dataclass(frozen=True)
+class EnhanceSettings:
+    """What is written.
+
+    Args:
+        given: how the input is read.
+        meshes: also every frame as a mesh file of this kind.
+        glb: the animated ``.glb``.
+        megabytes: that its morph targets may take.
+        video: the video of input and result side by side.
+    """
+
+    given: InputSettings = field(default_factory=InputSettings)
+    meshes: Literal["none", "obj", "ply"] = "none"
+    glb: bool = True
+    megabytes: float = MEGABYTES
+    video: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Enhanced:
+    """What came of an animation.
+
+    Args:
+        animation: what was enhanced.
+        model: the actor's.
+        model_name: as it was asked for.
+        frames: the result.
+        mesh: the model's neutral, framed by what moves.
+        products: files by what they are.
+        notes: lines for people to read; warnings begin with ``warning: ``.
+    """
+
+    animation: CoarseAnimation
+    model: EnhancementModel
+    model_name: str
+    frames: EnhancedFrames
+    mesh: Mesh
+    products: dict[str, Path]
+    notes: tuple[str, ...]
+
+    @property
+    def outside_share(self) -> float:
+        """Of the frames, those that the database does not hold in some region."""
+        return float(self.frames.outside.any(1).float().mean())
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        count, vertices = self.animation.count, len(self.model.neutral)
+        lines = [
+            f"{count} frames of {self.animation.kind} on {vertices} vertices, {self.animation.fps:g} a second; model "
+            f"{self.model_name}, {len(self.model.sequences)} frames, {len(self.model.regions.names)} regions",
+            f"{self.outside_share:.0%} of the frames are outside of what the model has seen in some region"
+            + (" (there the smooth input keeps the nearest detail)" if self.outside_share else ""),
+        ]
+        if self.frames.enhanced:
+            rate = self.frames.enhanced / max(self.frames.seconds, 1e-9)
+            lines.append(f"{self.frames.enhanced} frames enhanced in this run, {rate:.2f} a second")
+        else:
+            lines.append("all frames were enhanced by an earlier run")
+        return [*lines, *self.notes]
+
+
+def load_model(name_or_path: str) -> EnhancementModel:
+    """An actor's model by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    model = zoo.get_model(name_or_path)
+    if not isinstance(model, EnhancementModel):
+        raise NameMismatchError(
+            f"--model: found {name_or_path}, a {type(model).__name__}, expected an EnhancementModel "
+            "(python -m train.enhancement makes one)"
+        )
+    return model
+
+
+def enhance_animation(
+    path: Path,
+    model_name: str,
+    out: Path,
+    settings: EnhanceSettings = EnhanceSettings(),
+    progress: Progress | None = None,
+) -> Enhanced:
+    """Reads, enhances, writes; see ``torchface enhance --help`` for the arguments.
+
+    Writes ``enhanced.safetensors``, ``enhanced.glb``, ``comparison.mp4``, ``frames.csv``, ``summary.json``, ``meshes/``
+    and ``colors.safetensors`` where asked for or known;
+    :func:`torchface.workflows.enhance.enhance_page.write_enhance_page` makes the report.
+
+    Raises:
+        TorchfaceError: a file is broken or does not fit the others, or the disk is full.
+    """
+    with within_job(out):
+        return _enhance(path, model_name, out, settings, progress or silent)
+
+
+def _enhance(path: Path, model_name: str, out: Path, settings: EnhanceSettings, progress: Progress) -> Enhanced:
+    progress("reading the model")
+    model = load_model(model_name)
+    neutral = Mesh(model.neutral, model.faces)
+    state = make_folder(out / STATE)
+    animation = read_coarse(path, neutral, settings.given, state, progress)
+    given = settings.given
+    key = content_key(
+        _METHOD, input=path, rig=given.rig, attachment=given.attachment, pairs=given.pairs, given=given, model=model
+    )
+    found = enhance_frames(animation, model, out, state, key, progress)
+    mesh = framed_model(model)
+    products, notes = {"meshes, every frame": out / SEQUENCE}, list(animation.notes)
+    if found.colors is not None:
+        products["vertex colours, every frame"] = found.colors.path
+    share = float(found.outside.any(1).float().mean())
+    if share > _MANY_OUTSIDE:
+        notes.append(
+            f"warning: {share:.0%} of the frames are unlike any the model has seen, so their detail is the nearest it "
+            "has; a take of more expressions, or another actor's model, would do better"
+        )
+    if settings.meshes != "none":
+        products["meshes, a file a frame"] = _write_meshes(found, mesh, out / MESHES, settings.meshes, progress)
+    if settings.glb:
+        products["animation"] = out / GLB
+        notes.append(_write_glb(found, mesh, animation.fps, out / GLB, settings.megabytes, progress))
+    if settings.video:
+        products["video"] = out / VIDEO
+        _write_video(animation, model, found, mesh, out / VIDEO, progress)
+    done = Enhanced(animation, model, model_name, found, mesh, products, tuple(notes))
+    with all_or_none():
+        _write_tables(done, out)
+    return done
+
+
+def _write_meshes(found: EnhancedFrames, mesh: Mesh, folder: Path, ending: str, progress: Progress) -> Path:
+    """A file a frame; those that are newer than the frames themselves are an earlier run's, and right."""
+    make_folder(folder)
+    count, made = len(found.sequence), found.sequence.path.stat().st_mtime_ns
+    digits = max(4, len(str(count)))
+    for t in range(count):  # a file a frame
+        path = folder / f"frame_{t:0{digits}d}.{ending}"
+        if not (path.is_file() and path.stat().st_mtime_ns > made):
+            colors = None if found.colors is None else found.colors.read(t, t + 1)[0].clamp(0, 1)
+            save_mesh(Mesh(found.sequence.read(t, t + 1)[0], mesh.faces, colors=colors), path)
+        progress("writing meshes", t + 1, count)
+    return folder
+
+
+def _write_glb(found: EnhancedFrames, mesh: Mesh, fps: float, path: Path, megabytes: float, progress: Progress) -> str:
+    """Writes it, and says what it holds."""
+    targets = animation_targets(found.sequence, mesh.vertices, megabytes, progress)
+    progress("writing the animation")
+    colors = None if found.colors is None else found.colors.read(0, 1)[0].clamp(0, 1)
+    write_targets(targets, Mesh(mesh.vertices, mesh.faces, colors=colors), fps, path)
+    size = path.stat().st_size / 1e6
+    if targets.kind == "frames":
+        return f"{path.name}: {size:.0f} MB, a sparse morph target a frame, exact"
+    told = (
+        f"{path.name}: {size:.0f} MB, {len(targets.deltas)} morph targets (principal components) for "
+        f"{len(found.sequence)} frames, {targets.rms:.3f} mm from them (root mean square; worst frame "
+        f"{targets.largest:.3f})"
+    )
+    if targets.rms > _BADLY_SHOWN_MM:
+        told = f"warning: {told}; --glb-megabytes above {megabytes:g} would show more, {SEQUENCE} holds all"
+    return told
+
+
+def _write_video(
+    animation: CoarseAnimation,
+    model: EnhancementModel,
+    found: EnhancedFrames,
+    mesh: Mesh,
+    path: Path,
+    progress: Progress,
+) -> None:
+    count, step, drawn = drawn_frames(animation, model, found, mesh)
+
+    def told():  # type: ignore[no-untyped-def]
+        for number, picture in enumerate(drawn, 1):
+            yield picture
+            progress("drawing the video", number, count)
+
+    write_video(told(), path, animation.fps / step)
+
+
+def _write_tables(done: Enhanced, out: Path) -> None:
+    names = done.model.regions.names
+    distances, outside = done.frames.distances.tolist(), done.frames.outside.tolist()
+    rows = [
+        [str(t), *(f"{value:.5g}" for value in distances[t]), *(str(int(value)) for value in outside[t])]
+        for t in range(len(distances))
+    ]
+    write_table(out / FRAMES, ["frame", *(f"distance_{n}" for n in names), *(f"outside_{n}" for n in names)], rows)
+    summary = {
+        "format": _FORMAT,
+        "input": done.animation.path.name,
+        "kind": done.animation.kind,
+        "model": done.model_name,
+        "frames": done.animation.count,
+        "fps": done.animation.fps,
+        "vertices": len(done.model.neutral),
+        "residual_mm": done.animation.residual,
+        "outside_share": done.outside_share,
+        "outside_share_by_region": dict(zip(names, done.frames.outside.float().mean(0).tolist(), strict=True)),
+        "median_distance_by_region": dict(zip(names, done.frames.distances.median(0).values.tolist(), strict=True)),
+        "frames_enhanced": done.frames.enhanced,
+        "seconds": done.frames.seconds,
+        "notes": list(done.notes),
+        "files": {what: path.name for what, path in done.products.items()},
+    }
+    write_json(out / SUMMARY, summary)
+
+
+def spread_frames(done: Enhanced, count: int) -> list[int]:
+    """Frames to show: those in which the result differs most from the neutral, spread over the animation."""
+    total = done.animation.count
+    rows = torch.linspace(0, total - 1, min(total, 4 * count)).round().long().unique()
+    step = max(1, len(done.mesh.vertices) // 4000)
+    moved = torch.stack(
+        [done.frames.sequence.read(t, t + 1)[0, ::step] - done.mesh.vertices[::step] for t in rows.tolist()]
+    )
+    moved = (moved - moved.mean(1, keepdim=True)).norm(dim=-1).mean(-1)
+    best = [part[moved[part].argmax()] for part in torch.arange(len(rows)).tensor_split(count) if len(part)]
+    return [int(rows[i]) for i in best]

@@ -1,0 +1,163 @@
+"""Frame after frame through the model onto the disk; a run that was killed goes on behind what is there."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.enhancement import EnhancementModel
+from torchface.errors import FileFormatError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.whole_files import make_folder
+from torchface.io import MeshSequence
+from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
+from torchface.progress import Progress
+from torchface.workflows.enhance.coarse_animation import CoarseAnimation
+
+SEQUENCE, COLORS = "enhanced.safetensors", "colors.safetensors"
+_VALUES_A_PIECE = 2**23
+_MOST_A_PIECE = 16
+
+
+@dataclass(frozen=True, eq=False)
+class EnhancedFrames:
+    """What came of an animation.
+
+    Args:
+        sequence: the enhanced meshes, on disk.
+        colors: their vertex colours, on disk; None where the model has none.
+        distances: of each region from the database, relative to the database's own spread, (T,R).
+        outside: frames and regions that the database does not hold, (T,R) bool.
+        seconds: that the frames took which this run enhanced, and how many these were.
+    """
+
+    sequence: MeshSequence
+    colors: MeshSequence | None
+    distances: Tensor
+    outside: Tensor
+    seconds: float = 0.0
+    enhanced: int = 0
+
+
+def piece_size(vertices: int) -> int:
+    """How many frames go through the model at once."""
+    return max(1, min(_MOST_A_PIECE, _VALUES_A_PIECE // (3 * vertices)))
+
+
+def check_space(out: Path, frames: int, vertices: int, colors: bool) -> None:
+    """Raises ``FileFormatError`` where the disk has no room for an animation, before any work."""
+    wanted = 12 * frames * vertices * (2 if colors else 1)
+    free = shutil.disk_usage(out).free + sum(
+        found.stat().st_size for name in (SEQUENCE, COLORS) for found in out.glob(f"{name}*")
+    )
+    if free < wanted:
+        raise FileFormatError(
+            f"{out}: found {free / 1e9:.1f} GB free, expected {wanted / 1e9:.1f} for {frames} frames of {vertices} "
+            "vertices; make room, or write to another disk (--out)"
+        )
+
+
+def enhance_frames(
+    animation: CoarseAnimation, model: EnhancementModel, out: Path, state: Path, key: str, progress: Progress
+) -> EnhancedFrames:
+    """Enhances an animation into files of a folder.
+
+    Args:
+        animation: in the model's vertices.
+        model: the actor's.
+        out: the folder of results, held for this run.
+        state: a folder for what a killed run leaves to the next.
+        key: of everything that the frames come from; what another key left is made anew.
+        progress: called with each step and how far it is.
+
+    Raises:
+        FileFormatError: the disk is full; what is finished stays for another run.
+        TorchfaceError: a frame cannot be read.
+    """
+    make_folder(out)
+    make_folder(state)
+    count, vertices = animation.count, len(model.neutral)
+    colored = has_colors(model)
+    distances, outside, previous = [], [], None
+    step, seconds, fresh = piece_size(vertices), 0.0, 0
+    with (
+        _Output(out / SEQUENCE, count, model, key) as meshes,
+        _Output(out / COLORS if colored else None, count, model, key) as colors,
+    ):
+        if meshes.done == 0:
+            check_space(out, count, vertices, colored)
+        for begin in range(0, count, step):
+            end = min(begin + step, count)
+            kept = read_checkpoint(_piece(state, begin), key)
+            if kept is None or min(meshes.done, colors.done) < end:
+                started = time.perf_counter()
+                with torch.no_grad():
+                    found = model.enhance(animation.read(begin, end), previous)
+                    shades = model.colors(found.weights) if colored else None
+                kept = {"distances": found.distances, "outside": found.outside, "previous": found.weights[-1]}
+                write_checkpoint(_piece(state, begin), kept, key)
+                meshes.append(begin, found.vertices)
+                if shades is not None:
+                    colors.append(begin, shades)
+                seconds, fresh = seconds + time.perf_counter() - started, fresh + end - begin
+            distances.append(kept["distances"])
+            outside.append(kept["outside"])
+            previous = kept["previous"]
+            progress("enhancing", end, count)
+    return EnhancedFrames(
+        MeshSequence(out / SEQUENCE),
+        MeshSequence(out / COLORS) if colored else None,
+        torch.cat(distances),
+        torch.cat(outside),
+        seconds,
+        fresh,
+    )
+
+
+def has_colors(model: EnhancementModel) -> bool:
+    """Whether a model knows its actor's colours."""
+    return len(model.mean_color) > 0
+
+
+class _Output:
+    """A mesh sequence that is written, or that an earlier run has finished; or none."""
+
+    def __init__(self, path: Path | None, count: int, model: EnhancementModel, key: str) -> None:
+        self._writer: MeshSequenceWriter | None = None
+        self.done = count
+        if path is None or _is_finished(path, count, key):
+            return
+        self._writer = MeshSequenceWriter(path, count, len(model.neutral), model.faces, key=key)
+        self.done = self._writer.done
+
+    def append(self, begin: int, vertices: Tensor) -> None:
+        """Adds the frames from ``begin`` on that are not there yet."""
+        if self._writer is not None and self.done < begin + len(vertices):
+            self._writer.append(vertices[self.done - begin :])
+            self.done = self._writer.done
+
+    def __enter__(self) -> _Output:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _is_finished(path: Path, count: int, key: str) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        found = MeshSequence(path)
+        return found.key == key and len(found) == count and found.is_whole()
+    except FileFormatError:
+        return False  # made anew
+
+
+def _piece(state: Path, begin: int) -> Path:
+    return state / f"frames_{begin:06d}.safetensors"

@@ -1,0 +1,177 @@
+"""Where the vertices of another topology lie on the model's dense mesh: by registration, or by given pairs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.enhancement.coarse_level import coarse_level
+from torchface.enhancement.propagation import LEAST_POINTS, ThinShell
+from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.io.landmarks.picks import load_correspondences
+from torchface.io.tables.csv_table import TableReader
+from torchface.mesh import Mesh
+from torchface.progress import Progress
+from torchface.registration import register
+from torchface.workflows.enhance.coarse_animation import check_scale, residual_notes
+
+_METHOD = "enhance: correspondence/1"
+_NEAR, _NEAR_BY_PAIRS = 2.0, 6.0
+_MOST_POINTS = 5000
+_COLUMNS = ("input", "model")
+
+
+@dataclass(frozen=True, eq=False)
+class HeadCorrespondence:
+    """How another head lies on the model's.
+
+    Args:
+        pose: from its space to the model's, a batch of one.
+        laid: its vertices at rest, bent onto the model's surface, (N,3), millimetres of the model's space.
+        known: which of them lie on that surface, (N,) bool.
+        residual: root mean square distance between ``laid`` and what the pose alone gives, of the known, millimetres.
+        how: what told, in words.
+    """
+
+    pose: Similarity
+    laid: Tensor
+    known: Tensor
+    residual: float
+    how: str
+
+    def on_model(self, surface: SurfaceIndex, points: Tensor) -> Attachment:
+        """The places (M,) on the model's surface that are nearest to points (M,3) of its space."""
+        found = surface.nearest(points)
+        return Attachment(found.triangle, found.barycentric.float())
+
+    def sparse_points(self, faces: Tensor) -> Tensor:
+        """Numbers of at most 5,000 known vertices, spread evenly, (M,)."""
+        ids = self.known.nonzero()[:, 0]
+        if len(ids) <= _MOST_POINTS:
+            return ids
+        level = coarse_level(self.laid, faces, int(_MOST_POINTS * len(self.known) / len(ids))).vertex_ids
+        return level[self.known[level]][:_MOST_POINTS]
+
+
+def find_correspondence(
+    head: Mesh, model: Mesh, pairs: Path | None, path: Path, kept: Path, progress: Progress
+) -> HeadCorrespondence:
+    """Lays a head at rest on the model's.
+
+    Args:
+        head: of any topology, millimetres.
+        model: the model's neutral.
+        pairs: places known by the user; by registration if absent.
+        path: of the head, for messages.
+        kept: a file that keeps what was found for a later run of the same.
+        progress: called with each step and how far it is.
+
+    Raises:
+        AlignmentError: no pose is found, or it is another head.
+        ShapeError: too few pairs.
+        TorchfaceError: the files do not fit each other.
+    """
+    given = None if pairs is None else load_pairs(pairs, head, model)
+    key = content_key(
+        _METHOD, head=head.vertices, faces=head.faces, model=model.vertices, triangles=model.faces, given=given
+    )
+    found = read_checkpoint(kept, key)
+    if found is None:
+        laid, pose, known = _by_registration(head, model, progress) if given is None else _by_pairs(head, model, *given)
+        found = {"laid": laid.float(), "known": known, **{name: part.double() for name, part in vars(pose).items()}}
+        write_checkpoint(kept, found, key)
+    pose = Similarity(found["scale"], found["rotation"], found["translation"])
+    check_scale(float(pose.scale[0]), path)
+    rigid = pose.apply(head.vertices.double())[0]
+    known = found["known"]
+    residual = float((found["laid"].double() - rigid)[known].square().sum(-1).mean().sqrt())
+    how = "registration" if pairs is None else f"{len(given[0]) if given else 0} pairs of {pairs.name}"
+    return HeadCorrespondence(pose, found["laid"], known, residual, how)
+
+
+def of_one_topology(head: Mesh, model: Mesh) -> HeadCorrespondence:
+    """A head whose vertices are the model's, in any place."""
+    own, target = head.vertices.double(), model.vertices.double()
+    pose = similarity_transform(own[None], target[None])
+    residual = float((pose.apply(own[None])[0] - target).square().sum(-1).mean().sqrt())
+    return HeadCorrespondence(pose, model.vertices, torch.ones(len(own), dtype=torch.bool), residual, "its topology")
+
+
+def correspondence_notes(found: HeadCorrespondence, path: Path) -> list[str]:
+    """Lines for people to read; see :func:`~torchface.workflows.enhance.coarse_animation.residual_notes`."""
+    share = float(found.known.float().mean())
+    return [
+        f"{path.name}: {int(found.known.sum())} of {len(found.known)} vertices ({share:.0%}) have a place on the "
+        f"model by {found.how}; scaled by {float(found.pose.scale[0]):.3f}, bent by {found.residual:.2f} mm (root mean "
+        "square)",
+        *residual_notes(found.residual, path),
+    ]
+
+
+def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
+    """Vertices of a head and where they lie on the model: numbers (L,) and points (L,3).
+
+    Args:
+        path: ``.csv`` with the columns ``input`` and ``model``, vertex numbers from 0; or ``.json`` as ``torchface
+            pick`` writes it, with the input's mesh for the template and the model's for the scan.
+        head: the input at rest.
+        model: the model at rest.
+
+    Raises:
+        FileFormatError: the file is neither.
+        TopologyError: a vertex is not there.
+        ShapeError: fewer than 12.
+    """
+    if path.suffix.lower() == ".json":
+        picked = load_correspondences(path)
+        picked.check(head)
+        ids, points = picked.vertices, picked.points
+    elif path.suffix.lower() == ".csv":
+        table = TableReader(path)
+        table.require(_COLUMNS)
+        numbers = torch.from_numpy(table.read(only=_COLUMNS).columns(_COLUMNS).copy())
+        if not bool((numbers == numbers.round()).all()):
+            raise FileFormatError(f"{path}: found a vertex number that is not whole, expected numbers from 0")
+        ids, own = numbers.long().unbind(1)
+        for name, rows, count in (("input", ids, len(head.vertices)), ("model", own, len(model.vertices))):
+            if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+                raise TopologyError(
+                    f"{path}: found vertices {int(rows.min())} to {int(rows.max())} in the column {name}, expected 0 "
+                    f"to {count - 1}"
+                )
+        points = model.vertices[own]
+    else:
+        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected .csv or .json")
+    if len(ids) < LEAST_POINTS:
+        raise ShapeError(f"{path}: found {len(ids)} pairs, expected at least {LEAST_POINTS}")
+    if len(ids.unique()) < len(ids):
+        raise ValueRangeError(f"{path}: found a vertex of the input more than once, expected each in one pair")
+    return ids, points.float()
+
+
+def _by_registration(head: Mesh, model: Mesh, progress: Progress) -> tuple[Tensor, Similarity, Tensor]:
+    """The sparse head is bent onto the dense one: that takes seconds, the other way round minutes."""
+    landmarks = None
+    both = [mesh.annotations for mesh in (head, model)]
+    marks = [None if one is None else one.landmarks for one in both]
+    if marks[0] is not None and marks[1] is not None and len(marks[0]) == len(marks[1]):
+        landmarks = marks[0], model.vertices[marks[1]].double()
+    found = register(head, model, landmarks, texture_size=0, progress=progress)
+    return found.mesh.vertices, found.pose, found.matched & (found.distance < _NEAR)
+
+
+def _by_pairs(head: Mesh, model: Mesh, ids: Tensor, points: Tensor) -> tuple[Tensor, Similarity, Tensor]:
+    pose = similarity_transform(head.vertices[ids].double()[None], points.double()[None])
+    posed = pose.apply(head.vertices.double())[0]
+    offset = points - posed[ids].float()
+    laid = posed.float() + ThinShell(posed.float(), head.faces, ids).spread(offset[None])[0]
+    distance = SurfaceIndex(model.vertices, model.faces).nearest(laid).distance
+    return laid, pose, distance < _NEAR_BY_PAIRS

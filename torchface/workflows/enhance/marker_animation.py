@@ -1,0 +1,198 @@
+"""Markers as an animation of the model's dense mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture import align_take
+from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
+from torchface.enhancement.propagation import LEAST_POINTS, ThinShell, rigid_motion
+from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+from torchface.temporal.gap_filling import bridged
+from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale
+from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
+from torchface.workflows.enhance.mesh_input import placed
+from torchface.workflows.marker_input import MarkerOptions, read_markers
+
+_SAME_SIZE = 0.05
+_MOST_AT_REST_MM = 15.0
+_FAR_MM = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSites:
+    """Where markers sit on the model, and the rig that says so.
+
+    Args:
+        attachment: as the user gave it.
+        rig: whose mesh it belongs to; None where that is the model's.
+        correspondence: how the rig's neutral lies on the model's, where there is a rig.
+    """
+
+    attachment: Attachment
+    rig: BlendshapeRig | None = None
+    correspondence: HeadCorrespondence | None = None
+
+    def on_model(self, model: Mesh) -> Attachment:
+        """The same sites on the model's triangles.
+
+        Raises:
+            AlignmentError: a site is not near the model's surface.
+        """
+        if self.rig is None or self.correspondence is None:
+            return self.attachment
+        points = self.attachment.on(self.rig.neutral.faces, self.correspondence.laid)
+        found = SurfaceIndex(model.vertices, model.faces).nearest(points)
+        far = found.distance > _FAR_MM
+        if far.any():
+            names = [label for label, off in zip(self.attachment.labels or (), far.tolist(), strict=True) if off]
+            raise AlignmentError(
+                f"attachment: found the sites of {', '.join(names[:5])} {float(found.distance.max()):.1f} mm from the "
+                f"model's surface, expected at most {_FAR_MM:g}; the rig is another head, or they sit where the model "
+                "has no surface"
+            )
+        barycentric = found.barycentric.float()
+        return Attachment(found.triangle, barycentric, self.attachment.labels, self.attachment.residual)
+
+
+def check_attachment(attachment: Attachment, path: Path, rig: BlendshapeRig | None, model: Mesh) -> bool:
+    """Whether an attachment belongs to the model's own mesh.
+
+    Raises:
+        TopologyError: it belongs to neither the model nor the rig.
+        ShapeError: it has fewer than 12 markers.
+    """
+    if len(attachment.triangles) < LEAST_POINTS:
+        raise ShapeError(f"{path}: found {len(attachment.triangles)} markers, expected at least {LEAST_POINTS}")
+    if rig is not None and attachment.fingerprint != model.fingerprint():
+        attachment.check(rig.neutral, path, "the rig")
+        return False
+    if attachment.fingerprint is not None and attachment.fingerprint != model.fingerprint():
+        raise TopologyError(
+            f"{path}: found marker sites made for topology {attachment.fingerprint}, expected the model's, "
+            f"{model.fingerprint()} (vertex count, hash of the triangles), or the rig that they belong to (--rig)"
+        )
+    attachment.check(model, path, "the model")
+    return True
+
+
+def marker_animation(
+    path: Path, sites: MarkerSites, model: Mesh, neutral: int | None, options: MarkerOptions
+) -> CoarseAnimation:
+    """A take of markers, spread over the model by the thin shell.
+
+    A marker that is not seen in a frame holds nothing there. Frames that show fewer than 12 are bridged from those
+    before and after.
+
+    Args:
+        path: the take.
+        sites: where its markers sit.
+        model: the model's neutral.
+        neutral: a frame with the face at rest, from which motion counts; else from the sites.
+        options: unit, labels, axes.
+
+    Raises:
+        AlignmentError: the markers do not lie on the sites in any pose, or are of another size, or mirrored.
+        ShapeError: no frame shows 12 markers.
+        TorchfaceError: the take is broken, or its labels are others.
+    """
+    take, notes = read_markers(path, sites.attachment.labels, options)
+    assert take.markers is not None
+    attachment = sites.on_model(model).select(take.markers.names)
+    if len(attachment.triangles) < LEAST_POINTS:
+        raise ShapeError(
+            f"{path}: found {len(attachment.triangles)} of the attachment's markers, expected at least {LEAST_POINTS}"
+        )
+    shell = ThinShell(model.vertices, model.faces, attachment)
+    pose = _pose(path, take, sites, shell, neutral)
+    check_scale(float(pose.scale[0]), path)
+    markers, bridges = _without_gaps(placed(pose, take.markers.values), path)
+    if attachment.residual is not None:
+        markers = markers - attachment.residual.to(markers)
+    rest, offsets = shell.rest, _distance_at_rest(shell, markers)
+    if neutral is not None:
+        seen = markers[neutral]
+        still = rigid_motion(rest.double(), seen[None].double()).inverse().apply(seen[None].double())[0].float()
+        rest = torch.where(torch.isfinite(still), still, rest)
+    if offsets > _MOST_AT_REST_MM:
+        raise AlignmentError(
+            f"{path}: found markers {offsets:.1f} mm (root mean square) from their sites where they come nearest, "
+            f"expected at most {_MOST_AT_REST_MM:g}; the attachment or the rig is another one's, or labels are mixed up"
+        )
+    found = [f"{len(attachment.triangles)} markers, {offsets:.2f} mm (root mean square) from their sites at rest"]
+    if offsets > 3.0 and neutral is None:
+        found.append(
+            f"warning: at rest the markers lie {offsets:.1f} mm from their sites; a frame with the face at rest "
+            "(--neutral) or the attachment of this take (torchface attach) would keep that out of the motion"
+        )
+    return CoarseAnimation(
+        path,
+        f"{len(attachment.triangles)} markers",
+        len(take),
+        lambda begin, end: shell.follow(markers[begin:end], rest),
+        take.fps,
+        lambda begin, end: markers[begin:end],
+        None,
+        offsets,
+        (*notes, *found, *bridges),
+    )
+
+
+def _pose(path: Path, take: Take, sites: MarkerSites, shell: ThinShell, neutral: int | None) -> Similarity:
+    """From the take's space to the model's."""
+    assert take.markers is not None
+    if neutral is not None and not 0 <= neutral < len(take):
+        raise ValueRangeError(f"--neutral: found frame {neutral}, expected 0 to {len(take) - 1}")
+    if sites.rig is not None and sites.correspondence is not None:
+        pose = align_take(sites.rig, sites.attachment, take, neutral)
+        onto = sites.correspondence.pose
+        rotation, scale = onto.rotation @ pose.rotation.to(onto.rotation), onto.scale * pose.scale.to(onto.scale)
+        translation = onto.apply(pose.translation.to(onto.translation)[:, None])[0]
+        return Similarity(scale, rotation, translation)
+    paths = take.markers.values.double()
+    check_not_mirrored(paths, shell.rest.double(), str(path))
+    middle = paths.nanmedian(0).values if neutral is None else paths[neutral]
+    check_not_collinear(middle[torch.isfinite(middle).all(-1)])
+    pose = similarity_transform(middle[None], shell.rest.double()[None])
+    if abs(float(pose.scale[0]) - 1) < _SAME_SIZE:  # millimetres as they should be: an open jaw does not shrink a head
+        pose = similarity_transform(middle[None], shell.rest.double()[None], scale=False)
+    return pose
+
+
+def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
+    """Frames with too few markers get those of the frames before and after, linear in between."""
+    enough = torch.isfinite(markers).all(-1).sum(1) >= LEAST_POINTS
+    rows = enough.nonzero()[:, 0]
+    if len(rows) == 0:
+        raise ShapeError(f"{path}: found no frame that shows {LEAST_POINTS} markers, expected at least one")
+    if enough.all():
+        return markers, []
+    filled = markers.clone()
+    filled[~enough] = bridged(markers[rows], rows, len(markers))[~enough]
+    still = torch.isfinite(filled).all(-1).sum(1) < LEAST_POINTS
+    if still.any():  # the frames beside show other markers
+        nearest = torch.searchsorted(rows, still.nonzero()[:, 0]).clamp(max=len(rows) - 1)
+        filled[still] = markers[rows[nearest]]
+    first = int((~enough).nonzero()[0, 0])
+    return filled, [
+        f"warning: {int((~enough).sum())} of {len(markers)} frames (the first {first}) show fewer than {LEAST_POINTS} "
+        "markers; they are bridged from the frames before and after"
+    ]
+
+
+def _distance_at_rest(shell: ThinShell, markers: Tensor) -> float:
+    """Root mean square distance of the markers from their sites in the frames where they come nearest, millimetres."""
+    few = markers[:: max(1, len(markers) // 200)].double()
+    pose = rigid_motion(shell.rest.double(), few)
+    off = (pose.inverse().apply(few) - shell.rest.double()).square().sum(-1).nanmean(-1).sqrt()
+    return float(off.quantile(0.05))
