@@ -66,5 +66,5 @@ def compression_scale(extremes: Tensor, line: Tensor, places: Sequence[str]) -> 
     scale = torch.empty_like(most)
     for place in set(places):
         of_place = torch.tensor([name == place for name in places])[line]
-        scale[of_place] = 0.5 * most[of_place].quantile(0.9).clamp(min=_LEAST_COMPRESSION)
+        scale[of_place] = 0.5 * most[of_place].quantile(0.7).clamp(min=_LEAST_COMPRESSION)
     return scale

@@ -127,26 +127,31 @@ def _forehead(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
             if high - low < 12 * scale:
                 continue
             across = torch.linspace(low, high, 14)
-            arch = 3.0 * scale * (1 - (across / reach * 1.5 - across.sign() * 0.75).square() * 1.8)
-            up = level + arch + draw.between(-0.9, 0.9) * scale + draw.wave(14, 0.7 * scale)
+            arch = _brow_arch(across / reach) * scale
+            up = level + arch + draw.between(-0.9, 0.9) * scale + draw.wave(14, 1.1 * scale)
             deep = draw.between(0.7, 1.05) * (0.55 + 0.45 * middle)
             yield _Stroke("forehead", torch.stack([across, up], 1), deep, spacing / 2, draw.between(0.05, 0.14))
         for _ in range(2):
             start = draw.between(-0.8, 0.5) * reach
             across = torch.linspace(start, start + draw.between(12, 26) * scale, 8)
-            arch = 3.0 * scale * (1 - (across / reach * 1.5 - across.sign() * 0.75).square() * 1.8)
-            up = level + arch + spacing * draw.between(0.4, 0.6) + draw.wave(8, 0.5 * scale)
+            arch = _brow_arch(across / reach) * scale
+            up = level + arch + spacing * draw.between(0.4, 0.6) + draw.wave(8, 0.8 * scale)
             yield _Stroke("forehead", torch.stack([across, up], 1), draw.between(0.15, 0.35), spacing / 4)
         level += spacing
         row += 1
 
 
+def _brow_arch(across: Tensor) -> Tensor:
+    """Millimetres by which furrows rise over each brow and dip between; -1 and 1 are the brows' outer ends."""
+    return 1.6 * (1 - (2 * math.pi * across).cos())
+
+
 def _glabella(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
     inner, root = marks[[21, 22]], marks[27]
     height, half = float(inner[:, 1].mean()), float(inner[:, 0].abs().mean())
-    for position, deep in ((-0.72, 1.1), (-0.3, 0.5), (0.22, 0.45), (0.68, 1.0)):
-        top = height + draw.between(7, 14) * scale
-        bottom = float(root[1]) + draw.between(0, 5) * scale
+    for position, deep, long in ((-0.74, 1.0, 1.0), (-0.3, 0.4, 0.45), (0.2, 0.35, 0.3), (0.7, 0.95, 0.85)):
+        top = height + (2 + draw.between(6, 11) * long) * scale
+        bottom = float(root[1]) + (draw.between(1, 3) + 5 * (1 - long)) * scale
         up = torch.linspace(bottom, top, 10)
         along = torch.linspace(0, 1, 10)
         lean = half * (position + draw.between(-0.08, 0.08)) * (0.72 + 0.5 * along.square())
@@ -212,12 +217,14 @@ def _nasolabial(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
     course = (1 - along).square() * start + 2 * along * (1 - along) * middle + along.square() * end
     course = course + torch.stack([draw.wave(14, 0.5 * scale), torch.zeros(14)], 1)
     yield _Stroke("nasolabial", course, draw.between(1.2, 1.5), 4.2 * scale, draw.between(0.16, 0.24), overhang=0.5)
-    for k in range(3):
-        first, last = draw.between(0.30, 0.45), draw.between(0.8, 1.0)
+    for k in range(5):
+        first, last = draw.between(0.30, 0.55), draw.between(0.8, 1.0)
         piece = course[int(13 * first) : int(13 * last) + 1]
-        spread = torch.tensor([5.0 + 4.6 * k + draw.between(-0.6, 0.6), 0.5]) * scale
+        spread = torch.tensor([5.0 + 4.9 * k + draw.between(-0.9, 0.9), draw.between(-1.5, 2.5)]) * scale
         shifted = piece + spread * torch.linspace(0.85, 1.15, len(piece))[:, None]
-        yield _Stroke("smile_lines", shifted, draw.between(0.5, 0.75) / (1 + 0.4 * k), 2.3 * scale, 0.05, overhang=0.2)
+        yield _Stroke(
+            "smile_lines", shifted, draw.between(0.2, 0.75), draw.between(1.9, 2.9) * scale, 0.05, overhang=0.2
+        )
 
 
 def _chin(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
@@ -236,10 +243,10 @@ def _chin(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
         ])  # fmt: skip
         angle = draw.between(-0.9, 0.9) + (0.5 * math.pi if k % 2 else 0.0)
         along = torch.linspace(-1, 1, 6)
-        length, bow = draw.between(1.8, 3.0) * scale, draw.between(-0.5, 0.5)
+        length, bow = draw.between(0.9, 1.9) * scale, draw.between(-0.6, 0.6)
         curve = torch.stack([along, bow * (1 - along.square())], 1) * length
         turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        yield _Stroke("chin", curve @ turn + place, draw.between(0.3, 0.6), 1.7 * scale, 0.04)
+        yield _Stroke("chin", curve @ turn + place, draw.between(0.3, 0.6), draw.between(1.6, 2.3) * scale, 0.04)
 
 
 def _lips(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
@@ -248,11 +255,11 @@ def _lips(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
     for k in range(13):
         place = (k - 6 + draw.between(-0.25, 0.25)) / 6.0 * 0.88
         rim = _along(upper, place) + torch.tensor([0.0, 1.6 * scale])
-        rise = draw.between(0.38, 0.68) * skin
+        rise = draw.between(0.28, 0.66) * skin
         along = torch.linspace(0, 1, 7)
         course = rim + torch.stack([0.12 * place * rise * along, rise * along], 1)
         course[:, 0] += draw.wave(7, 0.25 * scale) + 0.18 * place * abs(float(rim[1]) - rim_height) * along
-        yield _Stroke("upper_lip", course, draw.between(0.25, 0.55), 1.6 * scale, 0.05)
+        yield _Stroke("upper_lip", course, draw.between(0.12, 0.42), 1.6 * scale, 0.05)
     for k in range(9):
         place = (k - 4 + draw.between(-0.25, 0.25)) / 4.0 * 0.8
         rim = _along(lower, place) - torch.tensor([0.0, 2.0 * scale])

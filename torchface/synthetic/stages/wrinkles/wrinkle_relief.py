@@ -132,7 +132,9 @@ def _plant(skin: _Skin, line: WrinkleLine, first: int, number: int) -> _Planted:
     half = max(1.8, 1.3 * line.width)
     kept = [torch.cat(x) for x in (row, column, value)]
     some = kept[2].abs() > 1e-5
-    ends = [_on_skin(skin, points[stops] + sign * half * across[stops]) for sign in (1, -1)]
+    # A fold with an overhang is made by what slides over it: there the gauge reaches out further.
+    reaches = (half * (1 + 4 * line.overhang), -half * (1 - line.overhang))
+    ends = [_on_skin(skin, points[stops] + reach * across[stops]) for reach in reaches]
     return _Planted(
         kept[0][some].numpy(), kept[1][some].numpy(), kept[2][some].numpy(),
         *ends, along, np.full(len(stops), line.trace),
@@ -164,7 +166,7 @@ def _envelope(place: Tensor, number: int) -> Tensor:
     """How deep a line is along its length, (P,): it fades out at both ends and is uneven between."""
     ends = (place * (1 - place) * 4).clamp(min=0).sqrt()
     phase = 2.399963 * number
-    uneven = 0.86 + 0.14 * (2 * torch.pi * (1.7 * place) + phase).sin() * (2 * torch.pi * 3.1 * place + 2 * phase).cos()
+    uneven = 0.78 + 0.22 * (2 * torch.pi * (1.7 * place) + phase).sin() * (2 * torch.pi * 3.1 * place + 2 * phase).cos()
     return ends * uneven
 
 

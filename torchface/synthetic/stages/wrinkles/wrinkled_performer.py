@@ -13,7 +13,6 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.mesh import Mesh
 from torchface.number_checks import check_rate
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.wrinkles.dense_surface import dense_surface
 from torchface.synthetic.stages.wrinkles.folding import (
     compression_scale,
@@ -21,6 +20,7 @@ from torchface.synthetic.stages.wrinkles.folding import (
     steady_folding,
     with_lag,
 )
+from torchface.synthetic.stages.wrinkles.performer_face import performer_face
 from torchface.synthetic.stages.wrinkles.skin_texture_relief import pore_heights
 from torchface.synthetic.stages.wrinkles.wrinkle_lines import wrinkle_lines
 from torchface.synthetic.stages.wrinkles.wrinkle_relief import wrinkle_relief
@@ -31,8 +31,6 @@ FOLD_TIME, UNFOLD_TIME = 0.040, 0.150
 _NUMBERS_AT_ONCE = 2**23
 _MOST_VERTICES = 2_000_000
 _LANDMARKS = 68
-_NOT_SKIN = ("eyeball_left", "eyeball_right", "eye_sockets", "mouth_interior", "ear_left", "ear_right")
-_BACK, _NECK, _CROWN = 3.0, -140.0, 30.0  # millimetres: what is behind, below, and above-and-behind is left out
 
 
 class WrinkledPerformer:
@@ -64,7 +62,7 @@ class WrinkledPerformer:
     ) -> None:
         if rig is not None and identity is not None:
             raise ValueRangeError("WrinkledPerformer: found identity and rig, expected one of them")
-        self.rig = _face_of_performer(identity) if rig is None else rig
+        self.rig = performer_face(identity) if rig is None else rig
         marks = self.rig.neutral.landmarks
         if len(marks) != _LANDMARKS:
             raise ValueRangeError(f"WrinkledPerformer: found a rig of {len(marks)} landmarks, expected {_LANDMARKS}")
@@ -170,16 +168,3 @@ class WrinkledPerformer:
             bad = (~torch.isfinite(weights)).any(0).nonzero()[:, 0].tolist()
             named = ", ".join(self.names[i] for i in bad[:5])
             raise ValueRangeError(f"weights: NaN or infinite in {named}; expected finite numbers")
-
-
-def _face_of_performer(identity: Tensor | None) -> BlendshapeRig:
-    """What a capture stage sees of the embedded performer: skin from the chin's underside over the brow to the temples.
-
-    Eyes, the inside of the mouth and ears are left out, so lids and lips are borders.
-    """
-    head = performer(identity, texture=False)
-    assert head.neutral.annotations is not None
-    places, regions = head.neutral.vertices, head.neutral.annotations.regions
-    hidden = torch.stack([regions[name] for name in _NOT_SKIN]).any(0)
-    front = places[:, 2] > _BACK + 0.6 * (places[:, 1] - _CROWN).clamp(min=0)
-    return head.part(~hidden & front & (places[:, 1] > _NECK))
