@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 from torch import Tensor
@@ -16,9 +16,10 @@ from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import check_rate
 
 _SMOOTHING = 0.1  # seconds
-_PROMINENCE = 0.2  # of the range of a take's activity: what rises by less from both its valleys is no expression
-_SHORTEST, _LONGEST = 0.5, 8.0  # seconds
+_PROMINENCE = 0.1  # of the range of a take's activity: what rises by less from both its valleys is no expression
+_SHORTEST = 0.5  # seconds
 _NOT_EXPRESSIONS = ("eyelook", "eyeblink")
+_STILL = 1e-6  # sum of weights below which nothing moves
 
 
 def expression_sequences(weights: Tensor, names: Sequence[str], fps: float) -> tuple[slice, ...]:
@@ -40,51 +41,54 @@ def expression_sequences(weights: Tensor, names: Sequence[str], fps: float) -> t
         NameMismatchError: no shape but gaze and blinks.
         ValueRangeError: a weight is NaN or infinite, or ``fps`` is no rate.
     """
-    check_rate(fps, "expression_sequences", ValueRangeError)
-    _check(weights, len(names))
-    counted = [not name.lower().startswith(_NOT_EXPRESSIONS) for name in names]
-    if not any(counted):
-        raise NameMismatchError(f"names: found {', '.join(names[:5])}, ...; expected shapes beside gaze and blinks")
-    sum_of_weights = weights[:, torch.tensor(counted)].double().sum(1).cpu().numpy()
-    activity = gaussian_filter1d(sum_of_weights, _SMOOTHING * fps)
-    span = float(np.ptp(activity))
-    if span < 1e-6:
+    activity = _activity(weights, names, fps)
+    span = float(np.ptp(activity)) if len(activity) else 0.0
+    if span < _STILL:
         return ()
-    peaks, _ = find_peaks(np.pad(activity, 1), prominence=_PROMINENCE * span)
-    peaks = peaks - 1
-    if len(peaks) == 0:
-        return ()
+    # Quiet before the first frame and after the last: a take may begin or end in an expression.
+    peaks = find_peaks(np.pad(activity, 1, constant_values=activity.min() - span), prominence=_PROMINENCE * span)[0] - 1
     stops = [0, *peaks.tolist(), len(activity)]
-    valleys = [low + int(activity[low:high].argmin()) if high > low else low for low, high in itertools.pairwise(stops)]
-    valleys[-1] += 1  # the last frame belongs to the last piece
-    pieces = itertools.pairwise(valleys)
-    return tuple(slice(a, b) for a, b in pieces if _SHORTEST * fps <= b - a <= _LONGEST * fps)
+    valleys = [low + int(activity[low:high].argmin()) for low, high in pairwise(stops) if high > low]
+    return tuple(slice(a, b) for a, b in pairwise(valleys) if b - a >= _SHORTEST * fps)
 
 
-def from_neutral_to_neutral(weights: Tensor, fps: float, seconds: float = 0.2) -> Tensor:
-    """A piece of a take whose first and last frames are exactly neutral, (T,N): faded in and out, else as it was.
+def from_neutral_to_neutral(weights: Tensor, names: Sequence[str], fps: float) -> Tensor:
+    """A piece of a take whose first and last frames are exactly neutral, (T,N), and whose timing is the take's own.
+
+    Every frame is scaled by one number, so that its activity (the sum of the weights without gaze and blinks) counts
+    from the line between both ends; where it is largest the frame stays as it was.
 
     Args:
-        weights: (T,N), at least three frames.
+        weights: (T,N), at least three frames, such as one of ``expression_sequences``.
+        names: of the shapes.
         fps: frames a second.
-        seconds: how long each fade lasts; at most a third of the piece.
 
     Raises:
-        ShapeError: not (T,N), or fewer than three frames.
-        ValueRangeError: a weight is NaN or infinite, or ``fps`` is no rate.
+        ShapeError: not (T,N) with one name a column, or fewer than three frames.
+        NameMismatchError: no shape but gaze and blinks.
+        ValueRangeError: a weight is NaN or infinite, ``fps`` is no rate, or no frame is more active than its ends.
     """
-    check_rate(fps, "from_neutral_to_neutral", ValueRangeError)
-    _check(weights, weights.shape[-1])
+    activity = _activity(weights, names, fps)
     if len(weights) < 3:
         raise ShapeError(f"weights: found {len(weights)} frames, expected at least 3")
-    length = min(max(1, math.ceil(seconds * fps)), max(1, len(weights) // 3))
-    frame = torch.arange(len(weights), dtype=weights.dtype)
-    rise = (torch.minimum(frame, len(weights) - 1 - frame) / length).clamp(max=1)
-    return weights * (rise.square() * (3 - 2 * rise))[:, None]
+    above = (activity - np.linspace(activity[0], activity[-1], len(activity))).clip(min=0)
+    if above.max() < _STILL:
+        raise ValueRangeError("weights: no frame is more active than the first and last; expected an expression")
+    share = above / activity.clip(min=_STILL)
+    share[[0, -1]] = 0
+    scale = torch.from_numpy(share / share[above.argmax()]).clamp(max=1)
+    return weights * scale.to(weights)[:, None]
 
 
-def _check(weights: Tensor, count: int) -> None:
-    if weights.ndim != 2 or weights.shape[1] != count:
-        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{count})")
+def _activity(weights: Tensor, names: Sequence[str], fps: float) -> NDArray[np.float64]:
+    """The sum of the weights of each frame without gaze and blinks, (T,), smoothed by a tenth of a second."""
+    check_rate(fps, "fps", ValueRangeError)
+    if weights.ndim != 2 or weights.shape[1] != len(names):
+        raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(names)})")
     if not torch.isfinite(weights).all():
         raise ValueRangeError("weights: found NaN or infinite weights, expected finite ones; fill the gaps first")
+    counted = torch.tensor([not name.lower().startswith(_NOT_EXPRESSIONS) for name in names])
+    if not counted.any():
+        raise NameMismatchError(f"names: found {', '.join(names[:5])}, ...; expected shapes beside gaze and blinks")
+    total: NDArray[np.float64] = weights[:, counted].double().sum(1).cpu().numpy()
+    return np.asarray(gaussian_filter1d(total, _SMOOTHING * fps)) if len(total) else total

@@ -20,6 +20,8 @@ _BOTTOM = 0.32  # millimetres: half width of the sharp bottom of a valley
 _SHARP = 0.45  # share of the depth that comes late and is sharp
 _PULL = 0.38  # how far a valley's sides come together, as a share of its depth
 _GAUGE_STEP = 2.0  # millimetres between places along a line where the compression is measured
+_LEAST_HALF = 1.8  # millimetres to either side: a shorter gauge would measure the mesh
+_LEAST_RELIEF = 1e-5  # millimetres
 _SAME_WAY = 0.2  # cosine to the line's normal below which a vertex belongs to another layer
 
 
@@ -91,54 +93,48 @@ class _Skin:
 
 
 def _plant(skin: _Skin, line: WrinkleLine, first: int, number: int) -> _Planted:
+    """One line, whose gauges are counted from ``first``."""
     points = line.points
     corner = skin.faces[line.triangle]
     normal = torch.nn.functional.normalize((skin.normals[corner] * line.barycentric[..., None]).sum(1), dim=1)
     course = torch.gradient(points, dim=0)[0]
     across = torch.nn.functional.normalize(torch.linalg.cross(normal, course), dim=1)
-
-    reach = _REACH * line.width
-    near = np.unique(np.concatenate(skin.tree.query_ball_point(points[::8].numpy(), reach + 1.0)).astype(np.int64))
-    distance, nearest = cKDTree(points.numpy()).query(skin.vertices[near].numpy())
-    vertex, nearest = torch.from_numpy(near), torch.from_numpy(nearest)
-    offset = skin.vertices[vertex] - points[nearest]
-    signed = (offset * across[nearest]).sum(1)
-    belongs = (torch.from_numpy(distance) < reach) & ((skin.normals[vertex] * normal[nearest]).sum(1) > _SAME_WAY)
-    vertex, nearest, signed = vertex[belongs], nearest[belongs], signed[belongs]
-
-    place = nearest.double() / max(len(points) - 1, 1)
-    envelope = _envelope(place, number)
-    height, late, side = _profile(signed, line, skin.spacing[vertex])
-    lateral = torch.stack([(across[nearest] * way[vertex]).sum(1) for way in skin.directions], dim=1)
-
     stops, along = _gauges(points)
-    position = place * (len(stops) - 1)
-    low = position.long().clamp(max=max(len(stops) - 2, 0))
-    high = (low + 1).clamp(max=len(stops) - 1)
-    share = position - low
-    row, column, value = [], [], []
-    count = len(skin.vertices)
-    for gauge, weight in ((low, 1 - share), (high, share)):
-        amount = weight * envelope * line.depth
-        for axis, early, after in (
-            (0, height * (1 - _SHARP), late * _SHARP),
-            (1, side * lateral[:, 0], torch.zeros_like(side)),
-            (2, side * lateral[:, 1], torch.zeros_like(side)),
-        ):
-            for power, form in ((0, early), (1, after)):
-                row.append(vertex + axis * count)
-                column.append(2 * (gauge + first) + power)
-                value.append(form * amount)
-    half = max(1.8, 1.3 * line.width)
-    kept = [torch.cat(x) for x in (row, column, value)]
-    some = kept[2].abs() > 1e-5
     # A fold with an overhang is made by what slides over it: there the gauge reaches out further.
-    reaches = (half * (1 + 4 * line.overhang), -half * (1 - line.overhang))
-    ends = [_on_skin(skin, points[stops] + reach * across[stops]) for reach in reaches]
-    return _Planted(
-        kept[0][some].numpy(), kept[1][some].numpy(), kept[2][some].numpy(),
-        *ends, along, np.full(len(stops), line.trace),
-    )  # fmt: skip
+    half = max(_LEAST_HALF, 1.3 * line.width)
+    before = _on_skin(skin, points[stops] + half * (1 + 4 * line.overhang) * across[stops])
+    behind = _on_skin(skin, points[stops] - half * (1 - line.overhang) * across[stops])
+
+    vertex, nearest = _beside(skin, line, normal)
+    signed = ((skin.vertices[vertex] - points[nearest]) * across[nearest]).sum(1)
+    height, late, side = _profile(signed, line, skin.spacing[vertex])
+    lateral = [side * (across[nearest] * way[vertex]).sum(1) for way in skin.directions]
+    place = nearest.double() / (len(points) - 1)
+    amount = _envelope(place, number) * line.depth
+    position = place * (len(stops) - 1)
+    low = position.long().clamp(max=len(stops) - 2)
+    row, column, value = [], [], []
+    for gauge, share in ((low, 1 - (position - low)), (low + 1, position - low)):
+        forms = ((0, 0, height * (1 - _SHARP)), (0, 1, late * _SHARP), (1, 0, lateral[0]), (2, 0, lateral[1]))
+        for axis, power, form in forms:
+            row.append(vertex + axis * len(skin.vertices))
+            column.append(2 * (gauge + first) + power)
+            value.append(form * amount * share)
+    rows, columns, values = torch.cat(row).numpy(), torch.cat(column).numpy(), torch.cat(value).numpy()
+    seen = np.abs(values) > _LEAST_RELIEF
+    trace = np.full(len(stops), line.trace)
+    return _Planted(rows[seen], columns[seen], values[seen], before, behind, along, trace)
+
+
+def _beside(skin: _Skin, line: WrinkleLine, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Vertices that a line moves, (P,), and the point of the line next to each, (P,)."""
+    reach = _REACH * line.width
+    found = skin.tree.query_ball_point(line.points[::8].numpy(), reach + 1.0)
+    near = np.unique(np.concatenate([np.asarray(some, np.int64) for some in found]))
+    distance, nearest = cKDTree(line.points.numpy()).query(skin.vertices[near].numpy())
+    same_layer = (skin.normals[near] * normal[nearest]).sum(1).numpy() > _SAME_WAY
+    belongs = (distance < reach) & same_layer
+    return torch.from_numpy(near[belongs]), torch.from_numpy(nearest[belongs])
 
 
 def _profile(signed: Tensor, line: WrinkleLine, spacing: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,72 @@
+"""Pieces of takes from rest to rest: found where they were planted, made neutral at both ends."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.io import load_take
+from torchface.synthetic.stages.wrinkles import expression_sequences, from_neutral_to_neutral
+
+FPS = 60.0
+NAMES = ("browInnerUp", "mouthSmileLeft", "eyeBlinkLeft")
+
+
+def planted(*peaks: tuple[int, float], length: int, rest: float = 0.3) -> Tensor:
+    """Bumps of 40 frames' standard deviation over a rest that is not neutral, and a blink between them."""
+    frame = torch.arange(length, dtype=torch.float32)
+    weights = torch.full((length, 3), rest)
+    for place, height in peaks:
+        weights[:, :2] += height * (-0.5 * ((frame - place) / 40) ** 2).exp()[:, None]
+    weights[200:206, 2] = 1.0
+    return weights
+
+
+def test_pieces_lie_round_the_planted_expressions() -> None:
+    pieces = expression_sequences(planted((150, 0.6), (450, 0.4), length=600), NAMES, FPS)
+    assert [piece.start < centre < piece.stop for piece, centre in zip(pieces, (150, 450), strict=True)] == [True, True]
+    assert pieces[0].stop == pieces[1].start
+    assert abs(pieces[0].stop - 305) < 15
+
+
+def test_what_is_still_holds_no_expression() -> None:
+    assert expression_sequences(torch.full((300, 3), 0.2), NAMES, FPS) == ()
+
+
+def test_a_piece_made_neutral_keeps_its_peak_and_its_timing() -> None:
+    weights = planted((150, 0.6), length=300)
+    made = from_neutral_to_neutral(weights, NAMES, FPS)
+    assert made[[0, -1]].abs().max() == 0
+    assert (made[150] - weights[150]).abs().max() < 1e-3
+    rising, before = made[:140, 0].diff(), weights[:140, 0].diff()
+    assert torch.corrcoef(torch.stack([rising, before]))[0, 1] > 0.98
+
+
+def test_wrong_input_is_named() -> None:
+    with pytest.raises(ShapeError, match="expected"):
+        expression_sequences(torch.zeros(10, 2), NAMES, FPS)
+    with pytest.raises(NameMismatchError, match="beside gaze"):
+        expression_sequences(torch.zeros(10, 1), ["eyeBlinkLeft"], FPS)
+    with pytest.raises(ValueRangeError, match="NaN"):
+        expression_sequences(torch.full((10, 3), torch.nan), NAMES, FPS)
+    with pytest.raises(ValueRangeError, match="more active"):
+        from_neutral_to_neutral(torch.full((10, 3), 0.5), NAMES, FPS)
+
+
+@pytest.mark.real
+def test_real_takes_hold_pieces_that_do_not_overlap(performances: list[Path]) -> None:
+    for path in performances:
+        track = load_take(path).weights
+        assert track is not None
+        pieces = expression_sequences(track.values[..., 0], track.names, FPS)
+        assert len(pieces) >= 2
+        assert all(a.stop <= b.start for a, b in itertools.pairwise(pieces))
+        for piece in pieces:
+            made = from_neutral_to_neutral(track.values[piece, :, 0], track.names, FPS)
+            assert made[[0, -1]].abs().max() == 0
+            assert (made <= track.values[piece, :, 0] + 1e-6).all()
