@@ -4,17 +4,20 @@
 const QUICK = 12; // milliseconds; a graphics card draws in less
 const SHARE = 0.3; // of the time that slower drawing may take
 const LONGEST_REST = 400; // milliseconds; the first drawing takes seconds
-const PATIENCE = 5; // slow drawings in a row until they are made coarser
-const COARSER = 0.7;
+const SLOW_ONES = 5; // drawings in a row until they are made coarser
+const COARSER = 0.7; // about half the pixels
+const WORTH = 0.8; // of the time before: coarser drawing that takes more was in vain
 const COARSEST = 0.5; // pixels drawn for one of the page's
 const POLL = 4; // milliseconds
 
 export class DrawingPace {
-  #slow = 0;
+  #slow = [];
+  #before = null;
+  #settled = false;
 
   /** @param {number} ratio pixels to be drawn for one of the page's, to begin with. */
   constructor(ratio) {
-    this.ratio = Math.max(COARSEST, ratio);
+    this.ratio = ratio;
   }
 
   /**
@@ -24,12 +27,26 @@ export class DrawingPace {
    * @returns {number} milliseconds until the next may begin.
    */
   rest(took) {
-    this.#slow = took > QUICK ? this.#slow + 1 : 0;
-    if (this.#slow === PATIENCE) {
-      this.ratio = Math.max(COARSEST, COARSER * this.ratio);
-      this.#slow = 0;
+    if (took <= QUICK) {
+      this.#slow = [];
+      return 0;
     }
-    return took > QUICK ? Math.min(LONGEST_REST, took * (1 / SHARE - 1)) : 0;
+    this.#slow.push(took);
+    if (this.#slow.length === SLOW_ONES) this.#adapt();
+    return Math.min(LONGEST_REST, took * (1 / SHARE - 1));
+  }
+
+  #adapt() {
+    const took = this.#slow.sort((a, b) => a - b)[SLOW_ONES >> 1];
+    this.#slow = [];
+    if (this.#settled) return;
+    if (this.#before !== null && took > WORTH * this.#before.took) {
+      this.#settled = true; // it is not the pixels
+      this.ratio = this.#before.ratio;
+    } else if (this.ratio > COARSEST) {
+      this.#before = { ratio: this.ratio, took };
+      this.ratio = Math.max(COARSEST, COARSER * this.ratio);
+    }
   }
 }
 

@@ -3,17 +3,18 @@
 import * as THREE from "three";
 
 import { DrawingPace, drawn, pause } from "./drawing_pace.js";
+import { ProcessorMorphing } from "./processor_morphing.js";
 
 const FIELD = 24; // degrees; a portrait lens
 const MOST_PIXELS = 2; // for one of the page's: more is work that nobody sees
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // WebGL without a graphics card
-const SOFTWARE_PIXELS = 0.5; // for one of the page's
 
 export class Stage {
   #renderer;
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
   #character = null;
+  #morphing = null;
   #software = drawsInSoftware();
   #pace = new DrawingPace(1);
   #asked = false;
@@ -34,6 +35,7 @@ export class Stage {
   show(character) {
     this.#character?.dispose();
     this.#character = character;
+    this.#morphing = this.#software ? new ProcessorMorphing(character.root) : null;
     this.#scene.add(character.root);
     this.#fit();
   }
@@ -66,6 +68,7 @@ export class Stage {
   async #drawnNow() {
     const began = performance.now();
     if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#renderer.setPixelRatio(this.#pace.ratio);
+    this.#morphing?.update();
     this.#renderer.render(this.#scene, this.#camera);
     await drawn(this.#renderer.getContext());
     return performance.now() - began;
@@ -74,7 +77,7 @@ export class Stage {
   #fit() {
     const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
     if (width === 0 || height === 0) return;
-    this.#pace = new DrawingPace(this.#software ? SOFTWARE_PIXELS : Math.min(MOST_PIXELS, window.devicePixelRatio));
+    this.#pace = new DrawingPace(Math.min(this.#software ? 1 : MOST_PIXELS, window.devicePixelRatio));
     this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#camera.aspect = width / height;

@@ -34,11 +34,35 @@ const jobs = {
     return { seconds: take.seconds, rate: take.rate };
   },
 
-  /** Rest after each of these drawings' milliseconds, and the pixels drawn for one of the page's, from two on. */
+  /** Vertices of a character in one pose as three.js has them of its targets, and as they are summed for software WebGL. */
+  async morphing() {
+    globalThis.self = globalThis;
+    const { readCharacter } = await load("character");
+    const { ProcessorMorphing } = await load("processor_morphing");
+    const { Vector3 } = await import("three");
+    const character = await readCharacter(bytes, "file"), meshes = [];
+    character.root.traverse((object) => object.isMesh && object.morphTargetInfluences && meshes.push(object));
+    const pose = (shift) => meshes.forEach(({ morphTargetInfluences: all }, mesh) => all.forEach((_, row) => (all[row] = ((row + mesh + shift) % 3) / 3)));
+    const vertices = (of) => meshes.map((mesh) => Array.from({ length: mesh.geometry.attributes.position.count }, (_, i) => of(mesh, i).toArray()));
+    pose(0);
+    const expected = vertices((mesh, i) => mesh.getVertexPosition(i, new Vector3()));
+    const morphing = new ProcessorMorphing(character.root);
+    pose(1); // what was before leaves nothing
+    morphing.update();
+    pose(0);
+    morphing.update();
+    const found = vertices((mesh, i) => new Vector3().fromBufferAttribute(mesh.geometry.attributes.position, i));
+    return { expected, found, left: meshes.some((mesh) => "position" in mesh.geometry.morphAttributes) };
+  },
+
+  /** Drawings of [milliseconds, and those for each pixel drawn for one of the page's], from two on: their time, rest and ratio. */
   async pace() {
     const { DrawingPace } = await load("drawing_pace");
     const pace = new DrawingPace(2);
-    return JSON.parse(input).map((took) => [pace.rest(took), pace.ratio]);
+    return JSON.parse(input).map(([fixed, each]) => {
+      const took = fixed + each * pace.ratio ** 2;
+      return [took, pace.rest(took), pace.ratio];
+    });
   },
 
   /** What is said of a character that cannot be used. */

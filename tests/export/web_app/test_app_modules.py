@@ -84,15 +84,19 @@ def test_times_rise_and_the_rate_is_a_usual_one(run: Run) -> None:
     assert told["rate"] == 30
 
 
-def test_slow_drawing_takes_a_third_of_the_time_at_most_and_becomes_coarser(run: Run) -> None:
-    quick, slow = [3.0] * 50, [60.0] * 40
-    rests, ratios = np.array(run("pace", [*quick, 5000.0, *quick, *slow])).T
-    assert not rests[:50].any()
+def test_slow_drawing_takes_a_third_of_the_time_at_most_and_becomes_coarser_where_that_helps(run: Run) -> None:
+    quick = [(3.0, 0.0)] * 50
+    took, rests, ratios = np.array(run("pace", [*quick, (5000.0, 0.0), *quick, *[(5.0, 20.0)] * 40])).T
+    assert not rests[took < 4].any()
     assert rests[50] < 1000  # the first drawing takes seconds, and the character is awaited
     assert (ratios[:101] == 2).all()  # one slow drawing is none
-    assert (60 / (60 + rests[101:])).max() < 1 / 3
-    assert ratios[-1] == 0.5
-    assert (np.diff(ratios) <= 0).all()
+    slow = took[101:] > 12
+    assert (took[101:] / (took + rests)[101:])[slow].max() < 1 / 3
+    assert 0.5 <= ratios[-1] < 0.7
+    assert not slow[-1]
+    of_corners = np.array(run("pace", [(60.0, 1.0)] * 40))
+    assert (of_corners[:, 2] < 2).any()
+    assert (of_corners[20:, 2] == 2).all()  # fewer pixels were no quicker
 
 
 def sheet(path: Path, names: tuple[str, ...]) -> Path:
@@ -112,21 +116,46 @@ def test_a_character_takes_weights_by_name_and_turns_as_the_head_does(run: Run, 
     np.testing.assert_allclose(told["box"], [vertices.amin(0), vertices.amax(0)], atol=1e-5)
 
 
+def test_morph_targets_summed_for_software_drawing_are_those_of_three(run: Run, tmp_path: Path) -> None:
+    """On a file whose one mesh two nodes share."""
+    data = sheet(tmp_path / "sheet.glb", ("jawOpen", "mouthClose", "antenna", "browInnerUp")).read_bytes()
+
+    def shared(root: dict[str, Any]) -> None:
+        root["nodes"].append({"mesh": root["nodes"][0]["mesh"], "translation": [1.0, 0.0, 0.0]})
+        root["scenes"][0]["nodes"].append(len(root["nodes"]) - 1)
+
+    told = run("morphing", edited(data, tmp_path / "shared.glb", shared))
+    expected, found = np.array(told["expected"]), np.array(told["found"])
+    assert expected.shape[0] == 2
+    assert np.abs(expected[0] - expected[1]).max() > 0.05 * np.abs(expected).max()  # each its own pose
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+    assert not told["left"]
+
+
 def test_eyes_that_no_shape_moves_turn_in_the_head(run: Run, tmp_path: Path) -> None:
     data = sheet(tmp_path / "sheet.glb", ("jawOpen",)).read_bytes()
+
+    def with_eye(root: dict[str, Any]) -> None:
+        root["nodes"][0]["children"] = [1]
+        root["nodes"].append({"name": "LeftEye", "translation": [0.01, 0.02, 0.03]})
+
+    way = run("pose", edited(data, tmp_path / "eye.glb", with_eye))["ways"]["LeftEye"]
+    x, y, z = np.sin(0.2) * np.cos(0.1), np.sin(0.1), np.cos(0.2) * np.cos(0.1)  # 0.2 to the person's left, 0.1 up
+    expected = [np.cos(0.3) * x + np.sin(0.3) * z, y, np.cos(0.3) * z - np.sin(0.3) * x]
+    np.testing.assert_allclose(way, expected, atol=1e-6)
+
+
+def edited(data: bytes, path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
+    """A ``.glb`` with its document changed."""
     (size,) = struct.unpack("<I", data[12:16])
     root = json.loads(data[20 : 20 + size])
-    root["nodes"][0]["children"] = [1]
-    root["nodes"].append({"name": "LeftEye", "translation": [0.01, 0.02, 0.03]})
+    edit(root)
     text = json.dumps(root).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + size :]
     head = struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    (tmp_path / "eye.glb").write_bytes(head + text + rest)
-    way = run("pose", tmp_path / "eye.glb")["ways"]["LeftEye"]
-    x, y, z = np.sin(0.2) * np.cos(0.1), np.sin(0.1), np.cos(0.2) * np.cos(0.1)  # 0.2 to the person's left, 0.1 up
-    expected = [np.cos(0.3) * x + np.sin(0.3) * z, y, np.cos(0.3) * z - np.sin(0.3) * x]
-    np.testing.assert_allclose(way, expected, atol=1e-6)
+    path.write_bytes(head + text + rest)
+    return path
 
 
 def document(path: Path, **fields: object) -> Path:
