@@ -23,8 +23,10 @@ from torchface.enhancement.model_training import (
     learn_frames,
     warn_without_neutral,
 )
+from torchface.enhancement.patches import grow_patches
+from torchface.enhancement.projection import RegionProjection
+from torchface.enhancement.regions import Regions, regions_of_motion
 from torchface.enhancement.surface_frames import SurfaceFrames
-from torchface.enhancement.whole_face import RegionProjection, Regions, grow_patches
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import triangle_areas
@@ -217,7 +219,7 @@ class EnhancementModel(nn.Module):
             raise ShapeError(f"colors: found {tuple(colors.shape)}, expected {(len(frames), len(neutral), 3)}")
         neutral = neutral.detach().float()
         progress("preparing the mesh")
-        patches = grow_patches(faces, neutral, patch_size)
+        patches = grow_patches(faces, len(neutral), patch_size, seed)
         encoder = _encoder(neutral, faces, patches, wavelength, detail)
         settings = content_key(
             "enhancement/1", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
@@ -226,7 +228,7 @@ class EnhancementModel(nn.Module):
         size = 3 * len(neutral) if detail == "displacements" else 9 * len(faces)
         learned = learn_frames(frames, encoder, rank, size, settings, folder, progress)
         warn_without_neutral(learned.motion)
-        regions = Regions(("face",), torch.ones(1, len(faces)), torch.ones(1, dtype=torch.bool))
+        regions = regions_of_motion(learned.motion, patches, neutral, faces, region_count, landmarks, seed=seed)
         hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
         model = cls(
             len(neutral),

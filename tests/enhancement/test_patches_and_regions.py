@@ -1,0 +1,92 @@
+"""Patches are connected and even; regions are what moves together, named by place, with Gaussian borders."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from torchface.enhancement.patches import grow_patches, neighbouring_triangles, patch_means
+from torchface.enhancement.regions import find_regions
+from torchface.enhancement.soft_borders import soft_weights, surface_distances
+from torchface.errors import ValueRangeError
+from torchface.geometry.meshes.operators import triangle_areas
+
+
+def _sheet(count: int, edge: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A flat square of ``count`` by ``count`` vertices in the plane of x and y."""
+    row = torch.arange(count) * edge
+    y, x = torch.meshgrid(row, row, indexing="ij")
+    number = torch.arange(count * count).view(count, count)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = torch.cat([torch.stack([a, b, d], -1).view(-1, 3), torch.stack([a, d, c], -1).view(-1, 3)])
+    return torch.stack([x, y, torch.zeros_like(x)], -1).view(-1, 3), faces
+
+
+def test_patches_are_connected_even_and_follow_their_seed(database):
+    faces, count = database.faces, len(database.neutral)
+    patches = grow_patches(faces, count, 100, seed=3)
+    links = neighbouring_triangles(faces)
+    inside = links[patches[links[:, 0]] == patches[links[:, 1]]].numpy()
+    graph = coo_array((np.ones(len(inside)), inside.T), shape=(len(faces),) * 2)
+    assert connected_components(graph, directed=False)[0] == int(patches.max()) + 1
+    sizes = patches.bincount().float()
+    assert 0.3 * sizes.mean() < sizes.median() < 2 * sizes.mean()
+    assert float(sizes.max()) < 4 * float(sizes.mean())
+    assert torch.equal(patches, grow_patches(faces, count, 100, seed=3))
+    assert not torch.equal(patches, grow_patches(faces, count, 100, seed=4))
+
+
+def test_patch_means_are_integrals_over_areas(database):
+    patches = grow_patches(database.faces, len(database.neutral), 100)
+    areas = triangle_areas(database.neutral, database.faces).double()
+    values = torch.rand(2, len(patches), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    means = patch_means(values, patches, areas)
+    total = torch.zeros(int(patches.max()) + 1, dtype=torch.float64).index_add(0, patches, areas)
+    whole = (means * total[:, None]).sum(1)
+    assert torch.allclose(whole, (values * areas[:, None]).sum(1), rtol=1e-9)
+
+
+def test_borders_fall_off_as_a_gaussian_of_the_distance():
+    vertices, faces = _sheet(41, 1.0)
+    left = vertices[faces].mean(1)[:, 0] < 10
+    weights = soft_weights((~left).long(), 2, vertices, faces, 5.0).float()
+    assert bool((weights[0, left] == 1).all())
+    middles = vertices[faces].mean(1)
+    row = (middles[:, 1] - 20.5).abs() < 0.4
+    far = row & ~left
+    expected = torch.exp(-0.5 * ((middles[far, 0] - 10) / 5) ** 2)
+    assert float((weights[0, far] - expected).abs().max()) < 0.03
+
+
+def test_distances_along_a_flat_sheet_are_straight_along_its_edges():
+    vertices, faces = _sheet(21, 2.0)
+    distance = surface_distances(vertices, faces, torch.tensor([0]))
+    assert torch.allclose(distance[:21], vertices[:21, 0])
+    assert float(distance[-1]) == pytest.approx(20 * 2.0 * 2**0.5, rel=1e-6)  # the diagonals are edges
+
+
+def test_regions_have_names_and_sides_and_are_a_partition(database):
+    displacements = database.smooth - database.neutral
+    moved = torch.cat([displacements, displacements.flip(0) * 0.5])
+    regions = find_regions(moved, database.neutral, database.faces, 9, database.landmarks)
+    assert {"eye_left", "eye_right"} < set(regions.names)
+    assert len(set(regions.names)) == 9
+    assert any(name.startswith("mouth") for name in regions.names)
+    assert bool(regions.voluntary.any())
+    inside = regions.weights.float() == 1
+    assert bool(inside.any(0).all())
+    assert float((inside.sum(0) == 1).float().mean()) > 0.9  # but for triangles within rounding of a border
+    shares = regions.vertex_weights(database.faces, len(database.neutral))
+    assert torch.allclose(shares.sum(0), torch.ones(len(database.neutral)))
+    eyes = {name: regions.weights[regions.names.index(name)].float() == 1 for name in ("eye_left", "eye_right")}
+    middles = database.neutral[database.faces].mean(1)[:, 0]
+    # The actor's left eye lies to the viewer's right.
+    assert float(middles[eyes["eye_left"]].min()) > 0 > float(middles[eyes["eye_right"]].max())
+
+
+def test_a_face_that_does_not_move_has_no_regions(database):
+    with pytest.raises(ValueRangeError, match=r"0 of \d+ patches that move"):
+        find_regions(torch.zeros(3, *database.neutral.shape), database.neutral, database.faces, 4)

@@ -1,0 +1,217 @@
+"""Regions of a face with soft borders, found by what moves together and named by where they lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from torchface.enhancement.motion_clusters import motion_clusters
+from torchface.enhancement.patches import (
+    grow_labels,
+    grow_patches,
+    neighbour_table,
+    neighbouring_triangles,
+    patch_means,
+)
+from torchface.enhancement.region_names import named_regions
+from torchface.enhancement.soft_borders import soft_weights, surface_distances
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.meshes.operators import components, corners, triangle_areas
+from torchface.number_checks import checked_count, checked_number
+
+SIGMA = 10.0
+"""Standard deviation of the regions' borders, millimetres."""
+
+_LANDMARKS = 68
+_MIDDLE = (8, 27, 28, 29, 30, 33, 51, 57, 62, 66)
+_EYES = {"eye_right": range(36, 42), "eye_left": range(42, 48)}
+_LID_REACH = 0.25  # of the eye's width: how far an eye's region goes beyond the lids' edges
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Where each region of a face counts, and how much.
+
+    Args:
+        names: of the regions, such as ``mouth_left``, or ``region_03`` where no landmarks tell the place. Left is the
+            actor's left.
+        weights: of each region at each triangle, (R,F), in [0,1]: 1 inside, less outside.
+        voluntary: (R,) bool, whether the actor moves the region at will: mouth and brows. False for all where no
+            landmarks tell.
+    """
+
+    names: tuple[str, ...]
+    weights: Tensor
+    voluntary: Tensor
+
+    def __post_init__(self) -> None:
+        if self.weights.ndim != 2 or len(self.weights) != len(self.names) or len(self.voluntary) != len(self.names):
+            raise ShapeError(
+                f"Regions: found {len(self.names)} names, weights {tuple(self.weights.shape)} and voluntary "
+                f"{tuple(self.voluntary.shape)}, expected (R,), (R,F) and (R,)"
+            )
+
+    def patch_weights(self, patches: Tensor, areas: Tensor) -> Tensor:
+        """How much each patch counts in each region, (R,P), of sum 1: by its area and the weight of its triangles.
+
+        Args:
+            patches: the patch of each triangle, (F,) int64.
+            areas: of the triangles, (F,).
+        """
+        shared = self.weights.float() * areas.float()
+        total = shared.new_zeros(len(shared), int(patches.max()) + 1).index_add(1, patches, shared)
+        return total / total.sum(1, keepdim=True)
+
+    def vertex_weights(self, faces: Tensor, vertex_count: int) -> Tensor:
+        """The share of each region in each vertex, (R,V), of sum 1 in every vertex: the mean of the triangles around.
+
+        A vertex of no triangle belongs to all regions alike.
+        """
+        ids = faces.flatten()
+        each = self.weights.float().repeat_interleave(3, dim=1)
+        total = each.new_zeros(len(each), vertex_count).index_add(1, ids, each)
+        loose = total.sum(0) == 0
+        total[:, loose] = 1.0
+        return total / total.sum(0)
+
+
+def find_regions(
+    displacements: Tensor,
+    neutral: Tensor,
+    faces: Tensor,
+    count: int = 13,
+    landmarks: Tensor | None = None,
+    sigma: float = SIGMA,
+    seed: int = 0,
+) -> Regions:
+    """Regions of correlated motion, from frames in memory.
+
+    Args:
+        displacements: of the frames from the neutral, laid on it, (K,V,3), millimetres.
+        neutral, faces, count, landmarks, sigma, seed, Returns, Raises, Source: as :func:`regions_of_motion`.
+    """
+    patches = grow_patches(faces, len(neutral), max(4, min(100, len(neutral) // 400)), seed)
+    areas = triangle_areas(neutral, faces)
+    motion = torch.cat([patch_means(some[:, faces].mean(2), patches, areas) for some in displacements.split(8)])
+    return regions_of_motion(motion, patches, neutral, faces, count, landmarks, sigma, seed)
+
+
+def regions_of_motion(
+    motion: Tensor,
+    patches: Tensor,
+    neutral: Tensor,
+    faces: Tensor,
+    count: int = 13,
+    landmarks: Tensor | None = None,
+    sigma: float = SIGMA,
+    seed: int = 0,
+) -> Regions:
+    """Regions of correlated motion, from the motion of patches.
+
+    With landmarks the lids of each eye are regions of their own, the mouth's and the brows' are halves, all are named
+    by their place, and mouth and brows are marked as voluntary. What hardly moves goes to the region next to it.
+
+    Args:
+        motion: displacements (or shape features) of the patches in each frame, (K,P,C).
+        patches: the patch of each triangle, (F,) int64.
+        neutral: (V,3), millimetres, upright, looking along z.
+        faces: (F,3) int64.
+        count: of regions.
+        landmarks: vertex ids of the 68 iBUG landmarks.
+        sigma: of the borders, millimetres.
+        seed: of the clustering.
+
+    Returns:
+        The regions; each is connected but for parts of the mesh that hang on nothing.
+
+    Raises:
+        ShapeError: shapes do not fit each other.
+        ValueRangeError: too little moves for so many regions, or a number is out of its range.
+
+    Source: Tena, De la Torre, Matthews 2011; Facial Performance Enhancement Using Dynamic Shape Space Analysis,
+    section 4.3.
+    """
+    checked_number("sigma", sigma, 0.0, above=True)
+    checked_count("count", count, 3 if landmarks is not None else 1)
+    if motion.ndim != 3 or motion.shape[1] != int(patches.max()) + 1 or len(patches) != len(faces):
+        raise ShapeError(
+            f"regions: found motion {tuple(motion.shape)} and patches {tuple(patches.shape)} for {len(faces)} "
+            "triangles, expected (K,P,C) and (F,)"
+        )
+    if landmarks is not None and len(landmarks) != _LANDMARKS:
+        raise ValueRangeError(f"landmarks: found {len(landmarks)} vertices, expected the 68 iBUG landmarks")
+    if not bool(torch.isfinite(motion).all()):
+        raise ValueRangeError("regions: motion holds NaN or infinite entries, expected finite ones")
+    links = neighbouring_triangles(faces)
+    across = patches[links].sort(1).values
+    across = across[across[:, 0] != across[:, 1]].unique(dim=0)
+    middles = torch.stack(corners(neutral, faces)).mean(0)
+    centres = patch_means(middles[None], patches, triangle_areas(neutral, faces))[0]
+    eyes = (
+        {} if landmarks is None else {name: _eye(neutral, faces, landmarks[list(ids)]) for name, ids in _EYES.items()}
+    )
+    eyes = {name: mask for name, mask in eyes.items() if bool(mask.any())}
+    clusters = motion_clusters(
+        motion.double().numpy(),
+        centres.double().numpy(),
+        across.numpy(),
+        count - len(eyes),
+        _midline(neutral, landmarks),
+        _expressive_patches(landmarks, faces, patches),
+        seed,
+    )
+    labels = torch.from_numpy(clusters)[patches]
+    for number, mask in enumerate(eyes.values(), start=count - len(eyes)):
+        labels[mask] = number
+    labels = _connected(labels, links, middles)
+    names, voluntary = named_regions(labels, count, neutral, faces, landmarks, tuple(eyes))
+    return Regions(names, soft_weights(labels, count, neutral, faces, sigma), voluntary)
+
+
+def _midline(neutral: Tensor, landmarks: Tensor | None) -> float:
+    if landmarks is None:
+        return float(0.5 * (neutral[:, 0].amin() + neutral[:, 0].amax()))
+    return float(neutral[landmarks[list(_MIDDLE)], 0].mean())
+
+
+def _expressive_patches(landmarks: Tensor | None, faces: Tensor, patches: Tensor) -> np.ndarray:
+    """The patches of mouth and brows."""
+    if landmarks is None:
+        return np.zeros(0, dtype=np.int64)
+    shown = torch.isin(faces, landmarks[[*range(17, 27), *range(48, 68)]]).any(1)
+    return patches[shown].unique().numpy()
+
+
+def _eye(neutral: Tensor, faces: Tensor, lids: Tensor) -> Tensor:
+    """The triangles (F,) around the edges of one eye's lids."""
+    width = float(torch.cdist(neutral[lids], neutral[lids]).max())
+    # Landmarks are a few vertices of the lids' edges: what lies between them, too.
+    distance = surface_distances(neutral, faces, lids, (0.3 + _LID_REACH) * width)
+    return distance[faces].amax(1) <= (0.2 + _LID_REACH) * width
+
+
+def _connected(labels: Tensor, links: Tensor, middles: Tensor) -> Tensor:
+    """The same labels of triangles, with what hangs apart from the largest piece of its region given to a neighbour."""
+    own = links[labels[links[:, 0]] == labels[links[:, 1]]]
+    piece = _pieces(own, len(labels))
+    sizes = piece.bincount()
+    largest = torch.zeros(int(labels.max()) + 1, dtype=torch.int64).scatter_reduce(0, labels, sizes[piece], "amax")
+    keep = sizes[piece] == largest[labels]
+    seeds = keep.nonzero()[:, 0].numpy()
+    grown = grow_labels(seeds, labels[keep].numpy(), neighbour_table(links.numpy(), len(labels)))
+    lost = torch.from_numpy(grown < 0)
+    result = torch.from_numpy(grown)
+    if bool(lost.any()):  # parts of the mesh that no edge joins to any region
+        nearest = KDTree(middles[~lost].numpy()).query(middles[lost].numpy())[1]
+        result[lost] = result[~lost][torch.from_numpy(nearest)]
+    return result
+
+
+def _pieces(links: Tensor, count: int) -> Tensor:
+    """The connected piece of each triangle, (F,), by links (E,2)."""
+    # A triangle of a pair twice: the same search as over a mesh's vertices.
+    return components(torch.cat([links, links[:, 1:]], dim=1), count)
