@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -32,29 +33,35 @@ class StreamingBasis:
         self._kept = min(2 * rank, max(rank, _NUMBERS // size))
         self._basis = torch.zeros(0, size)
         self._coefficients = torch.zeros(0, 0, dtype=torch.float64)
-        self._energies = torch.zeros(0, dtype=torch.float64)
+        self._total = torch.zeros((), dtype=torch.float64)
+        self._dropped = torch.zeros((), dtype=torch.float64)
 
     @property
     def state(self) -> dict[str, Tensor]:
         """Everything it has learned so far."""
-        return {"basis": self._basis, "coefficients": self._coefficients, "energies": self._energies}
+        return {
+            "basis": self._basis,
+            "coefficients": self._coefficients,
+            "total": self._total,
+            "dropped": self._dropped,
+        }
 
     def load(self, state: Mapping[str, Tensor]) -> None:
         """Goes on where another one was."""
         self._basis, self._coefficients = state["basis"], state["coefficients"]
-        self._energies = state["energies"]
+        self._total, self._dropped = state["total"], state["dropped"]
 
     def add(self, rows: Tensor) -> None:
         """Learns from more rows, (B,n) float32, whose memory it uses."""
         if rows.ndim != 2 or rows.shape[1] != self._basis.shape[1]:
             raise ShapeError(f"rows: found {tuple(rows.shape)}, expected (B,{self._basis.shape[1]})")
-        energy = rows.square().sum(1, dtype=torch.float64)
+        energy = rows.square().sum(dtype=torch.float64)
         inside = rows @ self._basis.T
         rest = rows.addmm_(inside, self._basis, alpha=-1)
         again = rest @ self._basis.T  # once more: rounding leaves a part that is not orthogonal
         rest.addmm_(again, self._basis, alpha=-1)
         values, vectors = torch.linalg.eigh((rest @ rest.T).double())
-        new = values > _NEGLIGIBLE * float(energy.sum())
+        new = values > _NEGLIGIBLE * float(energy)
         roots = values[new].sqrt()
         own = vectors[:, new] * roots
         old = len(self._basis)
@@ -63,7 +70,9 @@ class StreamingBasis:
         stacked[: len(known), :old] = known
         stacked[len(known) :, :old] = (inside + again).double()
         stacked[len(known) :, old:] = own
-        _, turned = torch.linalg.eigh(stacked.T @ stacked)
+        held, turned = torch.linalg.eigh(stacked.T @ stacked)
+        self._total = self._total + energy
+        self._dropped = self._dropped + held[: -self._kept].clamp(min=0).sum()
         turned = turned[:, -self._kept :].flip(1)
         lift = (vectors[:, new] / roots).T.float()
         to_old, to_new = turned[:old].T.float(), turned[old:].T.float() @ lift
@@ -72,7 +81,6 @@ class StreamingBasis:
             some = slice(begin, begin + _CHUNK)
             basis[:, some] = to_old @ self._basis[:, some] + to_new @ rest[:, some]
         self._basis, self._coefficients = basis, stacked @ turned
-        self._energies = torch.cat([self._energies, energy])
 
     def finished(self) -> LearnedBasis:
         """The components of the rows so far."""
@@ -80,26 +88,25 @@ class StreamingBasis:
         # Entries near 1, not near 1 / sqrt(n), which half precision would not hold to its full digits.
         unit = self._basis.shape[1] ** 0.5
         coefficients = self._coefficients[:, :count]
-        kept, total = coefficients.square().sum(1), self._energies
-        lost = (1 - kept / total.clamp(min=1e-30)).clamp(min=0)
-        share = float(1 - kept.sum() / total.sum()) if float(total.sum()) > 0 else 0.0
+        lost = float(self._dropped + self._coefficients[:, count:].square().sum())
         components = (self._basis[:count] * unit).half()
-        return LearnedBasis(components, (coefficients / unit).float(), lost.float(), max(0.0, share))
+        share = lost / float(self._total) if float(self._total) > 0 else 0.0
+        return LearnedBasis(components, (coefficients / unit).float(), min(1.0, share))
 
 
+@dataclass(frozen=True, eq=False)
 class LearnedBasis:
     """Components and coefficients of what was learned.
 
     Args:
         components: (r,n), half precision, root mean square 1 each.
         coefficients: of every row, (K,r), in the rows' unit.
-        lost: the share of each row's energy that the components do not hold, (K,).
-        lost_share: the same of all rows together.
+        lost_share: of the rows' energy, by what the components do not hold.
     """
 
-    def __init__(self, components: Tensor, coefficients: Tensor, lost: Tensor, lost_share: float) -> None:
-        self.components, self.coefficients = components, coefficients
-        self.lost, self.lost_share = lost, lost_share
+    components: Tensor
+    coefficients: Tensor
+    lost_share: float
 
 
 def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor:

@@ -80,6 +80,7 @@ class EnhancementModel(nn.Module):
         color_rank: components of the colours; 0 without colours.
         detail: how detail is encoded: as "displacements" from the smooth part or as "gradients" of its triangles.
         lost_share: of the details' energy, by their compression.
+        keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
     works on displacements, alignment and averages by patches; detail is of low rank.
@@ -111,6 +112,7 @@ class EnhancementModel(nn.Module):
         color_rank: int = 0,
         detail: DetailKind = "displacements",
         lost_share: float = 0.0,
+        keeps_input: bool = False,
     ) -> None:
         super().__init__()
         if detail not in _DETAILS:
@@ -121,6 +123,7 @@ class EnhancementModel(nn.Module):
         self.wavelength = checked_number("wavelength", wavelength, above=True, most=1e6)
         self.detail: DetailKind = detail
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
+        self.keeps_input = bool(keeps_input)
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
@@ -155,6 +158,7 @@ class EnhancementModel(nn.Module):
             "color_rank": len(self.color_components),
             "detail": self.detail,
             "lost_share": self.lost_share,
+            "keeps_input": self.keeps_input,
         }
 
     @classmethod
@@ -170,6 +174,7 @@ class EnhancementModel(nn.Module):
         sequences: Tensor,
         neutral: Tensor,
         *,
+        coarse: Tensor | MeshSequence | None = None,
         fps: float = 30.0,
         wavelength: float = WAVELENGTH,
         patch_size: int = 100,
@@ -190,6 +195,10 @@ class EnhancementModel(nn.Module):
             sequences: the number of each frame's sequence, (K,) int64; a sequence goes from the neutral to an extreme
                 expression and back.
             neutral: (V,3), millimetres.
+            coarse: what the coarse animation shows of the same frames in the same places, (K,V,3), where it is known:
+                the actor's rig fitted to them, or the thin shell through their markers. Then the detail is what such an
+                animation lacks, and what it has itself beyond the smooth part stays. Absent, the smooth part's detail
+                takes the place of the input's own.
             fps: of the frames.
             wavelength: of which the smooth part keeps half the amplitude, millimetres.
             patch_size: vertices a patch.
@@ -213,6 +222,10 @@ class EnhancementModel(nn.Module):
         """
         progress = silent if progress is None else progress
         check_topology(frames, faces, neutral)
+        if coarse is not None:
+            check_topology(coarse, faces, neutral)
+            if len(coarse) != len(frames):
+                raise ShapeError(f"coarse: found {len(coarse)} frames, expected {len(frames)}, one for each")
         check_sequences(sequences, len(frames))
         checked_count("rank", rank, 1)
         if colors is not None and colors.shape != (len(frames), len(neutral), 3):
@@ -226,7 +239,7 @@ class EnhancementModel(nn.Module):
         )
         folder = None if folder is None else Path(folder)
         size = 3 * len(neutral) if detail == "displacements" else 9 * len(faces)
-        learned = learn_frames(frames, encoder, rank, size, settings, folder, progress)
+        learned = learn_frames(frames, coarse, encoder, rank, size, settings, folder, progress)
         warn_without_neutral(learned.motion)
         regions = regions_of_motion(learned.motion, patches, neutral, faces, region_count, landmarks, seed=seed)
         hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
@@ -243,6 +256,7 @@ class EnhancementModel(nn.Module):
             0 if hue is None else hue.rank,
             detail,
             learned.basis.lost_share,
+            coarse is not None,
         )
         model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
         model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
@@ -357,23 +371,24 @@ class EnhancementModel(nn.Module):
             raise TopologyError(f"patches: found some beyond the {self.database_features.shape[1]} there are")
 
     def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
-        smooth, pose = self._smooth(coarse)
+        smooth, displacements, pose = self._smooth(coarse)
         encoder = self._prepared()
         turned = encoder.frames.turned(smooth)
         matched = self._matching().project(encoder.gradients.features(smooth, turned), previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         weights = encoder.detail.site_weights(self.vertex_weights)
         details = blended(self.components, coefficients, weights)
-        vertices = encoder.detail.compose(self.neutral.to(smooth) + smooth, details, turned)
+        base = self.neutral.to(smooth) + (displacements if self.keeps_input else smooth)
+        vertices = encoder.detail.compose(base, details, turned)
         return Enhancement(
             pose.inverse().apply(vertices), matched.weights, matched.distances, matched.distances > _OUTSIDE
         )
 
-    def _smooth(self, coarse: Tensor) -> tuple[Tensor, Similarity]:
-        """The smooth part's displacements from the neutral, and how the frames were laid on it."""
+    def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:
+        """The smooth part of displacements from the neutral, all of them, and how the frames were laid on it."""
         encoder = self._prepared()
         displacements, pose = encoder.alignment.laid_on_neutral(coarse, "coarse")
-        return encoder.low_pass(displacements), pose
+        return encoder.low_pass(displacements), displacements, pose
 
     def _prepared(self) -> Encoder:
         return self._encoder.get(

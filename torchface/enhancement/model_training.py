@@ -65,6 +65,7 @@ class LearnedFrames:
 
 def learn_frames(
     frames: Tensor | MeshSequence,
+    coarse: Tensor | MeshSequence | None,
     encoder: Encoder,
     rank: int,
     size: int,
@@ -76,6 +77,7 @@ def learn_frames(
 
     Args:
         frames: (K,V,3), millimetres, any rigid pose each.
+        coarse: what a coarse animation shows of the same frames, in the same poses, where that is known.
         encoder: for their mesh.
         rank: components of the detail to keep at most.
         size: numbers of one frame's detail.
@@ -90,7 +92,7 @@ def learn_frames(
     """
     count = len(frames)
     path = None if folder is None else folder / CHECKPOINT
-    whole = content_key("learn_frames/1", settings=key, frames=_identity(frames), rank=rank)
+    whole = content_key("learn_frames/1", settings=key, frames=_identity(frames), coarse=_identity(coarse), rank=rank)
     basis = StreamingBasis(size, min(rank, count))
     features, motion, done = [], [], 0
     if path is not None and (found := read_checkpoint(path, whole)) is not None:
@@ -100,15 +102,16 @@ def learn_frames(
     saved = time.monotonic()
     with torch.no_grad():
         while done < count:
-            some = frames[done : done + block] if isinstance(frames, Tensor) else frames.read(done, done + block)
-            _check_finite(some, done)
-            displacements, _ = encoder.alignment.laid_on_neutral(some.float(), f"frames from {done} on")
+            some = _read(frames, done, block)
+            shown = some if coarse is None else _read(coarse, done, block)
+            displacements, pose = encoder.alignment.laid_on_neutral(shown, f"frames from {done} on")
             smooth = encoder.low_pass(displacements)
             turned = encoder.frames.turned(smooth)
             features.append(encoder.gradients.features(smooth, turned))
             motion.append(encoder.gradients.motion(smooth))
             neutral = encoder.alignment.neutral
-            basis.add(encoder.detail.encode(neutral + smooth, neutral + displacements, turned))
+            base = neutral + (smooth if coarse is None else displacements)
+            basis.add(encoder.detail.encode(base, pose.apply(some), turned))
             done += len(some)
             progress("learning detail", done, count)
             if path is not None and done < count and time.monotonic() - saved >= _SECONDS:
@@ -133,17 +136,20 @@ def warn_without_neutral(motion: Tensor) -> None:
         )
 
 
-def _check_finite(frames: Tensor, first: int) -> None:
-    bad = (~torch.isfinite(frames)).any(-1).any(-1).nonzero()[:, 0]
+def _read(frames: Tensor | MeshSequence, first: int, count: int) -> Tensor:
+    """Some frames, which must be finite."""
+    found = frames[first : first + count] if isinstance(frames, Tensor) else frames.read(first, first + count)
+    bad = (~torch.isfinite(found)).any(-1).any(-1).nonzero()[:, 0]
     if len(bad):
         raise ValueRangeError(
             f"frames: frame {first + int(bad[0])} holds NaN or infinite vertices, expected none; leave the frame out "
             "or repair it"
         )
+    return found.float()
 
 
-def _identity(frames: Tensor | MeshSequence) -> object:
-    if isinstance(frames, Tensor):
+def _identity(frames: Tensor | MeshSequence | None) -> object:
+    if not isinstance(frames, MeshSequence):
         return frames
     # A thousand dense meshes take a minute to read: their file is known by name, size and time.
     told = frames.path.stat()
