@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.meshes.operators import triangle_normals, vertex_normals
 from torchface.io import load_rig
 from torchface.mesh import Annotations
 from torchface.rig import BlendshapeRig
@@ -134,3 +135,16 @@ def test_a_rig_without_the_68_landmarks_is_refused(person: WrinkledPerformer) ->
         WrinkledPerformer(rig=BlendshapeRig(few, person.rig.deltas, person.names))
     with pytest.raises(ValueRangeError, match="one of them"):
         WrinkledPerformer(torch.zeros(3), rig=person.rig)
+
+
+def test_folds_are_no_height_field_and_turn_no_triangle_over(person: WrinkledPerformer) -> None:
+    weights = brow_raise(person, torch.ones(1))
+    folded, smooth = person.frames(weights, 30.0)[0].double(), person.smooth(weights)[0].double()
+    faces, moved = person.neutral.faces, folded - smooth
+    normals = vertex_normals(smooth, faces)
+    height = (moved * normals).sum(1)
+    along = (moved - height[:, None] * normals).norm(dim=1)
+    assert height.max() > 0.2
+    assert height.min() < -0.3
+    assert along.max() > 0.08
+    assert ((triangle_normals(folded, faces) * triangle_normals(smooth, faces)).sum(1) > 0).all()

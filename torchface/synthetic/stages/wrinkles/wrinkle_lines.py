@@ -246,7 +246,7 @@ def _chin(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
         length, bow = draw.between(0.9, 1.9) * scale, draw.between(-0.6, 0.6)
         curve = torch.stack([along, bow * (1 - along.square())], 1) * length
         turn = torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        yield _Stroke("chin", curve @ turn + place, draw.between(0.3, 0.6), draw.between(1.6, 2.3) * scale, 0.04)
+        yield _Stroke("chin", curve @ turn + place, draw.between(0.25, 0.5), draw.between(1.8, 2.6) * scale, 0.04)
 
 
 def _lips(marks: Tensor, scale: float, draw: _Draw) -> Iterator[_Stroke]:
