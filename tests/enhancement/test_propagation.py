@@ -86,15 +86,15 @@ def own_solution(
 @pytest.mark.parametrize("operator", [True, False])
 def test_it_agrees_with_a_solve_of_its_own(operator: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(propagation, "_OPERATOR_POINTS", 400 if operator else 0)
-    vertices, faces = sheet(20.0, 220)
-    points = sites(faces, 40)
-    wanted = torch.randn(2, 40, 3, generator=torch.Generator().manual_seed(2))
+    vertices, faces = sheet(20.0, 130)
+    points = sites(faces, 16)
+    wanted = torch.randn(2, 16, 3, generator=torch.Generator().manual_seed(2))
     found = ThinShell(vertices, faces, points, 1.0, 50.0).spread(wanted)
     expected = own_solution(
-        vertices, faces, points, (1.0, 50.0), wanted.permute(1, 0, 2).reshape(40, 6).double().numpy()
+        vertices, faces, points, (1.0, 50.0), wanted.permute(1, 0, 2).reshape(16, 6).double().numpy()
     )
     expected = torch.from_numpy(expected).float().reshape(-1, 2, 3).transpose(0, 1)
-    assert expected.abs().max() > 15
+    assert expected.abs().max() > 2
     torch.testing.assert_close(found, expected, atol=1e-3 if operator else 1e-2, rtol=0)
     torch.testing.assert_close(points.on(faces, found), wanted, atol=1e-5 if operator else 1e-3, rtol=0)
 

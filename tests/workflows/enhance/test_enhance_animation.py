@@ -33,7 +33,7 @@ from torchface.mesh import Mesh
 from torchface.progress import silent
 from torchface.registration import Registration
 from torchface.take import Take, Track
-from torchface.workflows.enhance import enhanced_frames, head_correspondence
+from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
 from torchface.workflows.enhance.animation_targets import animation_targets
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
@@ -65,8 +65,9 @@ def shuffled(actor: Actor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_weights_become_meshes_an_animation_a_video_and_a_report(
-    actor: Actor, expected: torch.Tensor, tmp_path: Path, coarse_figures: None
+    actor: Actor, expected: torch.Tensor, tmp_path: Path, coarse_figures: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(enhance_views, "_VIDEO_HEIGHT", 80)
     settings = EnhanceSettings(InputSettings(rig=actor.folder / "rig.glb"), meshes="ply")
     done = enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
     found = MeshSequence(tmp_path / "enhanced.safetensors").read(0, FRAMES)

@@ -17,7 +17,7 @@ from torchface.take import Take, Track
 
 MEGABYTES = 200.0
 _BYTES_A_VERTEX = 24  # of a target: position and normal
-_EXACT_MM = 0.02
+_EXACT_MM = 0.005
 _SAMPLE_BYTES = 5 * 2**28
 _MOST_SAMPLED = 200
 _CHUNK = 8
@@ -47,7 +47,7 @@ def animation_targets(
 ) -> AnimationTargets:
     r"""Every frame as a target where these are small enough, else as few principal components as show it.
 
-    Components are those of frames spread over the animation, as many as leave 0.02 mm, root mean square, or as fit.
+    Components are those of frames spread over the animation, as many as leave 0.005 mm, root mean square, or as fit.
     Their weights in all frames are projections: no frame is left out.
 
     Args:

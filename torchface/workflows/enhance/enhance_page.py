@@ -42,7 +42,7 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
         ),
         Section(
             "Mean curvature",
-            "Folds are blue, ridges red; the scale ends at 1/4 mm⁻¹.",
+            "Folds are blue, ridges red; the scale ends at 0.1 mm⁻¹. Waves of 8 mm are shown at half, pores hardly.",
             figures=[("curvature.png", curvature_views(shown, done.mesh, height))],
         ),
         Section(

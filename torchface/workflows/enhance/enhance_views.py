@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
+from torchface.enhancement.low_pass import LowPass
 from torchface.enhancement.propagation import rigid_motion
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
@@ -27,10 +28,11 @@ from torchface.workflows.enhance.enhanced_frames import EnhancedFrames
 
 DIVERGING = "RdBu_r"
 _DETAILED = 0.25  # of the detail where there is most
-_OUTERMOST = 0.02
+_OUTERMOST = 0.005
 _DOT = (60, 230, 60)
 _VIDEO_HEIGHT, _MOST_DRAWN = 480, 450
-_CURVATURE = 0.25  # end of the colour scale, one over millimetres
+_PORES_MM = 8.0  # of which the curvature pictures keep half
+_CURVATURE = 0.1  # end of the colour scale, one over millimetres
 _ALIGNED_BY = 4000  # vertices, which are plenty for a rigid motion
 
 
@@ -117,13 +119,14 @@ def _given(frame: ShownFrame, animation: CoarseAnimation, mesh: Mesh, camera: Ca
 
 
 def curvature_views(shown: list[ShownFrame], mesh: Mesh, height: int) -> Tensor:
-    """A row a frame: mean curvature of smooth and enhanced, folds blue and ridges red; (3,H,W)."""
+    """A row a frame: mean curvature of smooth and enhanced without pores, folds blue and ridges red; (3,H,W)."""
     rows = []
     camera = frame_face(mesh, width=height * 4 // 5, height=height)
+    without_pores = LowPass(mesh.vertices, mesh.faces, _PORES_MM)
     for frame in shown:
         pictures = []
         for title, vertices in (("smooth", frame.smooth), ("enhanced", frame.enhanced)):
-            bent = mean_curvature(vertices, mesh.faces)
+            bent = without_pores(mean_curvature(vertices, mesh.faces)[None, :, None])[0, :, 0]
             colors = heat_colors(bent + _CURVATURE, 2 * _CURVATURE, DIVERGING)
             picture = render(mesh.with_vertices(vertices), camera, colors)
             pictures.append(caption(picture, f"{title}, frame {frame.number}", 12))

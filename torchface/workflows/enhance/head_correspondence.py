@@ -164,7 +164,11 @@ def _by_registration(head: Mesh, model: Mesh, progress: Progress) -> tuple[Tenso
     marks = [None if one is None else one.landmarks for one in both]
     if marks[0] is not None and marks[1] is not None and len(marks[0]) == len(marks[1]):
         landmarks = marks[0], model.vertices[marks[1]].double()
-    found = register(head, model, landmarks, texture_size=0, progress=progress)
+
+    def told(step: str, done: int = 0, total: int = 0) -> None:
+        progress("laying the input on the model", done, total)
+
+    found = register(head, model, landmarks, texture_size=0, progress=told)
     return found.mesh.vertices, found.pose, found.matched & (found.distance < _NEAR)
 
 
