@@ -25,13 +25,14 @@ from torchface.errors import (
 )
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import MeshSequence, load_rig, load_take, save_animation, save_mesh, save_take
+from torchface.io import MeshSequence, load_rig, load_take, save_animation, save_mesh, save_rig, save_take
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
 from torchface.mesh import Mesh
 from torchface.progress import silent
 from torchface.registration import Registration
+from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
 from torchface.workflows.enhance.animation_targets import animation_targets
@@ -239,6 +240,29 @@ def test_long_animations_are_shown_by_components(actor: Actor, tmp_path: Path) -
     assert float(off) < 0.05  # two extremes span the take
     with pytest.raises(ValueRangeError, match="expected at least"):
         animation_targets(sequence, actor.mesh.vertices, 0.5 * each, silent)
+
+
+def test_another_actor_keeps_the_own_head_and_gets_the_detail(actor: Actor, tmp_path: Path) -> None:
+    wide = torch.tensor([1.12, 1.0, 0.92])
+    other = BlendshapeRig(
+        actor.mesh.with_vertices(actor.mesh.vertices * wide), actor.rig.deltas * wide, actor.rig.names
+    )
+    save_rig(other, tmp_path / "other.glb")
+    made = {}
+    for detail in (0.0, 1.0):
+        settings = replace(PLAIN, given=InputSettings(rig=tmp_path / "other.glb"), detail=detail)
+        done = enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path / str(detail), settings)
+        assert any("another person" in line for line in done.notes)
+        made[detail] = done.frames.sequence.read(0, FRAMES)
+    frames = other(actor.weights)
+    assert float((made[1.0] - frames).norm(dim=-1).mean()) < 0.5
+    model = zoo.get_model(Path(actor.model))
+    with torch.no_grad():
+        plain = model.on_actor(model.neutral, 0.0).enhance(actor.frames[-1:]).vertices[0]
+        own = model.enhance(actor.frames[-1:]).vertices[0] - plain
+    added = made[1.0][-1] - made[0.0][-1]
+    assert float(own.norm(dim=-1).max()) > 0.3
+    assert float(torch.corrcoef(torch.stack([added.flatten(), own.flatten()]))[0, 1]) > 0.9
 
 
 def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> None:

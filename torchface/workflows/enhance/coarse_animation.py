@@ -35,6 +35,7 @@ class CoarseAnimation:
         residual: root mean square distance of its face at rest from the model's, laid on one another, millimetres; None
             where it holds no face at rest.
         notes: lines for people to read; warnings begin with ``warning: ``.
+        head: its own head at rest in the model's vertices, (V,3), where that is another person's.
     """
 
     path: Path
@@ -46,6 +47,7 @@ class CoarseAnimation:
     shown_faces: Tensor | None
     residual: float | None = None
     notes: tuple[str, ...] = ()
+    head: Tensor | None = None
 
 
 def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> CoarseAnimation:
@@ -81,6 +83,7 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         model.faces,
         residual,
         (*rate_notes(animated, fps), *notes),
+        animated.neutral.vertices.float() if animated.rig is not None and residual > OTHER_ACTOR_MM else None,
     )
 
 
@@ -139,6 +142,6 @@ def residual_notes(residual: float, path: Path) -> list[str]:
     if residual > OTHER_ACTOR_MM:
         return [
             f"warning: at rest the vertices lie {residual:.1f} mm (root mean square) from the model's; it seems to be "
-            "another person, whose wrinkles will be the model's"
+            "another person, who gets the wrinkles of the model's actor"
         ]
     return []

@@ -43,6 +43,7 @@ class EnhanceSettings:
         meshes: also every frame as a mesh file of this kind.
         glb: the animated ``.glb``.
         megabytes: that its morph targets may take.
+        detail: how strong the detail is; 1 is the actor's.
         video: the video of input and result side by side.
     """
 
@@ -50,6 +51,7 @@ class EnhanceSettings:
     meshes: Literal["none", "obj", "ply"] = "none"
     glb: bool = True
     megabytes: float = MEGABYTES
+    detail: float = 1.0
     video: bool = True
 
 
@@ -138,6 +140,8 @@ def _enhance(path: Path, model_name: str, out: Path, settings: EnhanceSettings, 
     neutral = Mesh(model.neutral, model.faces)
     state = make_folder(out / STATE)
     animation = read_coarse(path, neutral, settings.given, state, progress)
+    if animation.head is not None or settings.detail != 1:
+        model = model.on_actor(model.neutral if animation.head is None else animation.head, settings.detail)
     given = settings.given
     key = content_key(
         _METHOD, input=path, rig=given.rig, attachment=given.attachment, pairs=given.pairs, given=given, model=model

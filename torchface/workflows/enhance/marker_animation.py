@@ -21,7 +21,7 @@ from torchface.take import Take
 from torchface.temporal.gap_filling import bridged
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale
 from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
-from torchface.workflows.enhance.mesh_input import placed
+from torchface.workflows.enhance.mesh_input import PLACE, placed
 from torchface.workflows.marker_input import MarkerOptions, read_markers
 
 _SAME_SIZE = 0.05
@@ -144,7 +144,7 @@ def marker_animation(
         lambda begin, end: markers[begin:end],
         None,
         offsets,
-        (*notes, *found, *bridges),
+        (*notes, *found, *bridges, PLACE),
     )
 
 

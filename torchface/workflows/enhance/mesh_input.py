@@ -14,6 +14,9 @@ from torchface.workflows.animated_meshes import AnimatedMesh
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_finite, known_rate, rate_notes
 from torchface.workflows.enhance.head_correspondence import HeadCorrespondence, correspondence_notes
 
+PLACE = "the result stands where the model stands, not where the input does"
+"""What users are told whose input has a space of its own."""
+
 
 def other_topology(
     animated: AnimatedMesh, model: Mesh, found: HeadCorrespondence, fps: float | None
@@ -54,7 +57,7 @@ def other_topology(
         lambda begin, end: placed(found.pose, animated.read(begin, end)),
         animated.neutral.faces,
         found.residual,
-        (*rate_notes(animated, fps), *assumed, *correspondence_notes(found, animated.path)),
+        (*rate_notes(animated, fps), *assumed, *correspondence_notes(found, animated.path), PLACE),
     )
 
 
