@@ -13,7 +13,7 @@ from app_browser import Page, film_camera, static_host
 from film import write_y4m
 from headless_chromium import headless_chromium, until
 from PIL import Image
-from test_app_in_chromium import WATCH, allow_camera, assert_same_weights, record
+from recorded_take import allow_camera, assert_same_weights, record, watch
 
 from torchface.errors import MissingExtraError
 from torchface.workflows.browser_app import export_app
@@ -45,7 +45,7 @@ def opened(app: Path, frames: np.ndarray, folder: Path, isolated: bool = False) 
         static_host(app, isolated) as host,
         headless_chromium(folder / "profile", *film_camera(folder / "film.y4m"), size=(800, 700)) as driver,
     ):
-        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
+        watch(driver)
         allow_camera(driver, "granted")
         driver.get(f"{host.url}/index.html")
         yield Page(driver)

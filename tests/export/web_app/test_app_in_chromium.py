@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from app_browser import Page, Server, elsewhere, film_camera, static_host
 from film import planted_film, write_y4m
 from headless_chromium import headless_chromium, until
 from planted_graph import write_planted_graph
+from recorded_take import Recorded, allow_camera, assert_same_weights, record, watch, watched
 from rig_samples import quad_sheet
 from test_gltf_viewers import assert_valid, node  # noqa: F401  (its packages)
 
@@ -30,7 +29,6 @@ from torchface.workflows.browser_app import export_app
 from torchface.workflows.track.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
-WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
 FRAMES, RATE = 48, 15
 WINDOW = (480, 360)
 BROWSERS_OWN = ("google.com", "googleapis.com", "gstatic.com", "duckduckgo.com")
@@ -85,7 +83,7 @@ def opened(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open
             folder / "profile", *switches, "--disable-3d-apis", f"--proxy-server={outside.url}", size=WINDOW
         ) as driver,
     ):
-        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
+        watch(driver)
         allow_camera(driver, "granted")
         driver.get(f"{host.url}/index.html")
         page = Page(driver)
@@ -94,65 +92,9 @@ def opened(app: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open
         yield Open(page, host, outside)
 
 
-def allow_camera(driver: Any, setting: str) -> None:
-    driver.execute_cdp_cmd("Browser.setPermission", {"permission": {"name": "camera"}, "setting": setting})
-
-
-def watched(page: Page, what: str) -> Any:
-    return page.driver.execute_script(f"return JSON.parse(JSON.stringify({what}))")
-
-
-def blob(page: Page, button: str) -> bytes:
-    """What a button downloads."""
-    page.click(button)
-    script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
-    return base64.b64decode(page.driver.execute_async_script(script))
-
-
-@dataclass
-class Recorded:
-    """What the page was shown and answered, and what it recorded of that."""
-
-    sent: list[dict]
-    solved: list[dict]
-    csv: Path
-    glb: Path
-
-    @property
-    def recorded(self) -> list[dict]:
-        """The answers that the recording holds, found by their weights."""
-        take = load_live_link(self.csv)
-        assert take.weights is not None
-        first_row = take.weights.values[0, :, 0].numpy()
-        first = next(i for i, one in enumerate(self.solved) if np.abs(one["weights"] - first_row).max() < 1e-6)
-        return self.solved[first : first + len(take)]
-
-
 @pytest.fixture(scope="module")
 def recorded(opened: Open, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return record(opened.page, tmp_path_factory.mktemp("recorded"), 10)
-
-
-def record(page: Page, folder: Path, frames: int) -> Recorded:
-    """Starts the camera, records so many frames or a few more, stops both, and downloads what the page made of it."""
-    page.driver.execute_script("watched.keep = true")
-    page.start()
-    page.click("record")
-    until(lambda: page.recorded_frames >= frames)
-    page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
-    page.driver.execute_script("watched.keep = false")
-    script = """
-    const done = arguments[0];
-    const withText = async (one) => ({...one, pixels: one.pixels && await watched.text(one.pixels)});
-    Promise.all(watched.sent.map(withText)).then(done);
-    """
-    sent = [one for one in page.driver.execute_async_script(script) if one["pixels"]]
-    solved = page.driver.execute_script(
-        "return watched.solved.map(s => ({...s, weights: [...s.weights], rotation: [...s.rotation]}))"
-    )
-    (folder / "take.csv").write_bytes(blob(page, "csv"))
-    (folder / "take.glb").write_bytes(blob(page, "glb"))
-    return Recorded(sent, solved, folder / "take.csv", folder / "take.glb")
 
 
 def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorded: Recorded) -> None:
@@ -164,23 +106,6 @@ def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorde
     np.testing.assert_allclose(rows.values[..., 0], answers, rtol=0, atol=1e-7)
     assert len(answers) > 5
     assert answers.std(0).min() > 0.01  # the film moves every shape
-
-
-def assert_same_weights(graph: Path, recorded: Recorded, tolerance: float) -> None:
-    """Runs the graph over the pixels that the page gave its worker, and compares the page's answers."""
-    session = onnxruntime.InferenceSession(graph)
-    size = next(one.shape[0] for one in session.get_inputs() if one.name == "state")
-    state = np.zeros(size, np.float32)
-    for sent, solved in zip(recorded.sent, recorded.solved, strict=False):
-        pixels = np.frombuffer(base64.b64decode(sent["pixels"]), np.uint8)
-        inputs = {
-            "image": pixels.reshape(sent["height"], sent["width"], 4),
-            "interval": np.array(solved["interval"], np.float32),
-            "controls": np.array([sent["pose"], sent["gain"], sent["smoothing"], sent["reset"], 0], np.float32),
-            "state": state,
-        }
-        weights, state = session.run(["weights", "next_state"], inputs)
-        np.testing.assert_allclose(solved["weights"], weights, rtol=0, atol=tolerance)
 
 
 def test_the_csv_has_the_cameras_times_and_the_heads_rotation(recorded: Recorded) -> None:
@@ -380,6 +305,68 @@ def test_calibration_is_spoken_and_left_with_escape(opened: Open, recorded: Reco
     driver.switch_to.active_element.send_keys(Keys.ESCAPE)
     assert not driver.find_element("id", "prompt").is_displayed()
     assert driver.switch_to.active_element.get_attribute("id") == "calibrate"
+
+
+def test_a_dropped_character_is_taken(opened: Open, tmp_path: Path) -> None:
+    """Dragged by the browser's own events, over the camera's picture and let go there."""
+    page, driver = opened.page, opened.page.driver
+    save_rig(sheet(("jawOpen",)), tmp_path / "dropped.glb")
+    data = {"items": [], "files": [str(tmp_path / "dropped.glb")], "dragOperationsMask": 1}
+    dragged = {"x": 150, "y": 200, "data": data}
+    dropping = "return document.body.classList.contains('dropping')"
+
+    def drag(kind: str) -> None:
+        driver.execute_cdp_cmd("Input.dispatchDragEvent", {"type": kind, **dragged})
+
+    def hinted() -> bool:
+        drag("dragOver")
+        return driver.execute_script(dropping)
+
+    def dropped() -> bool:
+        drag("dragOver")  # the browser lets go only where it knows by now that the page takes it
+        drag("drop")
+        return page.text("character-line") == "dropped.glb: your face moves 1 of its 1 shapes"
+
+    drag("dragEnter")
+    until(hinted)
+    until(dropped)
+    assert not driver.execute_script(dropping)
+    assert driver.current_url.startswith(opened.host.url)  # not left for the file
+
+
+def test_tab_goes_through_the_controls_in_the_order_in_which_they_stand(opened: Open, recorded: Recorded) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    page, driver = opened.page, opened.page.driver
+    page.start()
+    driver.execute_script("document.getElementById('start').focus()")
+    focused = """
+    const one = document.activeElement, { outlineStyle, outlineWidth } = getComputedStyle(one);
+    return [one.id || one.textContent, outlineStyle, parseFloat(outlineWidth)];
+    """
+    found = []
+    wanted = ["calibrate", "reset", "gain", "smoothing", "mirror", "record", "csv", "glb", "choose", "Licences"]
+    for _ in wanted:
+        ActionChains(driver).send_keys(Keys.TAB).perform()
+        found.append(driver.execute_script(focused))
+    assert [name for name, *_ in found] == wanted
+    assert all(style == "solid" and width >= 2 for _, style, width in found)  # and it is seen where one is
+
+
+def test_who_wants_no_motion_gets_none(opened: Open) -> None:
+    driver = opened.page.driver
+    moving = """
+    return [...document.querySelectorAll('*')].filter(one => {
+        const style = getComputedStyle(one);
+        return parseFloat(style.transitionDuration) > 0 || style.animationName !== 'none';
+    }).length;
+    """
+    assert driver.execute_script(moving) > 0
+    setting = {"name": "prefers-reduced-motion", "value": "reduce"}
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [setting]})
+    assert driver.execute_script(moving) == 0
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_every_control_has_a_name_for_screen_readers(opened: Open) -> None:

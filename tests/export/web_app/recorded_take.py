@@ -1,0 +1,95 @@
+"""What the page was shown and answered, recorded and downloaded; and what Python makes of the same pictures."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from app_browser import Page
+from headless_chromium import until
+
+from torchface.io.weights.live_link_csv import load_live_link
+
+_WATCH = (Path(__file__).parent / "watched_worker.js").read_text()
+
+
+def watch(driver: Any) -> None:
+    """Has the pages that are opened from now on keep what ``watched`` reads."""
+    driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": _WATCH})
+
+
+def allow_camera(driver: Any, setting: str) -> None:
+    driver.execute_cdp_cmd("Browser.setPermission", {"permission": {"name": "camera"}, "setting": setting})
+
+
+def watched(page: Page, what: str) -> Any:
+    return page.driver.execute_script(f"return JSON.parse(JSON.stringify({what}))")
+
+
+def blob(page: Page, button: str) -> bytes:
+    """What a button downloads."""
+    page.click(button)
+    script = "const done = arguments[0]; watched.text(watched.blobs.at(-1)).then(done)"
+    return base64.b64decode(page.driver.execute_async_script(script))
+
+
+@dataclass
+class Recorded:
+    """What the page was shown and answered, and what it recorded of that."""
+
+    sent: list[dict]
+    solved: list[dict]
+    csv: Path
+    glb: Path
+
+    @property
+    def recorded(self) -> list[dict]:
+        """The answers that the recording holds, found by their weights."""
+        take = load_live_link(self.csv)
+        assert take.weights is not None
+        first_row = take.weights.values[0, :, 0].numpy()
+        first = next(i for i, one in enumerate(self.solved) if np.abs(one["weights"] - first_row).max() < 1e-6)
+        return self.solved[first : first + len(take)]
+
+
+def record(page: Page, folder: Path, frames: int) -> Recorded:
+    """Starts the camera, records so many frames or a few more, stops both, and downloads what the page made of it."""
+    page.driver.execute_script("watched.keep = true")
+    page.start()
+    page.click("record")
+    until(lambda: page.recorded_frames >= frames)
+    page.driver.execute_script("document.getElementById('record').click(); document.getElementById('start').click()")
+    page.driver.execute_script("watched.keep = false")
+    script = """
+    const done = arguments[0];
+    const withText = async (one) => ({...one, pixels: one.pixels && await watched.text(one.pixels)});
+    Promise.all(watched.sent.map(withText)).then(done);
+    """
+    sent = [one for one in page.driver.execute_async_script(script) if one["pixels"]]
+    solved = page.driver.execute_script(
+        "return watched.solved.map(s => ({...s, weights: [...s.weights], rotation: [...s.rotation]}))"
+    )
+    (folder / "take.csv").write_bytes(blob(page, "csv"))
+    (folder / "take.glb").write_bytes(blob(page, "glb"))
+    return Recorded(sent, solved, folder / "take.csv", folder / "take.glb")
+
+
+def assert_same_weights(graph: Path, recorded: Recorded, tolerance: float) -> None:
+    """Runs the graph over the pixels that the page gave its worker, and compares the page's answers."""
+    session = onnxruntime.InferenceSession(graph)
+    size = next(one.shape[0] for one in session.get_inputs() if one.name == "state")
+    state = np.zeros(size, np.float32)
+    for sent, solved in zip(recorded.sent, recorded.solved, strict=False):
+        pixels = np.frombuffer(base64.b64decode(sent["pixels"]), np.uint8)
+        inputs = {
+            "image": pixels.reshape(sent["height"], sent["width"], 4),
+            "interval": np.array(solved["interval"], np.float32),
+            "controls": np.array([sent["pose"], sent["gain"], sent["smoothing"], sent["reset"], 0], np.float32),
+            "state": state,
+        }
+        weights, state = session.run(["weights", "next_state"], inputs)
+        np.testing.assert_allclose(solved["weights"], weights, rtol=0, atol=tolerance)
