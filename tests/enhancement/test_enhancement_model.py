@@ -33,20 +33,74 @@ def test_smooth_frames_get_the_wrinkles_of_the_database(model, database):
     assert float(left) < 0.4 * float((database.smooth - database.frames).square().mean().sqrt())
 
 
-def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
-    other = EnhancementModel.fit(
-        database.frames,
-        database.faces,
-        database.sequences,
-        database.neutral,
-        rank=36,
-        patch_size=20,
-        detail="gradients",
+def test_frames_of_the_database_come_back(model, database):
+    detail = (database.frames - database.smooth).square().sum()
+    left = (model(database.frames) - database.frames).square().sum()
+    assert float(left) < 0.01 * float(detail)
+
+
+def test_what_an_input_shows_itself_is_kept_where_pairs_are_known(database):
+    paired = EnhancementModel.fit(
+        database.frames, database.faces, database.sequences, database.neutral, coarse=database.smooth, rank=36
     )
-    displaced = model(database.smooth[3:6])
-    by_gradients = other(database.smooth[3:6])
-    given = (database.frames - database.smooth)[3:6].square().mean().sqrt()
-    assert float((by_gradients - displaced).square().mean().sqrt()) < 0.3 * float(given)
+    found = paired(database.smooth)
+    given = (database.frames - database.smooth).square().mean().sqrt()
+    assert float((found - database.frames).square().mean().sqrt()) < 0.1 * float(given)
+    # A mark that no frame of the database has stays, and stays where it is.
+    marked = database.smooth[4:5].clone()
+    marked[0, 2000, 2] += 2.0
+    assert float((paired(marked) - found[4:5])[0, 2000, 2]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_far_outside_the_database_detail_stays_bounded_and_is_told(model, database):
+    far = database.neutral + 3 * (database.smooth[13:14] - database.neutral)
+    found = model.enhance(far)
+    assert bool(found.outside.any())
+    without = model.on_actor(database.neutral, 0.0)
+    largest = (database.frames - without(database.frames)).norm(dim=-1).max()
+    assert float((found.vertices - without(far)).norm(dim=-1).max()) < 2 * float(largest)
+    assert not bool(model.enhance(database.smooth[13:14]).outside.any())
+
+
+def test_another_actor_gets_the_detail_at_its_scale(model, database):
+    other = model.on_actor(1.1 * database.neutral, 0.5)
+    found = other(1.1 * database.smooth[13:14])
+    plain = model.on_actor(1.1 * database.neutral, 0.0)(1.1 * database.smooth[13:14])
+    own = model(database.smooth[13:14]) - model.on_actor(database.neutral, 0.0)(database.smooth[13:14])
+    assert torch.allclose(found - plain, 0.5 * own, atol=0.02)
+
+
+def test_colours_blend_as_the_detail_does(database):
+    shades = torch.rand(4, 1, 3).repeat_interleave(9, dim=0).expand(-1, len(database.neutral), -1)
+    colored = EnhancementModel.fit(
+        database.frames, database.faces, database.sequences, database.neutral, rank=4, colors=shades
+    )
+    weights = torch.zeros(1, len(colored.region_names), 36)
+    weights[..., 20] = 1.0
+    assert torch.allclose(colored.colors(weights)[0], shades[20], atol=5e-3)
+    weights[..., 20], weights[..., 2] = 0.5, 0.5
+    assert torch.allclose(colored.colors(weights)[0], 0.5 * (shades[20] + shades[2]), atol=5e-3)
+
+
+def test_derivatives_are_those_of_finite_differences(model, database):
+    own = copy.deepcopy(model)
+    given = (0.7 * database.smooth[4:5] + 0.3 * database.smooth[13:14]).double().requires_grad_(True)
+    looked_at = torch.randn(given.shape, generator=torch.Generator().manual_seed(0)).double()
+    step = 1e-4 * (database.smooth[22:23] - database.neutral).double()
+    (own(given) * looked_at).sum().backward()
+    with torch.no_grad():
+        ahead, behind = ((own(given + sign * step) * looked_at).sum() for sign in (1, -1))
+    assert float((given.grad * step).sum()) == pytest.approx(float(ahead - behind) / 2, rel=0.02)
+
+
+def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
+    given = database.frames, database.faces, database.sequences, database.neutral
+    projected = copy.deepcopy(model)
+    projected.matching = "projection"
+    other = EnhancementModel.fit(*given, rank=36, patch_size=20, detail="gradients", matching="projection")
+    left = other(database.smooth[3:6]) - projected(database.smooth[3:6])
+    detail = (database.frames - database.smooth)[3:6]
+    assert float(left.square().mean().sqrt()) < 0.3 * float(detail.square().mean().sqrt())
 
 
 def test_a_run_that_is_killed_continues_to_the_same_model(database, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from torchface.enhancement.aligned_frames import FrameAlignment
 from torchface.enhancement.detail_basis import StreamingBasis, blended
 from torchface.enhancement.displacement_detail import DisplacementDetail
 from torchface.enhancement.gradient_detail import GradientDetail
+from torchface.enhancement.learned_map import LearnedMap
 from torchface.enhancement.low_pass import WAVELENGTH, LowPass, vertex_areas
 from torchface.enhancement.model_training import (
     Encoder,
@@ -40,6 +41,8 @@ _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
 _OUTSIDE = 1.0  # of a projection's distance, whose unit is the database's own spread
 _COLOR_RANK = 32
 DetailKind = Literal["displacements", "gradients"]
+Matching = Literal["projection", "learned"]
+_MATCHINGS: tuple[Matching, ...] = ("projection", "learned")
 _DETAILS: tuple[DetailKind, ...] = ("displacements", "gradients")
 
 
@@ -80,6 +83,9 @@ class EnhancementModel(nn.Module):
         color_rank: components of the colours; 0 without colours.
         detail: how detail is encoded: as "displacements" from the smooth part or as "gradients" of its triangles.
         lost_share: of the details' energy, by their compression.
+        matching: how detail is found: by the "projection" onto the database alone, or with what a "learned" map adds
+            for frames beyond it.
+        temporal: how much weights hold on to those of the frame before, see ``RegionProjection``.
         keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
@@ -113,6 +119,8 @@ class EnhancementModel(nn.Module):
         detail: DetailKind = "displacements",
         lost_share: float = 0.0,
         keeps_input: bool = False,
+        matching: Matching = "learned",
+        temporal: float = 0.0,
     ) -> None:
         super().__init__()
         if detail not in _DETAILS:
@@ -124,6 +132,10 @@ class EnhancementModel(nn.Module):
         self.detail: DetailKind = detail
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
+        if matching not in _MATCHINGS:
+            raise ValueRangeError(f"matching: found {matching!r:.40}, expected one of {', '.join(_MATCHINGS)}")
+        self.matching: Matching = matching
+        self.temporal = checked_number("temporal", temporal)
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
@@ -141,6 +153,7 @@ class EnhancementModel(nn.Module):
         self._encoder: Prepared[Encoder] = Prepared()
         self._vertex_weights: Prepared[Tensor] = Prepared()
         self._projection: Prepared[RegionProjection] = Prepared()
+        self._learned: Prepared[LearnedMap] = Prepared()
 
     @property
     def config(self) -> dict[str, Any]:
@@ -159,6 +172,8 @@ class EnhancementModel(nn.Module):
             "detail": self.detail,
             "lost_share": self.lost_share,
             "keeps_input": self.keeps_input,
+            "matching": self.matching,
+            "temporal": self.temporal,
         }
 
     @classmethod
@@ -183,6 +198,8 @@ class EnhancementModel(nn.Module):
         colors: Tensor | None = None,
         landmarks: Tensor | None = None,
         detail: DetailKind = "displacements",
+        matching: Matching = "learned",
+        temporal: float = 0.0,
         seed: int = 0,
         folder: str | Path | None = None,
         progress: Progress | None = None,
@@ -207,6 +224,7 @@ class EnhancementModel(nn.Module):
             colors: of the frames' vertices, in [0,1], (K,V,3).
             landmarks: vertex ids of the 68 iBUG landmarks, which name the regions and set the eyes apart.
             detail: how detail is encoded.
+            matching, temporal: how it is found, see :class:`EnhancementModel`.
             seed: of patches and regions.
             folder: where a run that is killed finds what it has learned; of this run alone.
             progress: told of frames.
@@ -257,6 +275,8 @@ class EnhancementModel(nn.Module):
             detail,
             learned.basis.lost_share,
             coarse is not None,
+            matching,
+            temporal,
         )
         model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
         model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
@@ -374,8 +394,16 @@ class EnhancementModel(nn.Module):
         smooth, displacements, pose = self._smooth(coarse)
         encoder = self._prepared()
         turned = encoder.frames.turned(smooth)
-        matched = self._matching().project(encoder.gradients.features(smooth, turned), previous)
+        features = encoder.gradients.features(smooth, turned)
+        projection = self._matching()
+        matched = projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
+        if self.matching == "learned":
+            learned = self._learned.get(
+                (self.database_features, self.region_weights, self.neutral, self.coefficients),
+                lambda: LearnedMap(projection, self.coefficients),
+            )
+            coefficients = coefficients + learned.corrections(features, matched)
         weights = encoder.detail.site_weights(self.vertex_weights)
         details = blended(self.components, coefficients, weights)
         base = self.neutral.to(smooth) + (displacements if self.keeps_input else smooth)
@@ -399,9 +427,10 @@ class EnhancementModel(nn.Module):
     def _matching(self) -> RegionProjection:
         def made() -> RegionProjection:
             areas = triangle_areas(self.neutral, self.faces)
-            return RegionProjection(self.database_features, self.regions.patch_weights(self.patches, areas))
+            shares = self.regions.patch_weights(self.patches, areas)
+            return RegionProjection(self.database_features, shares, temporal=self.temporal)
 
-        return self._projection.get((self.database_features, self.region_weights, self.neutral), made)
+        return self._projection.get((self.database_features, self.region_weights, self.neutral, self.temporal), made)
 
     def _check_frames(self, coarse: Tensor) -> None:
         if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:

@@ -119,6 +119,18 @@ class RegionProjection:
             distances.append(left.clamp(min=1e-30).sqrt() / self.spread[row])
         return Matched(weights.to(features), torch.stack(distances, dim=1).to(features))
 
+    @property
+    def known(self) -> list[Tensor]:
+        """The database in each region's coordinates, (K,q) each."""
+        return [space.known for space in self._spaces]
+
+    def residuals(self, features: Tensor, weights: Tensor) -> list[Tensor]:
+        """What combinations (T,R,K) leave of features (T,P,9) in each region's coordinates, (T,q) each."""
+        pairs = zip(self._spaces, weights.double().unbind(1), strict=True)
+        return [
+            (space.centred(features) @ space.axes.to(features)).double() - own @ space.known for space, own in pairs
+        ]
+
     def _each_alone(self, linear: Tensor) -> Tensor:
         rows = [simplex_qp(H, f.contiguous()) for H, f in zip(self._H, linear.unbind(1), strict=True)]
         return torch.stack(rows, dim=1)

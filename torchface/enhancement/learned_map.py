@@ -1,0 +1,65 @@
+"""What a database's detail changes by where frames lie beyond it: a linear map, region by region."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.enhancement.projection import Matched, RegionProjection
+from torchface.number_checks import checked_count, checked_number
+
+COMPONENTS = 30
+RIDGE = 1e-4
+"""Of the mean variance of a component."""
+
+_FURTHEST = 1.0  # of the database's spread: what lies further away counts as if it lay there
+
+
+class LearnedMap:
+    r"""Detail for frames that no convex combination of the database meets.
+
+    .. math:: c = w^\top C + (z - w^\top Z)\, L
+
+    The projection's blend of the database's coefficients C, and what a linear map L makes of the part of the features z
+    that the blend of the database's, :math:`w^\top Z`, does not hold. L is learned on the database by ridge regression
+    on principal components. In the database's convex hull nothing is added; far from it no more than at the distance of
+    the database's own spread, so that nothing grows without bound.
+
+    Args:
+        projection: of the same database.
+        coefficients: C, (K,r).
+        components: principal components of each region's features.
+        ridge: as a share of their mean variance.
+    """
+
+    def __init__(
+        self, projection: RegionProjection, coefficients: Tensor, components: int = COMPONENTS, ridge: float = RIDGE
+    ) -> None:
+        checked_count("components", components, 1)
+        checked_number("ridge", ridge, above=True)
+        self._projection = projection
+        target = coefficients.double() - coefficients.double().mean(0)
+        self._maps = [_ridge_regression(known, target, components, ridge) for known in projection.known]
+
+    def corrections(self, features: Tensor, matched: Matched) -> Tensor:
+        """What to add to the blend's coefficients, (T,R,r).
+
+        Args:
+            features: (T,P,9); differentiable.
+            matched: the projection of the same frames.
+        """
+        beyond = self._projection.residuals(features, matched.weights)
+        reach = (_FURTHEST / matched.distances.clamp(min=_FURTHEST)).to(features)
+        added = [(rows @ learned).to(features) for rows, learned in zip(beyond, self._maps, strict=True)]
+        return torch.stack(added, dim=1) * reach[..., None]
+
+
+def _ridge_regression(known: Tensor, target: Tensor, components: int, ridge: float) -> Tensor:
+    """The map (q,r) from coordinates (K,q) to targets (K,r) about their means."""
+    centred = known - known.mean(0)
+    _, values, axes = torch.linalg.svd(centred, full_matrices=False)
+    axes = axes[: min(components, len(values))].T
+    scores = centred @ axes
+    gram = scores.T @ scores
+    weight = max(ridge * float(gram.diagonal().mean()), 1e-30)
+    return axes @ torch.linalg.solve(gram + weight * torch.eye(len(gram)).to(gram), scores.T @ target)
