@@ -1,0 +1,163 @@
+"""The recipe end to end: sequences in every form of file, a killed run, bad input."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchface import Mesh, save_mesh, zoo
+from torchface.enhancement import EnhancementModel
+from torchface.errors import FileFormatError, TopologyError, TorchfaceError, ValueRangeError
+from torchface.io import MeshSequenceWriter
+from torchface.viz.figures import face_views
+from train import captured_sequences
+from train import enhancement as recipe
+from train.captured_sequences import performed, read_capture
+from train.enhancement import Settings, train
+
+
+def sheet() -> Mesh:
+    """A bowed square of skin, 24 by 24 vertices, 120 mm wide."""
+    row = torch.linspace(-60, 60, 24)
+    y, x = torch.meshgrid(row, row, indexing="ij")
+    number = torch.arange(24 * 24).view(24, 24)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    faces = torch.cat([torch.stack([a, b, d], -1).view(-1, 3), torch.stack([a, d, c], -1).view(-1, 3)])
+    return Mesh(torch.stack([x, y, 40 - (x.square() + y.square()) / 120], -1).view(-1, 3), faces)
+
+
+def frames(kind: int) -> torch.Tensor:
+    """A bump at one of three places that comes and goes in nine frames, with waves on it, (9,V,3)."""
+    rest = sheet().vertices
+    centre = torch.tensor([[-35.0, -30.0], [35.0, -30.0], [0.0, 35.0]])[kind]
+    bump = torch.exp(-(rest[:, :2] - centre).square().sum(1) / 800)
+    course = torch.linspace(0, torch.pi, 9).sin().clamp(min=0)
+    course[[0, -1]] = 0
+    waves = 0.15 * (rest[:, 0] * 0.9).sin()
+    moved = rest.repeat(9, 1, 1)
+    moved[..., 2] += 8 * course[:, None] * bump * (1 + waves)
+    return moved
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three sequences: a folder of meshes, an archive, meshes named by number; a mesh sequence; the neutral."""
+    mesh, path = sheet(), tmp_path / "capture"
+    (path / "a").mkdir(parents=True)
+    save_mesh(mesh, path / "neutral.obj")
+    for number, vertices in enumerate(frames(0)):
+        save_mesh(replace(mesh, vertices=vertices), path / "a" / f"{number:03d}.ply")
+    np.savez_compressed(path / "b.npz", vertices=frames(1).numpy(), faces=mesh.faces.numpy())
+    for number, vertices in enumerate(frames(2)):
+        save_mesh(replace(mesh, vertices=vertices), path / f"c_{number:03d}.obj")
+    with MeshSequenceWriter(path / "d.safetensors", 9, len(mesh.vertices), mesh.faces) as writer:
+        writer.append(0.6 * frames(0) + 0.4 * frames(2))
+    return path
+
+
+def settings(folder: Path, **other: object) -> Settings:
+    return Settings(folder, out=folder.parent / "model", patch=12, regions=3, rank=9, held_out=1, **other)  # type: ignore[arg-type]
+
+
+def test_all_forms_of_sequences_are_read_alike(folder):
+    found = {sequence.name: sequence for sequence in read_capture(folder, None).sequences}
+    assert list(found) == ["a", "b.npz", "d.safetensors", "c"]
+    for name, kind in {"a": 0, "b.npz": 1, "c": 2}.items():
+        assert torch.allclose(found[name].read(2, 7), frames(kind)[2:7], atol=1e-4)
+
+
+def test_a_model_is_learned_measured_saved_and_drawn(folder, monkeypatch):
+    monkeypatch.setattr(face_views, "render", lambda mesh, camera, *a, **k: torch.zeros(3, camera.height, camera.width))
+    model = train(settings(folder))
+    out = folder.parent / "model"
+    told = zoo.describe(out).metrics
+    assert told["frames learned from"] == 27
+    assert told["learned: missing detail, of the smooth part's"] < 0.15
+    assert 0 < told["held out: missing detail, of the smooth part's"] < 1
+    assert {path.name for path in (out / "pictures").iterdir()} == {"regions.png", "learned.png", "held_out.png"}
+    again = zoo.get_model(out)
+    assert isinstance(again, EnhancementModel)
+    assert torch.allclose(again(frames(0)), model(frames(0)), atol=0.02)  # features in half precision
+    assert not list(folder.parent.glob(".*.training"))
+
+
+def test_a_run_that_is_killed_goes_on(folder, monkeypatch):
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    whole = train(settings(folder))
+    begun = []
+
+    def killed(step: str, done: int = 0, total: int = 0) -> None:
+        if step == "gathering frames" and done > 10:
+            raise KeyboardInterrupt
+
+    def told(step: str, done: int = 0, total: int = 0) -> None:
+        if step == "gathering frames":
+            begun.append(done)
+
+    monkeypatch.setattr(captured_sequences, "_BLOCK", 2)
+    monkeypatch.setattr("torchface.io.meshes.mesh_sequence._NOTE_SECONDS", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        train(settings(folder), killed)
+    found = train(settings(folder), told)
+    assert begun[0] > 10
+    assert torch.equal(found.database_features, whole.database_features)
+
+
+def test_broken_captures_are_told(folder):
+    def fails(error: type[TorchfaceError], words: str) -> None:
+        with pytest.raises(error, match=words):
+            train(settings(folder))
+
+    with pytest.raises(TorchfaceError, match="expected one: --frames or --performer"):
+        train(Settings())
+    with pytest.raises(ValueRangeError, match="found 9 of 4 sequences"):
+        train(replace(settings(folder), held_out=9))
+    with pytest.raises(FileFormatError, match="found no such folder"):
+        train(settings(folder / "none"))
+    broken = frames(1).numpy().copy()
+    broken[4, 7] = np.nan
+    np.savez(folder / "b.npz", vertices=broken, faces=sheet().faces.numpy())
+    fails(ValueRangeError, r"b.npz: frame 4 holds NaN")
+    np.savez(folder / "b.npz", vertices=broken, faces=sheet().faces.flip(0).numpy())
+    fails(TopologyError, r"b.npz: found 1058 triangles, expected the 1058 of neutral.obj, in their order")
+    (folder / "neutral.obj").rename(folder / "rest.obj")
+    fails(FileFormatError, r"found 0 files called neutral")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({"vertices": np.zeros((2, 4, 3))}, "faces"),
+        ({"vertices": np.array([{}], dtype=object), "faces": np.zeros((1, 3), int)}, "expected numbers"),
+        ({"vertices": np.zeros((4, 3)), "faces": np.zeros((1, 3), int)}, r"expected \(T,V,3\)"),
+        ({"vertices": np.zeros((2, 4, 3)), "faces": np.full((1, 3), 9)}, "beyond the 4"),
+    ],
+)
+def test_archives_of_something_else_are_refused(folder, arrays, words):
+    np.savez(folder / "b.npz", **arrays)
+    with pytest.raises(FileFormatError, match=words):
+        read_capture(folder, None)
+
+
+def test_an_archive_that_promises_more_than_it_holds_takes_no_memory(folder):
+    head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 100000, 3), }"
+    head += b" " * (117 - len(head)) + b"\n"
+    with zipfile.ZipFile(folder / "b.npz", "w") as archive:
+        archive.writestr("vertices.npy", b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head)
+    with pytest.raises(FileFormatError, match="in 128 bytes, expected numbers"):
+        read_capture(folder, None)
+
+
+def test_the_performers_takes_begin_and_end_at_rest():
+    capture = performed(3000, 0, 15.0)
+    assert len(capture.sequences) == 36
+    one = capture.sequences[0]
+    moved = one.read(0, one.count)
+    assert torch.allclose(moved[0], capture.neutral.vertices, atol=1e-4)
+    assert float((moved - capture.neutral.vertices).norm(dim=-1).max()) > 3
+    assert torch.equal(one.read(3, 5), moved[3:5])

@@ -1,0 +1,263 @@
+"""A captured performance as files hold it: sequences of frames of one topology, gathered into one file on disk."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.lib import format as npy
+from torch import Tensor
+
+from torchface import Mesh, load_mesh
+from torchface.errors import FileFormatError, TopologyError, ValueRangeError
+from torchface.files.content_keys import content_key
+from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.progress import Progress
+from torchface.synthetic.stages.weight_curves import GESTURES
+from torchface.synthetic.stages.wrinkles import WrinkledPerformer
+from torchface.workflows.animated_meshes import load_animated
+
+_METHOD = "captured sequences/1"
+_NEUTRAL = "neutral"
+_ANIMATIONS = (".glb", ".gltf", ".safetensors", ".npz")
+_BLOCK = 8  # frames that are read at a time
+_MOST_BYTES = 2**33  # of an .npz file's arrays, which are read whole
+_NUMBER = re.compile(r"[ _.-]*\d+$")
+_RISE, _HOLD, _FALL = (0.2, 0.5), (0.1, 0.4), (0.3, 0.7)  # seconds of a performer's expressions
+_TWO_SIDED = 3  # takes of each gesture: both sides, left more, right more
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedSequence:
+    """Frames from the neutral to an expression and back.
+
+    Args:
+        name: of the file or folder.
+        count: of frames.
+        read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
+        faces: (F,3) int64, of its own file.
+    """
+
+    name: str
+    count: int
+    read: Callable[[int, int], Tensor]
+    faces: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Sequences of an actor, and the neutral of their topology.
+
+    Args:
+        sequences: in order of their names.
+        neutral: with landmarks where it came with some.
+        key: changes when any of the files does.
+    """
+
+    sequences: tuple[CapturedSequence, ...]
+    neutral: Mesh
+    key: str
+
+    def part(self, begin: int, end: int) -> Capture:
+        """Some of the sequences."""
+        return Capture(self.sequences[begin:end], self.neutral, f"{self.key} {begin} {end}")
+
+
+def read_capture(folder: Path, neutral: Path | None) -> Capture:
+    """The sequences of a folder: sub-folders of meshes, animations, and meshes named ``sequence_0001.obj``.
+
+    Args:
+        folder: of OBJ, PLY, STL or OFF meshes, ``.glb`` animations, mesh sequences (``.safetensors``) and ``.npz``
+            files with ``vertices`` (T,V,3), millimetres, and ``faces`` (F,3).
+        neutral: a mesh file; ``neutral.*`` in the folder if absent.
+
+    Raises:
+        FileFormatError: no such folder, no frames, no neutral, or a broken file.
+        TopologyError: a sequence is of another mesh than the neutral.
+    """
+    if not folder.is_dir():
+        raise FileFormatError(f"{folder}: found no such folder, expected one of sequences of meshes")
+    entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    rest = _neutral_file(folder, entries) if neutral is None else neutral
+    used = [entry for entry in entries if entry != rest]
+    sequences = [_animated(entry) for entry in used if entry.is_dir() or entry.suffix.lower() in _ANIMATIONS]
+    loose = [entry for entry in used if entry.is_file() and entry.suffix.lower() in MESH_ENDINGS]
+    for name, files in groupby(loose, lambda file: _NUMBER.sub("", file.stem)):
+        sequences.append(_of_meshes(name, list(files)))
+    if not sequences:
+        raise FileFormatError(
+            f"{folder}: found no sequences, expected folders of meshes, {', '.join(_ANIMATIONS)} files or meshes "
+            "named sequence_0001.obj"
+        )
+    mesh = load_mesh(rest)
+    for sequence in sequences:
+        if not torch.equal(sequence.faces, mesh.faces):
+            raise TopologyError(
+                f"{sequence.name}: found {len(sequence.faces)} triangles, expected the {len(mesh.faces)} of "
+                f"{rest.name}, in their order: all frames must be of one topology"
+            )
+    read = {str(file.relative_to(folder)): file for file in sorted(folder.rglob("*")) if file.is_file()}
+    return Capture(tuple(sequences), mesh, content_key(_METHOD, files={**read, f"{_NEUTRAL}/{rest.name}": rest}))
+
+
+def performed(vertices: int, seed: int, fps: float) -> Capture:
+    """Expressions of the wrinkled embedded performer, three takes of each, every one a sequence."""
+    person = WrinkledPerformer(vertices=vertices, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    names, weights = [], []
+    for take in range(_TWO_SIDED):
+        for name, gesture in GESTURES.items():
+            names.append(f"{name} {take + 1}")
+            weights.append(_gesture(gesture, person.names, take, fps, generator))
+
+    @lru_cache(maxsize=1)  # folding of skin remembers: a sequence is made as a whole
+    def whole(number: int) -> Tensor:
+        return person.frames(weights[number], fps)
+
+    def read(number: int, begin: int, end: int) -> Tensor:
+        return whole(number)[begin:end]
+
+    sequences = [
+        CapturedSequence(name, len(weights[number]), partial(read, number), person.neutral.faces)
+        for number, name in enumerate(names)
+    ]
+    key = content_key(_METHOD, performer=vertices, seed=seed, fps=fps)
+    return Capture(tuple(sequences), person.neutral, key)
+
+
+def gather(capture: Capture, path: Path, progress: Progress) -> tuple[MeshSequence, Tensor]:
+    """Writes all frames into one file; where an earlier run has stopped, it goes on.
+
+    Args:
+        capture: what is gathered.
+        path: of the file.
+        progress: called with each step and how far it is.
+
+    Returns:
+        The frames, and the number of each frame's sequence, (K,) int64.
+
+    Raises:
+        ValueRangeError: a frame holds NaN.
+        TopologyError: a frame has another number of vertices.
+        FileFormatError: a file cannot be read, or the disk is full.
+    """
+    counts = torch.tensor([sequence.count for sequence in capture.sequences])
+    numbers = torch.arange(len(counts)).repeat_interleave(counts)
+    if path.is_file():
+        kept = MeshSequence(path)
+        if kept.key == capture.key:
+            return kept, numbers
+    total, size = int(counts.sum()), len(capture.neutral.vertices)
+    begin = 0
+    with MeshSequenceWriter(path, total, size, capture.neutral.faces, key=capture.key) as writer:
+        for sequence in capture.sequences:
+            for first in range(max(0, writer.done - begin), sequence.count, _BLOCK):
+                frames = sequence.read(first, min(first + _BLOCK, sequence.count))
+                _check(frames, sequence.name, first, size)
+                writer.append(frames)
+                progress("gathering frames", writer.done, total)
+            begin += sequence.count
+    return MeshSequence(path), numbers
+
+
+def _check(frames: Tensor, name: str, first: int, size: int) -> None:
+    if frames.shape[1:] != (size, 3):
+        raise TopologyError(f"{name}: found frames {tuple(frames.shape[1:])}, expected ({size},3)")
+    bad = (~torch.isfinite(frames)).flatten(1).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise ValueRangeError(f"{name}: frame {first + int(bad[0])} holds NaN or infinite vertices, expected none")
+
+
+def _neutral_file(folder: Path, entries: list[Path]) -> Path:
+    endings = (*MESH_ENDINGS, ".glb", ".gltf")
+    found = [entry for entry in entries if entry.stem.lower() == _NEUTRAL and entry.suffix.lower() in endings]
+    if len(found) != 1:
+        raise FileFormatError(
+            f"{folder}: found {len(found)} files called {_NEUTRAL}, expected one, such as {_NEUTRAL}.obj, or --neutral"
+        )
+    return found[0]
+
+
+def _animated(path: Path) -> CapturedSequence:
+    if path.suffix.lower() == ".npz":
+        vertices, faces = _npz(path)
+        return CapturedSequence(path.name, len(vertices), lambda begin, end: vertices[begin:end], faces)
+    animated = load_animated(path)
+    return CapturedSequence(path.name, animated.count, animated.read, animated.neutral.faces)
+
+
+def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:
+    faces = load_mesh(files[0]).faces
+
+    def read(begin: int, end: int) -> Tensor:
+        meshes = [load_mesh(file) for file in files[begin:end]]  # a file a frame
+        for mesh, file in zip(meshes, files[begin:end], strict=True):
+            if not torch.equal(mesh.faces, faces):
+                raise TopologyError(
+                    f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected the "
+                    f"triangles of {files[0].name}"
+                )
+        return torch.stack([mesh.vertices for mesh in meshes])
+
+    return CapturedSequence(name, len(files), read, faces)
+
+
+def _npz(path: Path) -> tuple[Tensor, Tensor]:
+    """``vertices`` (T,V,3) and ``faces`` (F,3) of an archive whose sizes are checked before memory is taken."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = [_array(archive, path, name) for name in ("vertices", "faces")]
+    except (zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
+        raise FileFormatError(f"{path}: no .npz file of vertices and faces ({error})") from error
+    vertices, faces = arrays
+    if vertices.ndim != 3 or vertices.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(vertices):
+        raise FileFormatError(
+            f"{path}: found vertices {vertices.shape} and faces {faces.shape}, expected (T,V,3) and (F,3)"
+        )
+    if faces.dtype.kind not in "iu" or faces.size == 0 or not 0 <= faces.min() <= faces.max() < vertices.shape[1]:
+        raise FileFormatError(f"{path}: found faces of vertices beyond the {vertices.shape[1]} there are")
+    return torch.from_numpy(vertices.astype(np.float32)), torch.from_numpy(faces.astype(np.int64))
+
+
+def _array(archive: zipfile.ZipFile, path: Path, name: str) -> np.ndarray:
+    stored = archive.getinfo(f"{name}.npy")
+    with archive.open(stored) as file:
+        version = npy.read_magic(file)
+        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, kind = header(file)
+        size = kind.itemsize * int(np.prod(shape, dtype=np.float64)) if kind.kind in "fiu" else -1
+        if size < 0 or size > stored.file_size or size > _MOST_BYTES:
+            raise FileFormatError(
+                f"{path}: found {name} {shape} of {kind} in {stored.file_size} bytes, expected numbers of at most "
+                f"{_MOST_BYTES // 2**30} GiB"
+            )
+    with archive.open(stored) as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+def _gesture(
+    gesture: Mapping[str, float], names: tuple[str, ...], take: int, fps: float, generator: torch.Generator
+) -> Tensor:
+    """Weights (T,N) that rise to an expression and fall again, the later takes more on one side."""
+    rise, hold, fall = (a + (b - a) * float(torch.rand((), generator=generator)) for a, b in (_RISE, _HOLD, _FALL))
+    seconds = torch.arange(round((rise + hold + fall) * fps) + 1) / fps
+    up = (seconds / rise).clamp(0, 1)
+    down = ((rise + hold + fall - seconds) / fall).clamp(0, 1)
+    envelope = 0.5 - 0.5 * (torch.pi * torch.minimum(up, down)).cos()
+    envelope[-1] = 0.0
+    strength = 0.7 + 0.3 * float(torch.rand((), generator=generator))
+    weak = {1: "Right", 2: "Left"}.get(take)
+    weights = torch.zeros(len(seconds), len(names))
+    for name, weight in gesture.items():
+        if name in names:
+            side = 0.35 if weak is not None and name.endswith(weak) else 1.0
+            weights[:, names.index(name)] = weight * side * strength * envelope
+    return weights

@@ -1,0 +1,151 @@
+"""``python -m train.enhancement --frames DIR --out models/NAME``: an actor's fine detail and timing, as captured.
+
+``DIR`` holds sequences from the neutral to an expression and back, all of one topology: folders of OBJ or PLY meshes,
+``.glb`` animations, ``.npz`` files, and ``neutral.obj``. ``--performer 20000`` learns from the embedded performer with
+so many vertices and planted wrinkles, and needs no file. Killed and started again, a run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from torchface import TorchfaceError, zoo
+from torchface.enhancement import EnhancementModel
+from torchface.enhancement.low_pass import WAVELENGTH
+from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
+from torchface.progress import Progress, silent
+from train.captured_sequences import Capture, gather, performed, read_capture
+from train.enhancement_figures import draw
+from train.restored_frames import measured
+from train.runner import metric_lines, run
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the recipe does.
+
+    Args:
+        frames: Folder of sequences: folders of meshes, .glb, .npz or .safetensors files, or meshes named
+            sequence_0001.obj; millimetres, or the unit of their file.
+        neutral: The neutral as a mesh; with landmarks (see `torchface annotate`) regions are named and eyes set apart.
+            neutral.* in the folder if absent.
+        performer: Learn from the embedded performer with so many vertices instead.
+        out: Folder for the model, its card and its pictures.
+        fps: Of the frames.
+        held_out: How many sequences, the last, are kept for the test.
+        wavelength: Of what counts as fine, millimetres: half of a wave of this length is detail.
+        patch: Vertices a patch, in the mean of which frames are compared.
+        regions: How many regions are looked for.
+        rank: Components of the detail that are kept.
+        detail: As displacements of vertices, or as gradients of triangles (the paper's).
+        seed: Of patches and regions; of the performer's wrinkles and takes.
+        licence: Under which the model may be used; MIT for the performer, else what the capture allows, if absent.
+    """
+
+    frames: Path | None = None
+    neutral: Path | None = None
+    performer: int = 0
+    out: Path = Path("models/enhancement")
+    fps: float = 30.0
+    held_out: int = 2
+    wavelength: float = WAVELENGTH
+    patch: int = 100
+    regions: int = 13
+    rank: int = 64
+    detail: str = "displacements"
+    seed: int = 0
+    licence: str | None = None
+
+
+def train(settings: Settings, progress: Progress | None = None) -> EnhancementModel:
+    """Gathers, learns, tests, saves and draws.
+
+    Raises:
+        TorchfaceError: neither frames nor performer, or both; files that cannot be used.
+        ValueRangeError: no sequence is left to learn from.
+    """
+    progress = progress or silent
+    capture = _capture(settings)
+    learned = len(capture.sequences) - settings.held_out
+    if settings.held_out < 0 or learned < 1:
+        raise ValueRangeError(
+            f"held_out: found {settings.held_out} of {len(capture.sequences)} sequences, expected at least one to "
+            "learn from"
+        )
+    work = settings.out.parent / f".{settings.out.name}.training"
+    make_folder(work)
+    known, numbers = gather(capture.part(0, learned), work / "learned.safetensors", progress)
+    test = None
+    if settings.held_out:
+        test, _ = gather(capture.part(learned, len(capture.sequences)), work / "tested.safetensors", progress)
+    progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
+    mesh = capture.neutral
+    model = EnhancementModel.fit(
+        known,
+        mesh.faces,
+        numbers,
+        mesh.vertices,
+        fps=settings.fps,
+        wavelength=settings.wavelength,
+        patch_size=settings.patch,
+        region_count=settings.regions,
+        rank=settings.rank,
+        landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
+        detail=settings.detail,  # type: ignore[arg-type]
+        seed=settings.seed,
+        folder=work,
+        progress=progress,
+    )
+    metrics = measured(model, known, test, progress)
+    save(model, settings, metrics, len(known), learned)
+    draw(model, mesh, known, test, settings.out / "pictures", progress)
+    shutil.rmtree(work, ignore_errors=True)
+    return model
+
+
+def _capture(settings: Settings) -> Capture:
+    if (settings.frames is None) == (settings.performer == 0):
+        raise TorchfaceError("found neither frames nor a performer, or both; expected one: --frames or --performer")
+    if settings.frames is None:
+        return performed(settings.performer, settings.seed, settings.fps)
+    return read_capture(settings.frames, settings.neutral)
+
+
+def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float], frames: int, sequences: int) -> None:
+    """Writes the model with its effective settings, what was measured, and its card."""
+    effective = {key: value for key, value in asdict(settings).items() if value is not None}
+    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
+    if settings.frames is None:
+        source = f"--performer {settings.performer} --seed {settings.seed}"
+        data = f"{frames} frames of {sequences} expressions of the embedded performer with planted wrinkles; no person."
+    else:
+        source, data = f"--frames {settings.frames.name}", f"{frames} captured frames of {sequences} sequences."
+    named = ", ".join(model.region_names)
+    zoo.save_model(
+        model,
+        settings.out,
+        licence=settings.licence or ("MIT" if settings.frames is None else "that of the capture"),
+        data=data,
+        metrics=metrics,
+        recipe=(
+            f"python -m train.enhancement {source} --held-out {settings.held_out} --rank {settings.rank} "
+            f"--patch {settings.patch} --regions {settings.regions} --out models/{settings.out.name}"
+        ),
+        card=(
+            f"Gives coarse animations on {len(model.neutral)} vertices the wrinkles, creases and timing of one actor: "
+            "`torchface enhance INPUT --model THIS --out DIR`. Detail is what lies beyond a smooth part "
+            f"({model.wavelength:.0f} mm keep half); it is looked up by region ({named}). The figures compare "
+            "restored frames with captured ones, in shares of what the smooth part lacks: of sequences that it has "
+            "learned from, and of others. It knows no expression that the actor did not show: regions outside the "
+            "database get the nearest detail."
+        ),
+        settings=effective,
+        half=("database_features", "region_weights"),
+    )
+
+
+if __name__ == "__main__":
+    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))

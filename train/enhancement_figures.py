@@ -1,0 +1,66 @@
+"""The pictures that lie beside an enhancement model: its regions, the detail it keeps, what compression loses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from matplotlib import colormaps
+from torch import Tensor
+
+from torchface import Mesh
+from torchface.enhancement import EnhancementModel
+from torchface.files.whole_files import make_folder
+from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.progress import Progress
+from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
+from torchface.viz.figures.face_views import face_views
+from torchface.viz.figures.heat_maps import error_views, round_maximum
+from train.restored_frames import Restored, restored
+
+_TRIED = 24  # frames among which the most detailed one is looked for
+_HEIGHT = 420
+
+
+def draw(
+    model: EnhancementModel,
+    neutral: Mesh,
+    learned: MeshSequence,
+    test: MeshSequence | None,
+    folder: Path,
+    progress: Progress,
+) -> None:
+    """Writes the pictures into a folder: ``regions.png``, ``learned.png`` and ``held_out.png``."""
+    make_folder(folder)
+    progress("drawing the regions")
+    save_rendered_image(_regions(model, neutral), folder / "regions.png")
+    for name, frames in {"learned": learned, "held_out": test}.items():
+        if frames is not None:
+            progress(f"drawing a frame, {name.replace('_', ' ')}")
+            shown = _most_detailed(model, frames)
+            save_rendered_image(_frame(neutral, shown), folder / f"{name}.png")
+
+
+def _regions(model: EnhancementModel, neutral: Mesh) -> Tensor:
+    hues = torch.tensor(colormaps["tab20"](range(len(model.region_names))))[:, :3].to(neutral.vertices)
+    colors = model.vertex_weights.T.float() @ hues
+    named = ", ".join(model.region_names)
+    return headed(face_views(neutral, colors=colors, width=_HEIGHT * 4 // 5, height=_HEIGHT), named)
+
+
+def _most_detailed(model: EnhancementModel, frames: MeshSequence) -> Restored:
+    tried = range(0, len(frames), max(1, len(frames) // _TRIED))
+    found = (restored(model, frames.read(number, number + 1)[0]) for number in tried)
+    return max(found, key=lambda one: float((one.truth - one.smooth).square().sum()))
+
+
+def _frame(neutral: Mesh, shown: Restored) -> Tensor:
+    views = []
+    for name, vertices in {"smooth part": shown.smooth, "restored": shown.restored, "captured": shown.truth}.items():
+        row = face_views(replace(neutral, vertices=vertices), width=_HEIGHT * 4 // 5, height=_HEIGHT, framed_by=neutral)
+        views.append(caption(row, name))
+    errors = (shown.restored - shown.truth).norm(dim=-1)
+    scale = round_maximum(float((shown.smooth - shown.truth).norm(dim=-1).quantile(0.99)))
+    views.append(error_views(replace(neutral, vertices=shown.truth), errors, scale, "restored from captured, mm"))
+    return sheet(views, 1)
