@@ -11,6 +11,7 @@ import torch
 
 from torchface.enhancement import EnhancementModel
 from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
+from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.zoo import get_model, save_model
@@ -185,3 +186,30 @@ def test_a_database_that_cannot_be_learned_from_is_told(database):
         fit(sequences=torch.zeros(36, dtype=torch.int64))
     with pytest.warns(UserWarning, match=r"nearer to the neutral than \d"):
         fit(database.frames[12:15], torch.tensor([0, 0, 1]))
+
+
+def test_a_loose_eye_and_a_vertex_of_no_triangle_come_through_as_they_are(database):
+    ball = torch.tensor([[0.0, 0, 5], [5, 0, 0], [0, 5, 0], [-5, 0, 0], [0, -5, 0]])
+    sides = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
+    count, place = len(database.neutral), torch.tensor([30.0, 30.0, 90.0])
+
+    def with_ball(vertices, turn=0.0):
+        turned = ball @ rotation_matrix(torch.tensor([0.0, turn, 0.0])).T + place
+        loose = torch.cat([turned, place[None] + 20]).expand(len(vertices), -1, -1)
+        return torch.cat([vertices, loose], dim=1)
+
+    faces = torch.cat([database.faces, sides + count])
+    own = EnhancementModel.fit(
+        with_ball(database.frames), faces, database.sequences, with_ball(database.neutral[None])[0], rank=8
+    )
+    asked = with_ball(database.smooth[4:5], 0.4)
+    found = own(asked)
+    assert torch.allclose(found[0, count:], asked[0, count:], atol=0.02)
+    assert bool(torch.isfinite(found).all())
+
+
+def test_borders_of_eyes_and_mouth_stay_where_the_database_has_them(model, database):
+    border = border_vertices(database.faces, len(database.neutral))
+    assert int(border.sum()) > 20
+    found = model(database.frames[13:14])
+    assert float((found - database.frames[13:14])[0, border].norm(dim=1).max()) < 0.05
