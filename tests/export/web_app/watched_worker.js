@@ -13,10 +13,8 @@ window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held:
   Worker.prototype.postMessage = function (message, given) {
     if (message.frame) {
       const { picture, ...rest } = message.frame;
-      const context = new OffscreenCanvas(picture.width, picture.height).getContext("2d", { willReadFrequently: true });
-      context.drawImage(picture, 0, 0);
-      const image = context.getImageData(0, 0, picture.width, picture.height);
-      watched.sent.push({ ...rest, width: picture.width, height: picture.height, pixels: watched.keep ? image.data : null });
+      const { width, height } = picture;
+      watched.sent.push({ ...rest, width, height, pixels: watched.keep ? pixels(picture) : null });
     }
     const go = () => post.call(this, message, given);
     if (message.frame && watched.held) watched.held.push(go);
@@ -27,6 +25,11 @@ window.watched = { sent: [], solved: [], workers: [], blobs: [], said: [], held:
     const keep = () => watched.said.push(status.textContent);
     if (status) new MutationObserver(keep).observe(status, { childList: true, characterData: true, subtree: true });
   });
+  const pixels = (picture) => {
+    const context = new OffscreenCanvas(picture.width, picture.height).getContext("2d", { willReadFrequently: true });
+    context.drawImage(picture, 0, 0);
+    return context.getImageData(0, 0, picture.width, picture.height).data;
+  };
   URL.createObjectURL = (blob) => (watched.blobs.push(blob), made.call(URL, blob));
   watched.text = async (bytes) => {
     const address = await new Promise((done) => {
