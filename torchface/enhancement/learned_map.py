@@ -39,7 +39,8 @@ class LearnedMap:
         checked_number("ridge", ridge, above=True)
         self._projection = projection
         target = coefficients.double() - coefficients.double().mean(0)
-        self._maps = [_ridge_regression(known, target, components, ridge) for known in projection.known]
+        # The projection's coordinates are principal components about the mean, the largest first.
+        self._maps = [_ridge_regression(known[:, :components], target, ridge) for known in projection.known]
 
     def corrections(self, features: Tensor, matched: Matched) -> Tensor:
         """What to add to the blend's coefficients, (T,R,r).
@@ -50,16 +51,13 @@ class LearnedMap:
         """
         beyond = self._projection.residuals(features, matched.weights)
         reach = (_FURTHEST / matched.distances.clamp(min=_FURTHEST)).to(features)
-        added = [(rows @ learned).to(features) for rows, learned in zip(beyond, self._maps, strict=True)]
+        pairs = zip(beyond, self._maps, strict=True)
+        added = [(rows[:, : len(learned)] @ learned).to(features) for rows, learned in pairs]
         return torch.stack(added, dim=1) * reach[..., None]
 
 
-def _ridge_regression(known: Tensor, target: Tensor, components: int, ridge: float) -> Tensor:
-    """The map (q,r) from coordinates (K,q) to targets (K,r) about their means."""
-    centred = known - known.mean(0)
-    _, values, axes = torch.linalg.svd(centred, full_matrices=False)
-    axes = axes[: min(components, len(values))].T
-    scores = centred @ axes
+def _ridge_regression(scores: Tensor, target: Tensor, ridge: float) -> Tensor:
+    """The map (q,r) from scores (K,q) to targets (K,r), both about their means."""
     gram = scores.T @ scores
     weight = max(ridge * float(gram.diagonal().mean()), 1e-30)
-    return axes @ torch.linalg.solve(gram + weight * torch.eye(len(gram)).to(gram), scores.T @ target)
+    return torch.linalg.solve(gram + weight * torch.eye(len(gram)).to(gram), scores.T @ target)
