@@ -76,7 +76,8 @@ class StreamingBasis:
         turned = turned[:, -self._kept :].flip(1)
         lift = (vectors[:, new] / roots).T.float()
         to_old, to_new = turned[:old].T.float(), turned[old:].T.float() @ lift
-        basis = torch.empty(turned.shape[1], rows.shape[1])
+        # Into its own memory once it has its full size: at 500,000 vertices it is most of what there is.
+        basis = self._basis if turned.shape[1] == old else torch.empty(turned.shape[1], rows.shape[1])
         for begin in range(0, rows.shape[1], _CHUNK):
             some = slice(begin, begin + _CHUNK)
             basis[:, some] = to_old @ self._basis[:, some] + to_new @ rest[:, some]
