@@ -27,6 +27,7 @@ from torchface.enhancement.model_training import (
 from torchface.enhancement.patches import grow_patches
 from torchface.enhancement.projection import RegionProjection
 from torchface.enhancement.regions import Regions, regions_of_motion
+from torchface.enhancement.retiming import retime_features
 from torchface.enhancement.surface_frames import SurfaceFrames
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
@@ -350,6 +351,26 @@ class EnhancementModel(nn.Module):
         offsets = blended(self.color_components, weights @ self.color_coefficients.to(weights), self.vertex_weights)
         return (self.mean_color.to(weights) + offsets.unflatten(1, (3, -1)).transpose(1, 2)).clamp(0, 1)
 
+    def retime(self, keyframes: Tensor, frames: int) -> Tensor:
+        """The actor's timing of a motion between two poses, by region.
+
+        Args:
+            keyframes: (2,V,3), millimetres, in this mesh and any rigid place.
+            frames: how many the motion lasts at the database's rate, both keyframes counted.
+
+        Returns:
+            How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling; see
+            ``torchface.enhancement.retiming.interpolate``.
+
+        Raises:
+            TopologyError: another number of vertices, or another order.
+            ValueRangeError: the keyframes are equal, fewer than two frames, or NaN.
+
+        Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.
+        """
+        features = self.features(keyframes)
+        return retime_features(features, self.database_features, self.sequences, self.patch_weights, frames)
+
     def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
         """This actor's detail for another head of the same mesh.
 
@@ -378,6 +399,11 @@ class EnhancementModel(nn.Module):
         return self._vertex_weights.get(
             (self.region_weights, self.faces), lambda: self.regions.vertex_weights(self.faces, len(self.neutral))
         )
+
+    @property
+    def patch_weights(self) -> Tensor:
+        """The share of each patch in each region, (R,P)."""
+        return self.regions.patch_weights(self.patches, triangle_areas(self.neutral, self.faces))
 
     def check_state(self) -> None:
         """Refuses a state whose numbers do not make a model.
@@ -426,9 +452,7 @@ class EnhancementModel(nn.Module):
 
     def _matching(self) -> RegionProjection:
         def made() -> RegionProjection:
-            areas = triangle_areas(self.neutral, self.faces)
-            shares = self.regions.patch_weights(self.patches, areas)
-            return RegionProjection(self.database_features, shares, temporal=self.temporal)
+            return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
 
         return self._projection.get((self.database_features, self.region_weights, self.neutral, self.temporal), made)
 

@@ -1,0 +1,278 @@
+"""The actor's timing for keyframes: where a motion between two poses stands at each moment, by his captured motions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import checked_count
+
+NEAREST = 8
+_STILL = 1e-3  # share of the whole motion below which a region counts as at rest
+_STEPS = 128  # blends by which a captured motion's timing is read, at least
+_DRIFT = 0.05  # share of a sequence's range by which an extended motion may go back before it counts as another
+_DETOUR = 0.5  # what a captured way costs that is longer than the straight one, a length of distance
+_HOLD = 0.01  # share of the range within which the face counts as held
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceProjection:
+    """Where the frames of one sequence lie on another.
+
+    Args:
+        times: on the other's timeline, from 0 to its number of frames minus 1, never falling, (m,).
+        distances: from the points at those times, (m,).
+    """
+
+    times: Tensor
+    distances: Tensor
+
+
+def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
+    r"""Projects a sequence onto another in order.
+
+    Each frame is projected onto each segment; the path that never goes back and has the least sum of distances is
+    found by dynamic programming. Frames that share a segment are put in order by isotonic regression.
+
+    .. math:: \min_P \sum_i E_{i,P(i)}, \quad P(i) \le P(i+1)
+
+    Args:
+        alpha: the frames, (m,D).
+        beta: the sequence to project onto, (n,D), of two frames at least.
+
+    Raises:
+        ShapeError: the shapes do not fit, or ``beta`` is no sequence.
+
+    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.1, equations 5 and 6. Changed:
+    order is held inside segments too.
+    """
+    if alpha.ndim != 2 or beta.ndim != 2 or alpha.shape[1] != beta.shape[1] or len(beta) < 2 or len(alpha) < 1:
+        raise ShapeError(
+            f"project_sequence: found alpha {tuple(alpha.shape)} and beta {tuple(beta.shape)}, expected (m,D) and "
+            "(n,D) with a frame and two frames at least"
+        )
+    alpha, beta = alpha.double(), beta.double()
+    shares, distances = _segment_projections(alpha, beta)
+    best, came_from = distances[0], []
+    # A frame's best cost needs the frame's before: one step a frame.
+    for row in distances[1:]:
+        least, where = best.cummin(0)
+        came_from.append(where)
+        best = least + row
+    path = [int(best.argmin())]
+    for where in reversed(came_from):
+        path.append(int(where[path[-1]]))
+    segments = torch.tensor(path[::-1])
+    frames = torch.arange(len(alpha))
+    inside = shares[frames, segments]
+    for segment in segments.unique():  # runs differ in length
+        run = segments == segment
+        inside[run] = _isotonic(inside[run])
+    step = beta[segments + 1] - beta[segments]
+    found = beta[segments] + inside[:, None] * step
+    return SequenceProjection(segments + inside, (alpha - found).norm(dim=1))
+
+
+def retime_features(
+    keyframes: Tensor, database: Tensor, sequences: Tensor, weights: Tensor, frames: int, nearest: int = NEAREST
+) -> Tensor:
+    """How far the motion between two keyframes has come in each frame, by region.
+
+    In each region the pair is projected in order onto each sequence of the database; what it meets is extended to the
+    whole of that motion, from where it sets in to where it ends. The timings of the nearest motions, in pose and in
+    length, are averaged, nearer ones weighing more.
+
+    Args:
+        keyframes: features of both, (2,P,C).
+        database: features of the captured frames, (K,P,C).
+        sequences: the number of each captured frame's sequence, (K,).
+        weights: of patches in each region, (R,P).
+        frames: how many the motion lasts at the database's rate, both keyframes counted.
+        nearest: how many captured motions are averaged.
+
+    Returns:
+        (R,frames), 0 first and 1 last, never falling. A region at rest follows the whole face.
+
+    Raises:
+        ShapeError: the shapes do not fit.
+        ValueRangeError: the keyframes are equal, fewer than two frames, or no sequence has two frames.
+
+    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2. Changed: several motions are
+    averaged, and extending is the default.
+    """
+    checked_count("frames", frames, 2)
+    checked_count("nearest", nearest, 1)
+    if keyframes.ndim != 3 or len(keyframes) != 2 or keyframes.shape[1:] != database.shape[1:]:
+        raise ShapeError(
+            f"keyframes: found features {tuple(keyframes.shape)}, expected (2,*) of {tuple(database.shape)}"
+        )
+    if not float((keyframes[1] - keyframes[0]).abs().max()) > 1e-7:
+        raise ValueRangeError("keyframes: found two that are equal, expected a motion between them")
+    owned = [database[sequences == number] for number in sequences.unique()]
+    owned = [sequence for sequence in owned if len(sequence) > 1]
+    if not owned:
+        raise ValueRangeError(
+            "sequences: found none of two frames or more, expected captured motions to take timing from"
+        )
+    whole = weights.mean(0)
+    motion = (keyframes[1] - keyframes[0]).square().sum(-1)
+    rows, together = [], None
+    for region in weights:  # each has its own nearest motions
+        moves = float((region * motion).sum()) > _STILL**2 * float(motion.sum()) * float(region.mean())
+        if moves:
+            rows.append(_region_times(keyframes, owned, region, frames, nearest))
+        else:
+            together = _region_times(keyframes, owned, whole, frames, nearest) if together is None else together
+            rows.append(together)
+    return torch.stack(rows)
+
+
+def interpolate(keyframes: Tensor, times: Tensor, vertex_weights: Tensor) -> Tensor:
+    """The motion between two keyframes at given times.
+
+    Args:
+        keyframes: (2,V,3).
+        times: how far each region has come in each frame, (R,T), 0 first and 1 last.
+        vertex_weights: the share of each region in each vertex, (R,V), of sum 1.
+
+    Returns:
+        (T,V,3); the first and the last are the keyframes exactly.
+
+    Raises:
+        ShapeError: the shapes do not fit.
+    """
+    if keyframes.ndim != 3 or len(keyframes) != 2 or times.shape[1] < 2 or len(times) != len(vertex_weights):
+        raise ShapeError(
+            f"interpolate: found keyframes {tuple(keyframes.shape)}, times {tuple(times.shape)} and weights "
+            f"{tuple(vertex_weights.shape)}, expected (2,V,3), (R,T) and (R,V)"
+        )
+    shares = (times[:, 1:-1].T.to(keyframes) @ vertex_weights.to(keyframes))[..., None]
+    between = torch.lerp(keyframes[:1], keyframes[1:], shares)
+    return torch.cat([keyframes[:1], between, keyframes[1:]])
+
+
+def motion_progress(motion: Tensor, frames: int) -> Tensor:
+    """The timing of a captured motion: how far it has come from its first to its last pose, (frames,), never falling.
+
+    Args:
+        motion: features, (n,D), n at least 2.
+        frames: how many moments are asked for, at even distance.
+    """
+    if len(motion) == 2:
+        return torch.linspace(0, 1, frames, dtype=torch.float64)
+    count = max(_STEPS, 2 * len(motion))
+    asked = torch.linspace(0, 1, count, dtype=torch.float64)
+    blends = torch.lerp(motion[:1].double(), motion[-1:].double(), asked[:, None])
+    times = project_sequence(blends, motion).times
+    times[0], times[-1] = 0, len(motion) - 1
+    # A jump leaves several blends at one time: the least of slopes lets them be told apart.
+    times = (times + 1e-6 * asked) * ((len(motion) - 1) / (len(motion) - 1 + 1e-6))
+    moments = torch.linspace(0, len(motion) - 1, frames, dtype=torch.float64)
+    progress = _interpolated(moments, times, asked)
+    progress[0], progress[-1] = 0, 1
+    return progress
+
+
+def _region_times(keyframes: Tensor, owned: Sequence[Tensor], region: Tensor, frames: int, nearest: int) -> Tensor:
+    scale = region.clamp(min=0).sqrt().double()[:, None]
+    pair = (keyframes.double() * scale).flatten(1)
+    size = float((pair[1] - pair[0]).norm().clamp(min=1e-12))
+    motions: list[Tensor] = []
+    errors: list[float] = []
+    for sequence in owned:
+        captured = (sequence.double() * scale).flatten(1)
+        times, error = _on_one_motion(pair, captured)
+        motion = _extended(captured, times, pair[1] - pair[0])
+        if len(motion) < 2:
+            continue
+        # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
+        missed = (pair[1] - pair[0] - (motion[-1] - motion[0])).norm()
+        # Quick motions have another course than slow ones.
+        errors.append((error + float(missed)) / size + abs(math.log(len(motion) / frames)))
+        motions.append(motion)
+    if not motions:
+        return torch.linspace(0, 1, frames, dtype=keyframes.dtype)
+    order = torch.tensor(errors, dtype=torch.float64).sort(stable=True)
+    chosen = order.indices[:nearest].tolist()
+    shares = 1 / (order.values[:nearest] + 0.1 * order.values[0] + 1e-6)
+    curves = torch.stack([motion_progress(motions[index], frames) for index in chosen])
+    times = ((shares / shares.sum()) @ curves).clamp(0, 1).to(keyframes.dtype)
+    times[-1] = 1
+    return times
+
+
+def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:
+    """Where two poses (2,D) lie in order on a sequence (n,D), (2,), with little else between them; and what is missed.
+
+    The neutral stands at both ends of a sequence, and an expression is met on the way there and on the way back: by
+    distance alone all four pairings are as good.
+    """
+    shares, distances = _segment_projections(pair, captured)
+    steps = (captured[1:] - captured[:-1]).norm(dim=1)
+    travelled = torch.cat([steps.new_zeros(1), steps.cumsum(0)])[:-1] + shares * steps
+    way = travelled[1] - travelled[0][:, None]
+    detour = (way - (pair[1] - pair[0]).norm()).clamp(min=0)
+    cost = distances[0][:, None] + distances[1] + _DETOUR * detour
+    cost = torch.where(way >= 0, cost, torch.inf)
+    best = int(cost.argmin())
+    first, last = divmod(best, len(steps))
+    times = torch.stack([first + shares[0, first], last + shares[1, last]])
+    return times, float(cost[first, last])
+
+
+def _extended(captured: Tensor, times: Tensor, direction: Tensor) -> Tensor:
+    """The frames of the whole motion along a direction (D,) in which the times of two projected poses lie."""
+    along = captured @ direction
+    first, last = int(times[0].floor()), min(int(times[1].ceil()), len(captured) - 1)
+    extent = float(along.max() - along.min())
+    start = first - _turning(along[: first + 1].flip(0), extent)
+    end = last + _turning(-along[last:], extent)
+    return captured[start : end + 1]
+
+
+def _turning(values: Tensor, extent: float) -> int:
+    """The first index of (n,) at which they are as good as least, before they have risen from there again."""
+    least = values.cummin(0).values
+    risen = (values - least > _DRIFT * extent).nonzero()[:, 0]
+    end = int(risen[0]) if len(risen) else len(values) - 1
+    return int((values <= least[end] + _HOLD * extent).nonzero()[0, 0])
+
+
+def _segment_projections(alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
+    """Where on each segment of beta each frame of alpha lies nearest, 0 to 1, and how far from it, (m,n-1) each."""
+    # By products of matrices, which take no memory in m n D; from beta's middle, which keeps their digits.
+    middle = beta.mean(0)
+    alpha, beta = alpha - middle, beta - middle
+    step = beta[1:] - beta[:-1]
+    length = step.square().sum(1)
+    along = alpha @ step.T - (beta[:-1] * step).sum(1)
+    shares = torch.where(length > 0, along / length.clamp(min=1e-300), torch.zeros_like(along)).clamp(0, 1)
+    offset = alpha.square().sum(1)[:, None] - 2 * alpha @ beta[:-1].T + beta[:-1].square().sum(1)
+    squared = offset - 2 * shares * along + shares.square() * length
+    return shares, squared.clamp(min=0).sqrt()
+
+
+def _isotonic(values: Tensor) -> Tensor:
+    """The nearest sequence to (m,) that never falls, by pooling neighbours that do."""
+    pools: list[tuple[float, int]] = []
+    # Each value may merge any number of pools before it.
+    for value in values.tolist():
+        total, count = value, 1
+        while pools and pools[-1][0] * count > total * pools[-1][1]:
+            before = pools.pop()
+            total, count = total + before[0], count + before[1]
+        pools.append((total, count))
+    means = torch.tensor([total / count for total, count in pools], dtype=values.dtype)
+    return means.repeat_interleave(torch.tensor([count for _, count in pools]))
+
+
+def _interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
+    """Values (k,) known at rising places (k,), between them at others (n,)."""
+    right = torch.searchsorted(known, at).clamp(1, len(known) - 1)
+    span = (known[right] - known[right - 1]).clamp(min=1e-12)
+    return torch.lerp(values[right - 1], values[right], ((at - known[right - 1]) / span).clamp(0, 1))
