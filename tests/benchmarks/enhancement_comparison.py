@@ -81,7 +81,7 @@ def bench_of(kind: str, data: Path) -> Bench:
         scene.neutral, scene.faces, scene.frames, scene.rigged), model).items()}  # fmt: skip
     methods |= {name + PAIRS: way for name, way in ours(paired).items()}
     papers = PapersForm(scene.neutral, scene.faces, scene.frames)
-    methods[PAPER] = ways(papers, model)[FOUR]
+    methods[PAPER] = four_regions(papers, model)
     owner = model.vertex_weights.argmax(0)
     regions = {name: owner == number for number, name in enumerate(model.region_names)}
     ruler = Ruler(scene.neutral, scene.faces, database.low_pass)
@@ -105,16 +105,21 @@ def ours(model: EnhancementModel) -> dict[str, Method]:
     return {OURS: partial(matched, "projection"), LEARNED: partial(matched, "learned")}
 
 
-def ways(database: Database, model: EnhancementModel) -> dict[str, Method]:
-    """The peers; of the model they are given its four voluntary regions alone."""
+def four_regions(database: Database, model: EnhancementModel) -> Method:
+    """The paper's choice of regions: those that the actor moves at will, whose softness covers the rest."""
     four = model.regions.voluntary
     areas = triangle_areas(model.neutral, model.faces)
     weights = model.regions.patch_weights(database.patches, areas)[four]
     shares = model.vertex_weights[four] + 1e-6  # far from all four they share alike: there little moves
+    return convex(database, weights, shares / shares.sum(0))
+
+
+def ways(database: Database, model: EnhancementModel) -> dict[str, Method]:
+    """The peers; of the model they are given its four voluntary regions alone."""
     return {
         NEAREST: nearest_frame(database),
         HOLISTIC: holistic(database),
-        FOUR: convex(database, weights, shares / shares.sum(0)),
+        FOUR: four_regions(database, model),
         RIDGE: ridge_on_components(database),
         MOTION: polynomial_maps(database, strain=False),
         STRAIN: polynomial_maps(database, strain=True),

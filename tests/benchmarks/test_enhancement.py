@@ -86,6 +86,16 @@ def test_every_region(bench: Bench, measured: Measured) -> None:
     print(f"+ from pairs; ours is not below nearest frame and holistic in: {', '.join(worse) or 'none'}")
 
 
+def test_bars(bench: Bench, measured: Measured) -> None:
+    """What is promised: below the other uses of the database, steady, and a seventh of what the smooth input lacks."""
+    for kind in ("", PAIRS):
+        own = shares(bench, measured, LEARNED + kind)
+        assert own.fine < min(shares(bench, measured, name + kind).fine for name in (NEAREST, HOLISTIC, FOUR))
+        assert own.flicker <= 1.2
+    if bench.scene.name == "performer":
+        assert shares(bench, measured, LEARNED + PAIRS).fine <= 0.15
+
+
 def test_pictures(bench: Bench) -> None:
     """The liveliest frame of each test take: smooth input, ours, truth, and others, to be looked at."""
     for number, (coarse, truth) in enumerate(zip(bench.scene.coarse, bench.scene.truth, strict=True)):

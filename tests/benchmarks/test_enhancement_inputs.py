@@ -23,6 +23,7 @@ from torchface.rig import BlendshapeRig
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 EACH = 3  # test frames of which one is enhanced: 10 a second
 METHODS = (INPUT, OURS, LEARNED, LEARNED + PAIRS, MOTION, PAPER)
+TITLES = ("input itself", "13 regions", "learned map", "learned, from pairs", "polynomials", "paper's form")
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_sources(bench: Bench) -> None:
     """Every kind of input, ours beside polynomial maps (figure 14) and the paper's own form."""
     known = [bench.ruler.known(true[::EACH]) for true in bench.scene.truth]
     weights = [some[::EACH] for some in bench.scene.test_weights]
-    head = "".join(f"{name[-20:]:>22s}" for name in METHODS)
+    head = "".join(f"{name:>22s}" for name in TITLES)
     print(f"\nfine part, share of the smooth input's; normals behind\n{'':32s}{head}")
     for source, made in SOURCES.items():
         coarse = [made(bench, true.truth, rows) for true, rows in zip(known, weights, strict=True)]
