@@ -85,9 +85,9 @@ def one_camera(bench: Bench, truth: Tensor, weights: Tensor) -> Tensor:
     """Figure 12: the rig fitted to 68 landmarks of one camera's video, with half a pixel of noise at 640x480."""
     performer = bench.scene.performer
     marks = performer.neutral.landmarks
-    camera = look_at(bench.scene.neutral[marks].mean(0), span=400.0, width=640, height=480)
+    camera = look_at(bench.scene.neutral[marks].mean(0), yaw=0.0, span=400.0, width=640, height=480)
     noise = torch.randn(len(truth), 68, 2, generator=torch.Generator().manual_seed(0))
-    solver = VideoSolver(performer.rig, intrinsics=camera.intrinsics)
+    solver = VideoSolver(performer.rig, performer.rig.neutral.landmarks, camera.intrinsics)
     found = solver(camera.project(truth[:, marks].double()).float() + 0.5 * noise)
     return performer.smooth(found.weights.float().clamp(0, 1))
 
