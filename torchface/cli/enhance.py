@@ -28,6 +28,7 @@ def enhance(
     no_glb: bool = False,
     glb_megabytes: float = 200.0,
     detail: float = 1.0,
+    retime: bool = False,
     no_video: bool = False,
     height: int = 380,
     quiet: Quiet = False,
@@ -59,6 +60,7 @@ def enhance(
         no_glb: Do not write enhanced.glb.
         glb_megabytes: What its morph targets may take; a long animation is shown by principal components.
         detail: How strong the added detail is: 1 is the actor's, 0 none.
+        retime: First give the motions between the animation's keyframes the actor's timing; the keyframes stay.
         no_video: Do not write comparison.mp4.
         height: Of each view of a face in the report, pixels.
         quiet: Show no progress.
@@ -73,7 +75,7 @@ def enhance(
 
     checked_count("--height", height, *PICTURE_HEIGHTS)
     given = InputSettings(rig, attachment, pairs, part, neutral, fps, MarkerOptions(unit, labels, None, flip))
-    settings = EnhanceSettings(given, meshes, not no_glb, glb_megabytes, detail, not no_video)
+    settings = EnhanceSettings(given, meshes, not no_glb, glb_megabytes, detail, not no_video, retime)
     with job_lock(out), progress_bars(quiet) as progress:
         done = enhance_animation(animation, model, out, settings, progress)
         progress("writing the report")

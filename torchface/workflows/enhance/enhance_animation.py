@@ -25,6 +25,7 @@ from torchface.workflows.enhance.coarse_animation import CoarseAnimation
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_views import drawn_frames, framed_model
 from torchface.workflows.enhance.enhanced_frames import SEQUENCE, EnhancedFrames, enhance_frames
+from torchface.workflows.enhance.retimed_animation import retimed_animation
 
 STATE = "state"
 GLB, VIDEO, FRAMES, SUMMARY, MESHES = "enhanced.glb", "comparison.mp4", "frames.csv", "summary.json", "meshes"
@@ -45,6 +46,7 @@ class EnhanceSettings:
         megabytes: that its morph targets may take.
         detail: how strong the detail is; 1 is the actor's.
         video: the video of input and result side by side.
+        retime: give the motions between the animation's keyframes the actor's timing first.
     """
 
     given: InputSettings = field(default_factory=InputSettings)
@@ -53,6 +55,7 @@ class EnhanceSettings:
     megabytes: float = MEGABYTES
     detail: float = 1.0
     video: bool = True
+    retime: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,9 +146,10 @@ def _enhance(path: Path, model_name: str, out: Path, settings: EnhanceSettings, 
     if animation.head is not None or settings.detail != 1:
         model = model.on_actor(model.neutral if animation.head is None else animation.head, settings.detail)
     given = settings.given
-    key = content_key(
-        _METHOD, input=path, rig=given.rig, attachment=given.attachment, pairs=given.pairs, given=given, model=model
-    )
+    named = {"rig": given.rig, "attachment": given.attachment, "pairs": given.pairs}
+    key = content_key(_METHOD, input=path, **named, given=given, model=model, retime=settings.retime)
+    if settings.retime:
+        animation = retimed_animation(animation, model, progress)
     found = enhance_frames(animation, model, out, state, key, progress)
     mesh = framed_model(model)
     products, notes = {"meshes, every frame": out / SEQUENCE}, list(animation.notes)

@@ -1,0 +1,36 @@
+"""A retimed animation is read piece by piece and is the same as in one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.workflows.enhance.conftest import Actor
+from torchface import zoo
+from torchface.enhancement import EnhancementModel
+from torchface.enhancement.animation_retiming import retime_animation
+from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
+from torchface.progress import silent
+from torchface.workflows.enhance import retimed_animation
+from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
+
+
+def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = zoo.get_model(Path(actor.model))
+    assert isinstance(model, EnhancementModel)
+    frames = actor.frames
+    path = tmp_path / "meshes.safetensors"
+    with MeshSequenceWriter(path, len(frames), frames.shape[1], actor.mesh.faces) as writer:
+        writer.append(frames)
+    monkeypatch.setattr(retimed_animation, "piece_size", lambda vertices: 5)
+    given = read_coarse(path, actor.mesh, InputSettings(), tmp_path, silent)
+    found = retimed_animation.retimed_animation(given, model, silent)
+    with torch.no_grad():
+        whole = retime_animation(model, frames)
+    pieces = torch.cat([found.read(0, 4), found.read(4, len(frames))])
+    torch.testing.assert_close(pieces, whole, atol=2e-3, rtol=0)
+    torch.testing.assert_close(pieces[[0, -1]], frames[[0, -1]], atol=2e-3, rtol=0)
+    assert float((pieces - frames).abs().max()) > 0.01
+    assert "retimed" in found.notes[-1]
