@@ -21,7 +21,7 @@ LEAST_POINTS = 12
 _OPERATOR_POINTS = 400
 _LEAST_LEVEL = 30_000
 _VERTICES_A_POINT = 12
-_PULL = 1e5
+_PULL, _PULL_ON_A_LEVEL = 1e5, 30.0
 _RIGID_MM = 3.0
 _RIGID_ITERATIONS = 8
 _LEAST_ON_A_PART = 3
@@ -96,7 +96,10 @@ class ThinShell:
         energy = sparse.csr_array(energy + bending * bending_energy(level_points, coarse.faces))
         self._energy = sparse.csr_array(energy[self._ids][:, self._ids])
         self._carried = sparse.csr_array(self._carried[:, self._ids])
-        self._pull = _PULL * float(np.median(self._energy.diagonal()))
+        # Points on the two lips may share a triangle of a coarse level: to meet both exactly would tear at its corners.
+        meets_all = self.count <= _OPERATOR_POINTS or len(coarse.vertex_ids) == len(self.neutral)
+        pull = _PULL if meets_all else _PULL_ON_A_LEVEL
+        self._pull = pull * float(np.median(self._energy.diagonal()))
         to_dense = coarse.prolongation @ _followed(level_points.double().numpy(), part, held)
         self._to_dense = sparse.csr_array(to_dense, dtype=np.float32)
         self._operator: NDArray[np.float32] | None = None

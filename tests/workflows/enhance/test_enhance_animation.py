@@ -163,8 +163,9 @@ def test_registration_is_asked_once(actor: Actor, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(head_correspondence, "register", register)
     for _ in range(2):
         found = coarse(actor, path, tmp_path)
-        error = found.read(0, FRAMES) - actor.frames
-        assert float(error.norm(dim=-1).mean()) < 0.1
+        error = (found.read(0, FRAMES) - actor.frames).norm(dim=-1)
+        assert float(error.mean()) < 0.1
+        assert float(error.max()) < 3.0  # closed lips and lids move their own way
     assert asked == [len(order)]
 
 

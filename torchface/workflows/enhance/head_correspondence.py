@@ -14,6 +14,7 @@ from torchface.enhancement.propagation import LEAST_POINTS, ThinShell
 from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.landmarks.picks import load_correspondences
@@ -26,6 +27,7 @@ from torchface.workflows.enhance.coarse_animation import check_scale, residual_n
 _METHOD = "enhance: correspondence/1"
 _NEAR, _NEAR_BY_PAIRS = 2.0, 6.0
 _MOST_POINTS = 5000
+_ALIKE = 0.5  # cosine between two surfaces that are to be one
 _COLUMNS = ("input", "model")
 
 
@@ -47,10 +49,21 @@ class HeadCorrespondence:
     residual: float
     how: str
 
-    def on_model(self, surface: SurfaceIndex, points: Tensor) -> Attachment:
-        """The places (M,) on the model's surface that are nearest to points (M,3) of its space."""
-        found = surface.nearest(points)
-        return Attachment(found.triangle, found.barycentric.float())
+    def on_model(self, surface: SurfaceIndex, faces: Tensor) -> tuple[Tensor, Attachment]:
+        """At most 5,000 known vertices, spread evenly, (M,), and where they lie on the model's surface.
+
+        A vertex whose surface faces another way than the model's does there has come to lie on the other lip or lid,
+        and is left out.
+
+        Args:
+            surface: the model's, at rest.
+            faces: triangles of the head, (F,3).
+        """
+        ids = self.sparse_points(faces)
+        found = surface.nearest(self.laid[ids])
+        own = vertex_normals(self.laid.double(), faces)[ids]
+        alike = (own * surface.normals_at(found)).sum(-1) > _ALIKE
+        return ids[alike], Attachment(found.triangle[alike], found.barycentric[alike].float())
 
     def sparse_points(self, faces: Tensor) -> Tensor:
         """Numbers of at most 5,000 known vertices, spread evenly, (M,)."""

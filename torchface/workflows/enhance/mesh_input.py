@@ -32,14 +32,13 @@ def other_topology(
     Raises:
         AlignmentError: fewer than 12 vertices have a place on the model.
     """
-    ids = found.sparse_points(animated.neutral.faces)
+    ids, sites = found.on_model(SurfaceIndex(model.vertices, model.faces), animated.neutral.faces)
     if len(ids) < LEAST_POINTS:
         raise AlignmentError(
             f"{animated.path}: found {len(ids)} vertices with a place on the model, expected at least {LEAST_POINTS}; "
             "give pairs (--pairs), or bring the input's neutral nearer to the model's"
         )
-    surface = SurfaceIndex(model.vertices, model.faces)
-    shell = ThinShell(model.vertices, model.faces, found.on_model(surface, found.laid[ids]))
+    shell = ThinShell(model.vertices, model.faces, sites)
     rest = found.pose.apply(animated.neutral.vertices[ids].double())[0]
 
     def read(begin: int, end: int) -> Tensor:
