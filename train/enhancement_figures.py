@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchface import Mesh
 from torchface.enhancement import EnhancementModel
 from torchface.files.whole_files import make_folder
+from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.progress import Progress
 from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
@@ -21,6 +23,7 @@ from train.restored_frames import Restored, restored
 
 _TRIED = 24  # frames among which the most detailed one is looked for
 _HEIGHT = 420
+_LINE = 110  # characters of a heading
 
 
 def draw(
@@ -43,16 +46,25 @@ def draw(
 
 
 def _regions(model: EnhancementModel, neutral: Mesh) -> Tensor:
+    """The region that counts most at each vertex, in a colour of its own."""
     hues = torch.tensor(colormaps["tab20"](range(len(model.region_names))))[:, :3].to(neutral.vertices)
-    colors = model.vertex_weights.T.float() @ hues
-    named = ", ".join(model.region_names)
-    return headed(face_views(neutral, colors=colors, width=_HEIGHT * 4 // 5, height=_HEIGHT), named)
+    row = face_views(neutral, colors=hues[model.vertex_weights.argmax(0)], width=_HEIGHT * 4 // 5, height=_HEIGHT)
+    names = textwrap.wrap(", ".join(model.region_names), _LINE)
+    for line in reversed(names):
+        row = headed(row, line)
+    return row
 
 
 def _most_detailed(model: EnhancementModel, frames: MeshSequence) -> Restored:
+    """The frame whose normals the smooth part lacks most of: the most wrinkled one."""
     tried = range(0, len(frames), max(1, len(frames) // _TRIED))
     found = (restored(model, frames.read(number, number + 1)[0]) for number in tried)
-    return max(found, key=lambda one: float((one.truth - one.smooth).square().sum()))
+    return max(found, key=lambda one: _bent(one, model.faces))
+
+
+def _bent(frame: Restored, faces: Tensor) -> float:
+    own, smooth = (vertex_normals(vertices, faces) for vertices in (frame.truth, frame.smooth))
+    return float((own - smooth).square().sum())
 
 
 def _frame(neutral: Mesh, shown: Restored) -> Tensor:
@@ -61,6 +73,6 @@ def _frame(neutral: Mesh, shown: Restored) -> Tensor:
         row = face_views(replace(neutral, vertices=vertices), width=_HEIGHT * 4 // 5, height=_HEIGHT, framed_by=neutral)
         views.append(caption(row, name))
     errors = (shown.restored - shown.truth).norm(dim=-1)
-    scale = round_maximum(float((shown.smooth - shown.truth).norm(dim=-1).quantile(0.99)))
+    scale = round_maximum(float(errors.quantile(0.99)))
     views.append(error_views(replace(neutral, vertices=shown.truth), errors, scale, "restored from captured, mm"))
     return sheet(views, 1)
