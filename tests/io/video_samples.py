@@ -17,7 +17,12 @@ from av.packet import Packet
 
 RATE = 30
 TICKS = 60_000
-OPTIONS = {"libsvtav1": {"preset": "12"}, "libx265": {"x265-params": "log-level=none"}, "mpeg4": {"qmax": "4"}}
+OPTIONS = {
+    "libx264": {"x264-params": "mbtree=0"},  # with it the same frames are not always coded into the same bytes
+    "libsvtav1": {"preset": "12"},
+    "libx265": {"x265-params": "log-level=none"},
+    "mpeg4": {"qmax": "4"},
+}
 
 
 def pattern(number: int, width: int = 160, height: int = 120) -> np.ndarray:
