@@ -8,15 +8,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
 import torch
-from quadratic_programming_peers import Solver, daqp_solver, installed, piqp_solver
+from quadratic_programming_peers import Solver, daqp_solver, installed, osqp_solver, piqp_solver, quadprog_solver
 from torch import Tensor
 
+from torchface import Attachment, BlendshapeRig
 from torchface.optim import BoxQP
 
 matplotlib.use("Agg")
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
+PEERS: dict[str, Callable[[np.ndarray], Solver]] = {
+    "PIQP": piqp_solver,
+    "DAQP": daqp_solver,
+    "OSQP": osqp_solver,
+    "quadprog": quadprog_solver,
+}
 
 
 def blendshape_problem(shapes: int, frames: int) -> tuple[Tensor, Tensor]:
@@ -36,6 +44,30 @@ def blendshape_problem(shapes: int, frames: int) -> tuple[Tensor, Tensor]:
     return H, -0.02 * targets @ basis + 0.03
 
 
+def widened_problem(capture: tuple[BlendshapeRig, Attachment, list[Tensor]], shapes: int) -> tuple[Tensor, Tensor]:
+    """A real rig's 53 shapes and smooth local copies of them, 100 markers, 0.3 mm of noise, ``MarkerSolver``'s terms.
+
+    Real takes move the rig's own shapes; each copy has the weights of a random shape at another time, times 0.7.
+    """
+    rig, attachment, takes = capture
+    generator = torch.Generator().manual_seed(shapes)
+    faces, weights = rig.neutral.faces, torch.cat(takes).double()
+    points, basis = attachment.on(faces, rig.vertices).double(), attachment.on(faces, rig.deltas).double()
+    extra = shapes - len(basis)
+    parent = torch.randint(len(basis), (extra,), generator=generator)
+    center = points[torch.multinomial(basis[parent].square().sum(-1).float(), 1, generator=generator)[:, 0]]
+    reach = 15 + 15 * torch.rand(extra, generator=generator, dtype=torch.float64)
+    near = torch.exp(-(points - center[:, None]).square().sum(-1) / (2 * reach[:, None] ** 2))
+    basis = torch.cat((basis, basis[parent] * near[..., None])).flatten(1).T
+    shape = torch.randint(weights.shape[1], (extra,), generator=generator).tolist()
+    shift = torch.randint(500, len(weights) - 500, (extra,), generator=generator).tolist()
+    copies = [0.7 * weights[:, column].roll(by) for column, by in zip(shape, shift, strict=True)]
+    weights = torch.cat((weights, *(copy[:, None] for copy in copies)), 1)[:1000]
+    noise = torch.randn(len(weights), len(basis), generator=generator, dtype=torch.float64)
+    targets = weights @ basis.T + 0.3 * noise
+    return 0.02 * basis.T @ basis + 2e-3 * torch.eye(shapes, dtype=torch.float64), -0.02 * targets @ basis + 0.01
+
+
 def milliseconds(H: Tensor, f: Tensor) -> float:
     """Processor time a frame of all frames at once, the best of three."""
     qp = BoxQP(H.float())
@@ -50,7 +82,8 @@ def milliseconds(H: Tensor, f: Tensor) -> float:
 
 def peer_milliseconds(solve: Solver, f: Tensor) -> float:
     """Processor time a frame of a peer that is called a frame at a time, the best of three passes."""
-    rows, best = list(f[:100].numpy()), math.inf
+    rows, best = list(f[: max(4, round(2e5 / f.shape[1] ** 1.7))].numpy()), math.inf
+    solve(rows[0])
     for _ in range(3):
         begin = time.process_time()
         for row in rows:
@@ -65,21 +98,43 @@ def worst_residual(H: Tensor, f: Tensor) -> float:
     return float((x - (x - bent / H.diagonal()).clamp(0, 1)).abs().max())
 
 
+def growth(problems: dict[int, tuple[Tensor, Tensor]]) -> tuple[list[float], dict[str, list[float]]]:
+    """Milliseconds a frame by number of shapes, ours and theirs, as printed."""
+    # The two that are slow from the start take minutes where there are many shapes.
+    peers = {name: make for name, make in PEERS.items() if installed(name.lower())}
+    ours: list[float] = []
+    theirs: dict[str, list[float]] = {name: [] for name in peers}
+    heading = "".join(f"{name + ' ms':>12}" for name in peers)
+    print(f"{'shapes':>7} {'ours ms':>9} {'residual':>9}{heading}   (all frames at once, float32; peers one by one)")
+    for count, (H, f) in problems.items():
+        ours.append(milliseconds(H, f))
+        left = worst_residual(H, f)
+        for name, make in peers.items():
+            slow = name in ("OSQP", "quadprog") and count > 300
+            theirs[name].append(math.nan if slow else peer_milliseconds(make(H.numpy()), f))
+        print(f"{count:7} {ours[-1]:9.4f} {left:9.1e}" + "".join(f"{each[-1]:12.4f}" for each in theirs.values()))
+        assert left <= 1e-4
+    for count, mine, *others in zip(problems, ours, *theirs.values(), strict=True):
+        # Between 53 and 140 shapes the fastest, DAQP, is nearer; the machine's other work moves the ratio by a third.
+        least = 3.5 if count > 140 else 2 if count == 140 else 0.5
+        assert min((other for other in others if not math.isnan(other)), default=math.inf) >= least * mine
+    return ours, theirs
+
+
+@pytest.mark.real
+@pytest.mark.usefixtures("one_thread")
+def test_growth_of_a_real_rig_by_copies(
+    real_capture: tuple[BlendshapeRig, Attachment, list[Tensor]], print_machine: Callable[..., None]
+) -> None:
+    print_machine("piqp", "daqp", "osqp", "quadprog")
+    growth({count: widened_problem(real_capture, count) for count in (140, 280, 600)})
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_growth_with_shapes_and_frames(print_machine: Callable[..., None]) -> None:
-    shapes = [16, 32, 53, 100, 140, 200, 280]
-    peers = {name: make for name, make in (("PIQP", piqp_solver), ("DAQP", daqp_solver)) if installed(name.lower())}
-    ours, left, theirs = [], [], {name: [] for name in peers}
-    print_machine("piqp", "daqp")
-    heading = "".join(f"{name + ' ms':>9}" for name in peers)
-    print(f"{'shapes':>7} {'ours ms':>9} {'residual':>9}{heading}   (1,000 frames at once, float32; peers one by one)")
-    for count in shapes:
-        H, f = blendshape_problem(count, 1000)
-        ours.append(milliseconds(H, f))
-        left.append(worst_residual(H, f))
-        for name, make in peers.items():
-            theirs[name].append(peer_milliseconds(make(H.numpy()), f))
-        print(f"{count:7} {ours[-1]:9.4f} {left[-1]:9.1e}" + "".join(f"{each[-1]:9.4f}" for each in theirs.values()))
+    shapes = [16, 32, 53, 100, 140, 200, 280, 600]
+    print_machine("piqp", "daqp", "osqp", "quadprog")
+    ours, theirs = growth({count: blendshape_problem(count, 1000) for count in shapes})
     frames = [1, 10, 100, 1000, 10_000, 100_000]
     by_frame = []
     H, f = blendshape_problem(53, frames[-1])
@@ -105,8 +160,5 @@ def test_growth_with_shapes_and_frames(print_machine: Callable[..., None]) -> No
     OUT.mkdir(parents=True, exist_ok=True)
     figure.savefig(OUT / "box_qp_growth.png", dpi=120)
 
-    assert max(left) <= 1e-4
-    for count, mine, peer in zip(shapes, ours, theirs.get("PIQP", []), strict=False):
-        assert count > 100 or mine < peer
     # Large batches cost no more a frame than middling ones: memory stays bounded.
     assert by_frame[-1] <= 2 * min(by_frame)

@@ -6,9 +6,17 @@ import pytest
 import torch
 
 from torchface.errors import ValueRangeError
-from torchface.optim.active_set import projected_newton, solve_free
+from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
-from torchface.optim.operator_splitting import prepare_splitting, splitting_steps, start_splitting
+from torchface.optim.free_variables import solve_free
+from torchface.optim.operator_splitting import (
+    extrapolated_splitting,
+    prepare_splitting,
+    splitting_steps,
+    start_splitting,
+    suited_rho,
+)
+from torchface.optim.primal_dual_active_set import primal_dual_active_set
 
 
 def problem(variables: int = 12, problems: int = 30, seed: int = 0) -> BoxProblem:
@@ -46,6 +54,31 @@ def test_damping_adds_to_the_metric() -> None:
     torch.testing.assert_close(solved, torch.linalg.solve(lifted, given.f), rtol=1e-8, atol=1e-10)
 
 
+def test_a_masked_solve_with_an_h_each_and_of_singular_blocks() -> None:
+    given = problem()
+    free = torch.rand(30, 12, generator=torch.Generator().manual_seed(1)) < 0.6
+    free[3], free[4] = False, True
+    many = given.H * torch.linspace(0.5, 2, 30, dtype=torch.float64)[:, None, None]
+    alone = [solve_free(many[i], metric(many[i]), free[i : i + 1], given.f[i : i + 1]) for i in range(30)]
+    torch.testing.assert_close(solve_free(many, metric(many), free, given.f), torch.cat(alone))
+    ones = torch.ones(12, 12, dtype=torch.float64)
+    solved = solve_free(ones, metric(ones), free, ones[:1].expand(30, 12))
+    torch.testing.assert_close(solved.sum(-1), free.any(-1).double(), rtol=0, atol=1e-6)
+
+
+def test_sets_that_are_nearly_right_settle_at_the_optimum_and_others_are_given_back() -> None:
+    given = problem(problems=300)
+    optimum = projected_newton(given, torch.zeros(300, 12, dtype=torch.float64), 1e-12)
+    start = optimum.clone()
+    start[:, 5] = (start[:, 5] <= 0).double()  # one variable of each set is wrong
+    found, gradient = primal_dual_active_set(given, start)
+    torch.testing.assert_close(gradient, given.gradient(found), rtol=1e-9, atol=1e-9)
+    settled = given.residual(found) <= 1e-9
+    assert 0.6 < settled.double().mean() < 1
+    assert torch.equal(found[~settled], start[~settled])
+    torch.testing.assert_close(found[settled], optimum[settled], rtol=0, atol=1e-9)
+
+
 def test_newton_steps_reach_the_optimum_from_anywhere() -> None:
     given = problem(problems=300)
     start = torch.rand(300, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -72,6 +105,19 @@ def test_the_optimum_is_where_splitting_rests() -> None:
     again = splitting_steps(given, factors, state, 1)
     torch.testing.assert_close(again.z, state.z, rtol=0, atol=1e-11)
     torch.testing.assert_close(again.t, state.t, rtol=0, atol=1e-9)
+
+
+def test_extrapolated_splitting_is_nearer_after_as_many_steps() -> None:
+    given = problem(30, 200)
+    optimum = projected_newton(given, torch.zeros(200, 30, dtype=torch.float64), 1e-12)
+    factors, start = prepare_splitting(given.H, suited_rho(given.H)), start_splitting(given, None)
+    ours = (extrapolated_splitting(given, factors, start, 1).z - optimum).abs().amax(1)
+    plain = (splitting_steps(given, factors, start, 27, dtype=torch.float32).z - optimum).abs().amax(1)
+    assert ours.median() < 0.2 * plain.median()
+    H = given.H * torch.linspace(0.5, 2, 200, dtype=torch.float64)[:, None, None]
+    many = BoxProblem.of(H, given.f, given.lower, given.upper)
+    each = extrapolated_splitting(many, prepare_splitting(H, suited_rho(H)), start, 3).z
+    assert many.residual(each).median() < 1e-4
 
 
 def test_splitting_with_an_h_each_is_splitting_of_each() -> None:

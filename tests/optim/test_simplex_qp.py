@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.optim import simplex_qp
+from torchface.optim import SimplexQP, simplex_qp
 
 
 def problem(variables: int, features: int, problems: int, noise: float, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -106,6 +106,31 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(
         lambda H, f: simplex_qp(0.5 * (H + H.transpose(1, 2)), f), (own, arguments[1]), eps=1e-6, atol=1e-5
     )
+
+
+def test_problems_of_several_matrices_are_solved_as_each_alone() -> None:
+    parts = [problem(15, 20, 4, 0.5, seed) for seed in range(3)]
+    H, f = torch.stack([H for H, _ in parts]), torch.stack([f for _, f in parts]).requires_grad_()
+    found = SimplexQP(H)(f)
+    for row, (own, linear) in enumerate(parts):
+        torch.testing.assert_close(found[row], simplex_qp(own, linear), atol=1e-9, rtol=0)
+    looked_at = torch.randn(found.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (found * looked_at).sum().backward()
+    for row, (own, linear) in enumerate(parts):
+        alone = linear.clone().requires_grad_()
+        (simplex_qp(own, alone) * looked_at[row]).sum().backward()
+        torch.testing.assert_close(f.grad[row], alone.grad, atol=1e-8, rtol=0)
+    with pytest.raises(ShapeError, match=r"expected \(B,15\) or \(3,B,15\)"):
+        SimplexQP(H)(f[:2])
+
+
+def test_neighbours_that_are_nearly_one_do_not_keep_it_from_the_minimum() -> None:
+    """Frames of an animation lie on curves, where many enter together and leave again."""
+    curve = problem(200, 12, 1, 0.0, 7)[0][:12].cumsum(1)
+    rough = torch.randn(12, 60, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    H, f = curve.T @ curve, -(20 * rough.cumsum(1)).T @ curve
+    x = simplex_qp(H, f)
+    assert slack(H, f, x) <= 1e-9 * float(H.diagonal().max() + f.amax() - f.amin())
 
 
 def test_what_is_wrong_is_told() -> None:

@@ -1,6 +1,6 @@
 """Solvers that know nothing of faces."""
 
 from torchface.optim.box_qp import BoxQP, box_qp
-from torchface.optim.simplex_qp import simplex_qp
+from torchface.optim.simplex_qp import SimplexQP, simplex_qp
 
-__all__ = ["BoxQP", "box_qp", "simplex_qp"]
+__all__ = ["BoxQP", "SimplexQP", "box_qp", "simplex_qp"]

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchface.number_checks import checked_count, checked_number
 from torchface.optim.box_problem import BoxProblem
+from torchface.optim.free_variables import solve_free
 
 # Numbers in the matrices factored at once: 2 MB of float64 stay in a CPU's cache; an accelerator wants more.
 _CHUNK_NUMBERS = {"cpu": 2**18, "other": 2**25}
@@ -23,9 +24,6 @@ _STEP_LENGTHS, _BLOCKED_TRIES = 10, 8
 # Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in directions
 # that only rounding fills, and the term fades as fast as the solution comes near.
 _DAMPING = 1e-5
-# The least of it, so that semidefinite blocks factor; raised a thousandfold where they do not.
-_RIDGE = 1e-13
-_RIDGE_TRIES = 5
 
 
 def projected_newton(
@@ -135,32 +133,3 @@ def _careful_step(problem: BoxProblem, x: Tensor, gradient: Tensor, step: _Newto
         best = torch.where(better[:, None], trial, best)
         least = torch.where(better, change, least)
     return best
-
-
-def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping: Tensor | None = None) -> Tensor:
-    r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` with :math:`x = 0` elsewhere.
-
-    Args:
-        H: (N,N) or (B,N,N), positive semidefinite, float64.
-        diagonal: the metric in which it is scaled, (N,) or (B,N).
-        free: which variables take part, (B,N) bool.
-        right: :math:`b`, (B,N).
-        damping: :math:`\delta`, (B,); none if absent.
-    """
-    scale = torch.where(free, diagonal.rsqrt(), 0.0)
-    scaled = H * scale[:, :, None] * scale[:, None, :]
-    entry = scaled.diagonal(dim1=-2, dim2=-1)
-    ridged = _RIDGE if damping is None else damping[:, None].clamp(min=_RIDGE)
-    entry += torch.where(free, ridged, 1.0)
-    right = (right * scale)[..., None]
-    factor, info = torch.linalg.cholesky_ex(scaled)
-    ridge = _RIDGE
-    for _ in range(_RIDGE_TRIES):
-        failed = info > 0
-        if not bool(failed.any()):
-            break
-        ridge *= 1e3
-        again = scaled[failed]
-        again.diagonal(dim1=-2, dim2=-1).add_(ridge)
-        factor[failed], info[failed] = torch.linalg.cholesky_ex(again)
-    return torch.cholesky_solve(right, factor)[..., 0] * scale

@@ -41,7 +41,7 @@ class BoxProblem:
         return BoxProblem(self.H[keep], self.f[keep], self.lower, self.upper, self.diagonal[keep])
 
     def clip(self, x: Tensor) -> Tensor:
-        return torch.minimum(torch.maximum(x, self.lower), self.upper)
+        return torch.clamp(x, self.lower, self.upper)
 
     def curvature(self, x: Tensor) -> Tensor:
         """:math:`Hx` for x (B,N)."""
@@ -61,7 +61,8 @@ class BoxProblem:
     def residuals(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
         """:math:`|x - clip(x - (Hx+f)/diag H)|_i / (1 + |x_i|)`, (B,N); zero everywhere only at the optimum."""
         gradient = self.gradient(x) if gradient is None else gradient
-        return (x - self.clip(x - gradient / self.diagonal)).abs() / (1 + x.abs())
+        step = self.clip(torch.addcdiv(x, gradient, self.diagonal, value=-1)).sub_(x).abs_()
+        return step.div_(x.abs().add_(1))
 
     def residual(self, x: Tensor, gradient: Tensor | None = None) -> Tensor:
         """The largest of a problem's residuals, (B,)."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -11,19 +13,32 @@ from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import checked_number
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, check_box, metric
+from torchface.optim.compiled_program import CompiledProgram, compiled_solver_installed
 from torchface.optim.implicit import BoxSolution
-from torchface.optim.operator_splitting import SplittingFactors, prepare_splitting, splitting_steps, start_splitting
+from torchface.optim.operator_splitting import (
+    SplittingFactors,
+    extrapolated_splitting,
+    prepare_splitting,
+    splitting_steps,
+    start_splitting,
+    suited_rho,
+)
 from torchface.optim.prepared_tensors import Prepared
+from torchface.optim.primal_dual_active_set import primal_dual_active_set
+from torchface.optim.single_program import SingleProgram
 
-# Rounds: Newton steps to try (at most), then steps of splitting, where the residual asks for either. A coarse solve
-# ends in the first iterations nearly always. A fine one needs more digits than splitting gives quickly, so Newton steps
-# follow the first iteration at once. Later iterations are for an H that is singular or close to it: splitting brings
-# such problems near enough for Newton steps to end them, and the last ones make sure.
-_COARSE_ROUNDS = ((0, 48), (0, 32), (0, 32), (0, 32))
-_FINE_ROUNDS = ((0, 60),)
+# Cycles of splitting before the active set is tried, times the root of N; then steps of splitting and Newton steps for
+# what it does not settle, an H that is singular or close to it: splitting brings such problems near enough for Newton
+# steps to end them, and the last ones make sure.
+_FIRST_CYCLES = 0.235
+# Few variables and a coarse tolerance: so many steps of splitting alone end nearly always, sooner than a factorisation.
+_COARSE_ROUNDS = ((None, 48), (None, 32), (None, 32))
+_COARSE, _FEW_VARIABLES = 1e-7, 64
+_SETTLING_ROUNDS = 4
 _LATER_ROUNDS = ((4, 100), (4, 200), (4, 400), (4, 400))
 _CAREFUL_ROUNDS = ((8, 400), (8, 800), (8, 1600), (100, 0))
-_COARSE = 1e-7
+# So many problems are solved one by one.
+_FEW = 8
 # The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
 # variable alone would go, or where the residual itself is still this share of that way.
 _RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
@@ -88,6 +103,9 @@ def box_qp(
 class BoxQP(nn.Module):
     """``box_qp`` as a module that checks and factors H once for many calls.
 
+    Calls of up to eight problems that ask for no gradients are made for live solving: on the processor they go to DAQP
+    where it is installed (the extra ``live``; each from the active set of the call before), else to NumPy and LAPACK.
+
     H is a buffer, or a parameter where an ``nn.Parameter`` is given. What is prepared from it follows it: an
     optimiser's step, ``load_state_dict``, ``.to()`` and ``.double()`` take effect at the next call.
 
@@ -145,10 +163,25 @@ class _PreparedHessian:
     exact: Tensor
     factors: SplittingFactors | None
 
+    @cached_property
+    def compiled(self) -> CompiledProgram | None:
+        """The same where DAQP is installed."""
+        single = self.single
+        if single is None or not compiled_solver_installed():
+            return None
+        return CompiledProgram(single.H, single.diagonal)
+
+    @cached_property
+    def single(self) -> SingleProgram | None:
+        """For calls of few problems; on an accelerator, or with an H for each problem, there is none."""
+        if self.factors is None or self.exact.device.type != "cpu":
+            return None
+        return SingleProgram.of(self.exact, self.factors)
+
     @classmethod
     def of(cls, H: Tensor) -> _PreparedHessian:
         exact = _checked_hessian(H)
-        return cls(exact, prepare_splitting(exact) if H.ndim == 2 else None)
+        return cls(exact, prepare_splitting(exact, suited_rho(exact)) if H.ndim == 2 else None)
 
 
 def _minimiser(
@@ -161,6 +194,9 @@ def _minimiser(
     tolerance: float,
 ) -> Tensor:
     """The minimisers (B,N), differentiable in H and f where these ask for it."""
+    quick = _solved_singly(H, prepared, f, lower, upper, start, tolerance)
+    if quick is not None:
+        return quick
     if torch.jit.is_tracing():
         raise TraceError(
             "box_qp: iterates until every problem is solved, and a trace would repeat one frame's path for all; "
@@ -190,37 +226,79 @@ def _solve_in_chunks(
         H = prepared.exact if shared else prepared.exact[rows]
         problem = BoxProblem.of(H, f[rows].double(), lower, upper)
         _check_slope(problem)
-        factors = prepare_splitting(H) if prepared.factors is None else prepared.factors
+        factors = prepare_splitting(H, suited_rho(H)) if prepared.factors is None else prepared.factors
         x = _solve(problem, factors, None if start is None else start[rows].double(), tolerance)
         # Rounding to float32 must not step over a bound.
         solution[rows] = torch.minimum(torch.maximum(x.to(f.dtype), lower.to(f)), upper.to(f))
     return solution
 
 
+def _solved_singly(
+    H: Tensor,
+    prepared: _PreparedHessian,
+    f: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    start: Tensor | None,
+    tolerance: float,
+) -> Tensor | None:
+    """The minimisers (B,N) of few problems that ask for no gradients, one by one, where each is found.
+
+    What is not as it should be is left to the checks of a batch.
+    """
+    if f.ndim != 2 or not 0 < len(f) <= _FEW or f.shape[1] != H.shape[-1] or f.dtype != H.dtype or not f.is_cpu:
+        return None
+    if start is not None and (start.shape != f.shape or not start.is_cpu):
+        return None
+    program, compiled = prepared.single, prepared.compiled
+    if program is None or torch.jit.is_tracing() or (torch.is_grad_enabled() and (H.requires_grad or f.requires_grad)):
+        return None
+    low, high, slopes = lower.double().numpy(), upper.double().numpy(), f.detach().double().numpy()
+    found = np.empty(f.shape)
+    for row, slope in enumerate(slopes):  # a batch of few takes as long as a dozen of these
+        x = None if compiled is None else compiled.solve(slope, low, high, tolerance)
+        if x is None:
+            x = program.solve(
+                slope, low, high, None if start is None else start[row].detach().double().numpy(), tolerance
+            )
+        if x is None:
+            return None
+        found[row] = x
+    if f.dtype == torch.float32:
+        # Rounding must not step over a bound.
+        found = np.minimum(np.maximum(found.astype(np.float32), low), high).astype(np.float32)
+    return torch.from_numpy(found)
+
+
 def _solve(problem: BoxProblem, factors: SplittingFactors, start: Tensor | None, tolerance: float) -> Tensor:
-    """Rounds of splitting for the problems still open, Newton steps for the last of them."""
-    first = _COARSE_ROUNDS if tolerance >= _COARSE else _FINE_ROUNDS
+    """Splitting finds the active set; it ends most problems, and Newton steps the last of them."""
+    cycles = max(1, round(_FIRST_CYCLES * problem.f.shape[1] ** 0.5))
+    rounds: tuple[tuple[int | None, int], ...] = ((0, cycles),) * _SETTLING_ROUNDS + _LATER_ROUNDS
+    if tolerance >= _COARSE and problem.f.shape[1] <= _FEW_VARIABLES:
+        rounds = _COARSE_ROUNDS + rounds
+    quick = len(rounds)
     state = start_splitting(problem, start)
     x = state.z.clone()
     rows = torch.arange(len(x), device=x.device)
     part = problem
-    quick = len(first) + len(_LATER_ROUNDS)
-    for number, (newton_steps, steps) in enumerate((*first, *_LATER_ROUNDS, *_CAREFUL_ROUNDS)):
-        gradient = part.gradient(state.z)
+    for number, (newton_steps, steps) in enumerate((*rounds, *_CAREFUL_ROUNDS)):
         if newton_steps:
-            x[rows] = found = projected_newton(part, state.z, tolerance, newton_steps, number >= quick)
-            still = part.unsolved(found, tolerance)
+            found, gradient = projected_newton(part, state.z, tolerance, newton_steps, number >= quick), None
+        elif newton_steps is not None and (number or start is not None):
+            found, gradient = primal_dual_active_set(part, state.z)
         else:
-            x[rows] = state.z
-            still = part.unsolved(state.z, tolerance, gradient)
-        keep = still.nonzero()[:, 0]
+            found, gradient = state.z, None
+        x[rows] = found
+        keep = part.unsolved(found, tolerance, gradient).nonzero()[:, 0]
         if not len(keep):
             break
         if len(keep) < len(rows):
             rows, part, state, factors = rows[keep], part.rows(keep), state.rows(keep), factors.rows(keep)
-            gradient = gradient[keep]
-        dtype = torch.float32 if number < quick else torch.float64
-        state = splitting_steps(part, factors, state, steps, gradient, dtype)
+        if newton_steps or newton_steps is None:
+            dtype = torch.float32 if number < quick else torch.float64
+            state = splitting_steps(part, factors, state, steps, dtype=dtype)
+        else:
+            state = extrapolated_splitting(part, factors, state, steps)
     _check_bounded(problem, x)
     return x
 

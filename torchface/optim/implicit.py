@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchface.optim.active_set import solve_free
 from torchface.optim.box_problem import metric
+from torchface.optim.free_variables import solve_free
 
 
 class BoxSolution(torch.autograd.Function):

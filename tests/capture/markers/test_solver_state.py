@@ -104,7 +104,8 @@ def test_a_penalty_is_learned_and_saved(small_rig: BlendshapeRig, small_attachme
     assert errors[-1] < 0.5 * errors[0]
     copy = MarkerSolver.from_config(solver.config)
     copy.load_state_dict(solver.state_dict())
-    assert torch.equal(copy(markers), solver(markers))
+    with torch.no_grad():  # few frames that ask for gradients are solved another way, which rounds otherwise
+        assert torch.equal(copy(markers), solver(markers))
     assert solver.sparsity.item() < 0.9
 
 
