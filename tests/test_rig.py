@@ -22,6 +22,20 @@ def test_forward_is_neutral_plus_weighted_deltas() -> None:
     torch.testing.assert_close(rig(torch.eye(4))[2], rig.neutral.vertices + rig.deltas[2])
 
 
+def test_a_rig_of_plain_tensors_is_the_same_rig() -> None:
+    rig = small_rig()
+    plain = BlendshapeRig.from_tensors(rig.vertices, rig.neutral.faces.int(), rig.deltas, rig.names)
+    weights = torch.rand(3, 4, generator=torch.Generator().manual_seed(2))
+    assert torch.equal(plain(weights), rig(weights))
+    deltas = rig.deltas.clone().requires_grad_()
+    quads, uvs = torch.tensor([[0, 1, 2, 3], [3, 4, 5, -1]]), torch.rand(6, 2)
+    built = BlendshapeRig.from_tensors(rig.vertices, quads, deltas, uvs=uvs, uv_faces=quads)
+    assert built.names == ("shape_0", "shape_1", "shape_2", "shape_3")
+    assert built.neutral.faces.tolist() == built.neutral.uv_faces.tolist() == [[0, 1, 2], [0, 2, 3], [3, 4, 5]]
+    built(weights).sum().backward()
+    assert torch.equal(deltas.grad[:, 0], weights.sum(0)[:, None].expand(4, 3))
+
+
 def test_casting_moves_the_neutral_too() -> None:
     rig = small_rig().to(torch.float64)
     assert rig.neutral.vertices.dtype == rig.deltas.dtype == torch.float64

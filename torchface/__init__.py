@@ -14,6 +14,8 @@ _HOMES = {
     "Track": "torchface.take",
     "Take": "torchface.take",
     "BlendshapeRig": "torchface.rig",
+    "Corrective": "torchface.correctives",
+    "Correctives": "torchface.correctives",
     "Attachment": "torchface.attachment",
     "TorchfaceError": "torchface.errors",
     "load_mesh": "torchface.io",
@@ -29,6 +31,7 @@ __all__ = [*_HOMES, "__version__"]
 
 if TYPE_CHECKING:
     from torchface.attachment import Attachment
+    from torchface.correctives import Corrective, Correctives
     from torchface.errors import TorchfaceError
     from torchface.io import (
         load_mesh,

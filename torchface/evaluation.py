@@ -108,7 +108,18 @@ def marker_rmse(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, mar
     faces = rig.neutral.faces
     basis = attachment.on(faces, rig.deltas)
     solved = attachment.on(faces, rig.vertices) + torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
+    if rig.activation is not None and rig.corrective_deltas is not None:
+        more = attachment.on(faces, rig.corrective_deltas)
+        solved = solved + torch.einsum("tn,nmc->tmc", rig.activation(weights.to(more)), more)
     return (solved - markers.to(basis)).square().sum(-1).nanmean(-1).sqrt()
+
+
+def moved_vertices(rig: BlendshapeRig, weights: Tensor, keep: Tensor) -> Tensor:
+    """Some vertices of a rig, ids or a mask, at weights (B,N): (B,K,3)."""
+    moved = weights @ rig.deltas[:, keep].flatten(1)
+    if rig.activation is not None and rig.corrective_deltas is not None:
+        moved = moved + rig.activation(weights) @ rig.corrective_deltas[:, keep].flatten(1)
+    return rig.vertices[keep] + moved.unflatten(1, (-1, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,20 +171,19 @@ def mesh_error(
             f"{len(true_rig.vertices)} vertices, expected the same"
         )
     keep = torch.arange(len(true_rig.vertices)) if vertices is None else vertices
-    solved_neutral, true_neutral = solved_rig.vertices[keep], true_rig.vertices[keep]
-    solved_deltas, true_deltas = solved_rig.deltas[:, keep].flatten(1), true_rig.deltas[:, keep].flatten(1)
-    total = torch.zeros(len(true_neutral))
-    largest = torch.zeros(len(true_neutral))
+    total, largest = (torch.zeros(len(true_rig.vertices[keep])) for _ in range(2))
     frame_mean, motion = [], 0.0
     for start in range(0, len(true), chunk):
         rows = slice(start, start + chunk)
-        moved = (true[rows].to(true_deltas) @ true_deltas).unflatten(1, (-1, 3))
-        found = (solved[rows].to(solved_deltas) @ solved_deltas).unflatten(1, (-1, 3))
-        distance = (found + solved_neutral - moved - true_neutral).norm(dim=-1)
+        found, face = (
+            moved_vertices(rig, weights[rows].to(rig.vertices), keep)
+            for rig, weights in ((solved_rig, solved), (true_rig, true))
+        )
+        distance = (found - face).norm(dim=-1)
         total += distance.sum(0)
         largest = torch.maximum(largest, distance.amax(0))
         frame_mean.append(distance.mean(1))
-        motion += float(moved.norm(dim=-1).mean(1).sum())
+        motion += float((face - true_rig.vertices[keep]).norm(dim=-1).mean(1).sum())
     return MeshError(total / len(true), largest, torch.cat(frame_mean), motion / len(true))
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from torchface.correctives import CorrectiveActivation, Correctives, merged_correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
 from torchface.shape_names import arkit_sources, mapping
@@ -16,16 +19,19 @@ from torchface.take import Track
 class BlendshapeRig(nn.Module):
     r"""A face that moves by weights.
 
-    .. math:: A(w) = A_0 + \sum_{i=1}^{N} w_i \, (A_i - A_0)
+    .. math:: A(w) = A_0 + \sum_{i=1}^{N} w_i \, (A_i - A_0) + \sum_{c=1}^{C} a_c(w) \, D_c
+
+    with the activations :math:`a_c` and the deltas :math:`D_c` of its correctives, where it has any.
 
     Args:
         neutral: the face at rest, V vertices, millimetres.
         deltas: :math:`A_i - A_0`, (N,V,3), millimetres.
         names: one a shape, no name twice.
+        correctives: what is added where shapes act together or half-way; of as many vertices.
 
     Raises:
-        ShapeError: ``deltas`` is not (N,V,3).
-        NameMismatchError: not one name a shape, or a name twice.
+        ShapeError: ``deltas`` is not (N,V,3), or the correctives' not (C,V,3).
+        NameMismatchError: not one name a shape, a name twice, or a corrective driven by a shape that is not there.
         ValueRangeError: a delta is NaN or infinite.
 
     Source: thesis 3.2.1, equation 1.
@@ -33,8 +39,11 @@ class BlendshapeRig(nn.Module):
 
     vertices: Tensor
     deltas: Tensor
+    corrective_deltas: Tensor | None
 
-    def __init__(self, neutral: Mesh, deltas: Tensor, names: Sequence[str]) -> None:
+    def __init__(
+        self, neutral: Mesh, deltas: Tensor, names: Sequence[str], correctives: Correctives | None = None
+    ) -> None:
         super().__init__()
         if deltas.ndim != 3 or deltas.shape[1:] != neutral.vertices.shape:
             raise ShapeError(
@@ -52,6 +61,57 @@ class BlendshapeRig(nn.Module):
         self._neutral = neutral
         self.register_buffer("vertices", neutral.vertices)
         self.register_buffer("deltas", deltas.to(neutral.vertices))
+        self._correctives = correctives
+        self.activation = None
+        if correctives is not None:
+            activation = CorrectiveActivation(correctives.definitions, self.names)
+            self.activation = activation if neutral.vertices.is_meta else activation.to(neutral.vertices.device)
+        if correctives is not None and correctives.deltas.shape[1:] != neutral.vertices.shape:
+            raise ShapeError(
+                f"correctives: found deltas {tuple(correctives.deltas.shape)}, expected (C,{len(neutral.vertices)},3) "
+                "for this neutral"
+            )
+        moved = None if correctives is None else correctives.deltas.to(neutral.vertices)
+        self.register_buffer("corrective_deltas", moved)
+
+    @staticmethod
+    def from_tensors(
+        vertices: Tensor,
+        faces: Tensor,
+        deltas: Tensor,
+        names: Sequence[str] | None = None,
+        correctives: Correctives | None = None,
+        **rest: Any,
+    ) -> BlendshapeRig:
+        """A rig of plain tensors, as other PyTorch code has them.
+
+        Args:
+            vertices: at rest, (V,3) float, millimetres; gradients flow through them and through the deltas.
+            faces: triangles, (F,3), any integers; (P,K) with K above 3, padded with -1, for polygons.
+            deltas: (N,V,3), millimetres; of target shapes take ``targets - vertices``.
+            names: one a shape; ``shape_0`` and so on if absent.
+            correctives: of the rig.
+            rest: what else a :class:`~torchface.mesh.Mesh` has: ``uvs`` with ``uv_faces`` (laid out as ``faces``),
+                ``colors``, ``texture``, ``annotations``.
+
+        Raises:
+            ShapeError: a tensor has the wrong shape.
+            TopologyError: an index points outside.
+            ValueRangeError: a position or a delta is NaN or infinite.
+            NameMismatchError: not one name a shape, or a name twice.
+
+        Example:
+            >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(2, 3, 3))
+            >>> rig.names
+            ('shape_0', 'shape_1')
+        """
+        faces, uv_faces = faces.long(), rest.pop("uv_faces", None)
+        if faces.ndim == 2 and faces.shape[1] > 3:
+            uv_polygons = None if uv_faces is None else uv_faces.long()
+            mesh = Mesh.from_polygons(vertices, faces, rest.pop("uvs", None), uv_polygons, **rest)
+        else:
+            mesh = Mesh(vertices, faces, uv_faces=None if uv_faces is None else uv_faces.long(), **rest)
+        return BlendshapeRig(mesh, deltas, names or [f"shape_{i}" for i in range(len(deltas))], correctives)
 
     @property
     def neutral(self) -> Mesh:
@@ -60,11 +120,40 @@ class BlendshapeRig(nn.Module):
             self._neutral = self._neutral.to(self.vertices.device).with_vertices(self.vertices)
         return self._neutral
 
+    @property
+    def correctives(self) -> Correctives | None:
+        """What is added where shapes act together or half-way, on the rig's device and in its dtype."""
+        if self._correctives is not None and self._correctives.deltas is not self.corrective_deltas:
+            assert self.corrective_deltas is not None
+            self._correctives = self._correctives.with_deltas(self.corrective_deltas)
+        return self._correctives
+
+    def without_correctives(self) -> BlendshapeRig:
+        """The rig of its shapes alone, which is linear in their weights."""
+        return BlendshapeRig(self.neutral, self.deltas, self.names)
+
+    def linear(self, method: str) -> BlendshapeRig:
+        """The rig for a method that takes faces as linear in the weights; one with correctives is warned of.
+
+        Args:
+            method: begins the warning.
+        """
+        if self.correctives is None:
+            return self
+        warnings.warn(
+            f"{method}: leaves the rig's {len(self.correctives.names)} correctives out, as it takes faces as linear in "
+            "the weights",
+            stacklevel=3,
+        )
+        return self.without_correctives()
+
     def forward(self, weights: Tensor) -> Tensor:
         """Vertices (B,V,3) at weights (B,N)."""
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
         moved = weights @ self.deltas.flatten(1)
+        if self.activation is not None and self.corrective_deltas is not None:
+            moved = moved + self.activation(weights) @ self.corrective_deltas.flatten(1)
         return self.vertices + moved.view(len(weights), *self.vertices.shape)
 
     def index(self, names: Sequence[str]) -> list[int]:
@@ -99,19 +188,31 @@ class BlendshapeRig(nn.Module):
         return track.values[..., 0] @ matrix.T
 
     def select(self, names: Sequence[str]) -> BlendshapeRig:
-        """The rig with these shapes only, in this order."""
-        return BlendshapeRig(self.neutral, self.deltas[self.index(names)], names)
+        """The rig with these shapes only, in this order, and the correctives that these alone drive."""
+        correctives = None if self.correctives is None else self.correctives.select(names)
+        return BlendshapeRig(self.neutral, self.deltas[self.index(names)], names, correctives)
 
     def with_arkit_names(self) -> BlendshapeRig:
-        """The rig under ARKit's names, halves of one of ARKit's shapes merged; see ``shape_names.arkit_sources``."""
+        """The rig under ARKit's names, halves of one of ARKit's shapes merged; see ``shape_names.arkit_sources``.
+
+        Raises:
+            NameMismatchError: a corrective is driven by both halves of what becomes one shape, hence by its square.
+        """
         sources = arkit_sources(self.names)
         deltas = torch.stack([self.deltas[list(rows)].sum(0) for rows in sources.values()])
-        return BlendshapeRig(self.neutral, deltas, tuple(sources))
+        correctives = self.correctives
+        if correctives is not None:
+            renamed = {self.names[row]: name for name, rows in sources.items() for row in rows}
+            correctives = merged_correctives(correctives, renamed)
+        return BlendshapeRig(self.neutral, deltas, tuple(sources), correctives)
 
     def part(self, keep: Tensor) -> BlendshapeRig:
         """The rig of some vertices only: a mask (V,) or ids; see ``torchface.mesh.submesh``."""
         piece = submesh(self.neutral, keep)
-        return BlendshapeRig(piece.mesh, self.deltas[:, piece.vertex_ids], self.names)
+        correctives = self.correctives
+        if correctives is not None:
+            correctives = correctives.with_deltas(correctives.deltas[:, piece.vertex_ids])
+        return BlendshapeRig(piece.mesh, self.deltas[:, piece.vertex_ids], self.names, correctives)
 
     def extra_repr(self) -> str:
         return f"{self.neutral}, {len(self.names)} shapes"

@@ -10,6 +10,9 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
+# Numbers in the matrices of all markers at once; beyond it frames take their turn.
+_MOST_NUMBERS = 2**24
+
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
@@ -96,8 +99,11 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
         H = (2.0 / markers) * (rows.T @ rows)
         return Quadratic(H, (2.0 / markers) * (offset.flatten(1) @ rows), offset.square().sum((-1, -2)) / markers)
     share = seen.to(basis) / seen.sum(-1, keepdim=True).clamp(min=1)
-    own = (basis.transpose(1, 2) @ basis).flatten(1)
-    H = 2.0 * (share @ own).unflatten(1, (shapes, shapes))
+    if markers * shapes * shapes <= _MOST_NUMBERS:
+        own = (basis.transpose(1, 2) @ basis).flatten(1)
+        H = 2.0 * (share @ own).unflatten(1, (shapes, shapes))
+    else:
+        H = 2.0 * torch.stack([(rows * one.repeat_interleave(3)[:, None]).T @ rows for one in share])
     weighted = share[..., None] * offset
     return Quadratic(H, 2.0 * (weighted.flatten(1) @ rows), (weighted * offset).sum((-1, -2)))
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchface.capture.priors import DynamicsPrior, GaussianMixture, ShapePrior
 from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
 from torchface.capture.video.face_points import FacePoints
+from torchface.correctives import Corrective, Correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
@@ -151,6 +152,45 @@ def test_derivatives_are_finite_differences(small: BlendshapeRig, remembers: boo
     step = 1e-5
     difference = (value(found + step * way) - value(found - step * way)) / (2 * step)
     torch.testing.assert_close((probe.grad * way).sum(), difference, rtol=1e-4, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def corrective(small: BlendshapeRig) -> BlendshapeRig:
+    definitions = (
+        Corrective("open_smile", ("jawOpen", "mouthSmileLeft")),
+        Corrective("open_pucker_left", ("jawOpen", "mouthPucker", "mouthLeft")),
+        Corrective("blink_half", ("eyeBlinkLeft",), 0.5),
+    )
+    smile, pucker, blink = small.deltas[small.index(["mouthSmileLeft", "mouthPucker", "eyeBlinkLeft"])]
+    deltas = torch.stack([0.4 * smile.roll(1, 1), 0.5 * pucker.roll(2, 1), 0.3 * blink.roll(1, 1)])
+    return BlendshapeRig(small.neutral, small.deltas, small.names, Correctives(deltas, definitions))
+
+
+def test_correctives_are_solved_with(corrective: BlendshapeRig, small: BlendshapeRig) -> None:
+    rotation, translation = poses(2)
+    weights = acted(2)
+    marks = corrective.neutral.landmarks
+    points = FacePoints.of(corrective, marks)
+    torch.testing.assert_close(points.at(weights)[:, :68], corrective.double()(weights)[:, marks], atol=1e-5, rtol=0)
+    seen = film(corrective.float(), weights, rotation, translation)
+    solution = exact(corrective)(seen)
+    torch.testing.assert_close(solution.weights, weights, atol=1e-3, rtol=0)
+    assert (exact(small)(seen).weights - weights).abs().max() > 0.1
+    again = VideoSolver.from_config(exact(corrective).config)
+    again.load_state_dict(exact(corrective).state_dict())
+    torch.testing.assert_close(again(seen).weights, solution.weights)
+
+
+def test_derivatives_with_correctives_are_finite_differences(corrective: BlendshapeRig) -> None:
+    rotation, translation = (pose[:1] for pose in poses(60))
+    found = film(corrective, acted(60)[:1], rotation, translation, noise=1.0)
+    solver = VideoSolver(corrective, None, K, settings=VideoSettings(tolerance=1e-11, steps=500))
+    probe = found.clone().requires_grad_()
+    solver(probe, rotation, translation).weights.square().sum().backward()
+    assert probe.grad is not None
+    way = 1e-5 * torch.randn(found.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    after, before = (solver(found + step, rotation, translation).weights.square().sum() for step in (way, -way))
+    torch.testing.assert_close((probe.grad * way).sum(), (after - before) / 2, rtol=1e-3, atol=1e-9)
 
 
 def test_frame_by_frame_is_the_batch(small: BlendshapeRig) -> None:

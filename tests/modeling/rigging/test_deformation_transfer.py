@@ -8,11 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.correctives import Corrective, Correctives
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation, transfer_with_report
+from torchface.modeling.rigging.example_rigging import rig_from_examples
 from torchface.rig import BlendshapeRig
 
 SHELLS = ("lacrimal_fluid", "eye_blend", "eye_occlusion")
@@ -226,3 +228,61 @@ def test_teeth_eyes_and_lashes_of_a_random_head_keep_their_offset_to_the_face(
     assert float(moved[offset < 0.01].max()) < 0.1
     still = real_rig.deltas.norm(dim=-1) < 0.01
     assert float(result.deltas.norm(dim=-1)[still].max()) < 0.02
+
+
+@pytest.fixture(scope="module")
+def corrective_rig() -> BlendshapeRig:
+    linear = hill_rig()
+    definitions = (
+        Corrective("bulge_twist", ("bulge", "twist")),
+        Corrective("all", ("bulge", "slip", "twist")),
+        Corrective("slip_half", ("slip",), 0.5),
+        Corrective("nothing", ("bulge", "slip")),
+    )
+    bulge, slip, twist = linear.deltas
+    turned = twist.roll(1, 1)
+    deltas = torch.stack([0.3 * turned, 0.2 * (bulge + slip).roll(1, 1), 0.4 * slip.roll(2, 1), 0 * slip])
+    return BlendshapeRig(linear.neutral, linear.deltas, linear.names, Correctives(deltas, definitions))
+
+
+def test_transferred_to_itself_a_rig_keeps_its_correctives(corrective_rig: BlendshapeRig) -> None:
+    rig = corrective_rig
+    found = transfer_deformation(rig, rig.neutral).correctives
+    assert found is not None
+    assert rig.correctives is not None
+    assert found.definitions == rig.correctives.definitions
+    assert (found.deltas - rig.correctives.deltas).abs().max() < 1e-6
+
+
+def test_correctives_turn_and_grow_with_the_face(corrective_rig: BlendshapeRig) -> None:
+    rig = corrective_rig
+    turn = rotation()
+    target = rig.neutral.with_vertices(1.3 * rig.vertices @ turn.T + 7)
+    found = transfer_deformation(rig, target).correctives
+    assert found is not None
+    assert rig.correctives is not None
+    assert (found.deltas - 1.3 * rig.correctives.deltas @ turn.T).abs().max() < 1e-6
+
+
+def test_on_another_face_correctives_stay_where_they_were(corrective_rig: BlendshapeRig) -> None:
+    rig = corrective_rig
+    found = transfer_deformation(rig, other_face(rig)).correctives
+    assert found is not None
+    assert rig.correctives is not None
+    still = rig.correctives.deltas.norm(dim=-1) < 0.01
+    assert found.deltas[still].norm(dim=-1).max() < 0.02
+    assert found.deltas[3].abs().max() == 0.0
+    changed = (found.deltas - rig.correctives.deltas).norm(dim=-1).amax(1)
+    size = rig.correctives.deltas.norm(dim=-1).amax(1)
+    assert (changed[:3] > 0.01 * size[:3]).all()
+    assert (changed[:3] < 0.5 * size[:3]).all()
+
+
+def test_examples_are_explained_by_shapes_and_correctives_together(corrective_rig: BlendshapeRig) -> None:
+    rig = corrective_rig
+    weights = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0.5, 0], [0.5, 0, 1], [1, 1, 1]], dtype=torch.float64)
+    found = rig_from_examples(rig, rig.neutral, rig(weights), weights)
+    assert (found.rig(weights) - rig(weights)).norm(dim=-1).max() < 0.05
+    linear = rig_from_examples(rig.without_correctives(), rig.neutral, rig(weights), weights)
+    far = (linear.rig(linear.weights) - rig(weights)).norm(dim=-1).max()
+    assert far > 4 * (found.rig(found.weights) - rig(weights)).norm(dim=-1).max()

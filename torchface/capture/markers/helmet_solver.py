@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torchface.attachment import Attachment
-from torchface.capture.energy import marker_term
+from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
+from torchface.capture.energy import Quadratic, marker_term
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
@@ -160,6 +161,7 @@ class HelmetSolver(nn.Module):
         rest = self.markers.rest.double()
         pivot = rest.mean(0)
         columns = torch.cat([self.markers.basis.double(), rigid_columns(rest, pivot)], dim=2)
+        corrective, activation = self.markers.corrective_basis, self.markers.activation
         shapes = len(self.names)
         bound = rest.new_tensor([torch.inf]).expand(6)
         lower = torch.cat([rest.new_zeros(shapes), -bound])
@@ -172,11 +174,16 @@ class HelmetSolver(nn.Module):
         translation = rest.new_zeros(len(seen), 3)
         solution: Tensor | None = None
         shared: BoxQP | None = None
-        for _ in range(_MAX_ITERATIONS if self.exact else 1):
+        # Correctives join after a first solve without them.
+        for _ in range((_MAX_ITERATIONS if self.exact else 1) + (activation is not None)):
             unmoved = HelmetMotion(rotation, translation, pivot).undo(seen)
             energy = marker_term(columns, rest, unmoved)
             H, f = energy.H + torch.diag(ridge), energy.f + penalty
-            if H.ndim == 2:
+            if activation is not None and corrective is not None and solution is not None:
+                extended = marker_term(torch.cat([columns, corrective.double()], 2), rest, unmoved)
+                whole = CorrectiveEnergy(extended, activation) + Quadratic(torch.diag(ridge), penalty[None])
+                solution = least_in_box(whole, solution, lower, upper, tolerance)
+            elif H.ndim == 2:
                 shared = shared or BoxQP(H, lower, upper, tolerance)
                 solution = shared(f, solution)
             else:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, pull_term
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
@@ -20,6 +21,7 @@ GAMMA = 4.0
 
 # Numbers in the matrices of frames that are in memory at once: 64 MB of float64.
 _CHUNK_NUMBERS = 2**23
+_TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 
 
 def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order: int = 2) -> Tensor:
@@ -74,10 +76,10 @@ class HybridSolver(nn.Module):
         """Of the weights."""
         return self.markers.names
 
-    def energy(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Quadratic:
+    def energy(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Quadratic | CorrectiveEnergy:
         """What the solve minimises for markers (B,M,3), predicted weights and gamma (B,N), float64."""
         energy = self.markers.energy(markers)
-        return energy + pull_term(predicted.to(energy.f), gamma.to(energy.f) / len(self.markers.labels))
+        return energy + pull_term(predicted.double(), gamma.double() / len(self.markers.labels))
 
     def forward(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Tensor:
         r"""Weights for markers and predictions.
@@ -103,8 +105,14 @@ class HybridSolver(nn.Module):
         for chunk in pulled.split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
             active = gamma[chunk] > 0
             energy = self.energy(markers[chunk], torch.where(active, predicted[chunk], 0.0), gamma[chunk])
+            start = alone[chunk].detach().double()
+            if isinstance(energy, CorrectiveEnergy):
+                lower, upper = torch.zeros_like(start[0]), torch.ones_like(start[0])
+                tolerance = _TOLERANCE.get(markers.dtype, 3e-6)
+                parts.append(least_in_box(energy, start, lower, upper, tolerance).to(alone.dtype))
+                continue
             H = energy.H if energy.H.ndim == 3 else energy.H.expand(len(chunk), -1, -1)
-            parts.append(box_qp(H, energy.f, 0.0, 1.0, alone[chunk].detach().double()).to(alone.dtype))
+            parts.append(box_qp(H, energy.f, 0.0, 1.0, start).to(alone.dtype))
         return alone.index_copy(0, pulled, torch.cat(parts))
 
     def solve_take(self, take: Take, predicted: Track, gamma: Track) -> Take:

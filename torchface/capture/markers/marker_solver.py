@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from torchface.attachment import Attachment
+from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, marker_term, ridge_term, sparsity_term
+from torchface.correctives import Corrective, CorrectiveActivation, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
@@ -38,11 +41,14 @@ class MarkerSolver(nn.Module):
         \min_{0 \le w \le 1} \frac{1}{|S|} \sum_{m \in S} \lVert b_m + B_m w - t_m \rVert^2
         + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
 
+    A rig with correctives adds :math:`C_m a(w)` to the distance, with their activations a (``torchface.correctives``);
+    the solve without them is where Gauss-Newton starts from, see ``torchface.capture.corrective_energy``.
+
     The first term is the mean over the markers S that a frame shows, in mm² a marker, so that ``sparsity`` and
     ``ridge`` mean the same for any number of markers. H and f are formed in float64.
 
     Args:
-        rig: N shapes.
+        rig: N shapes; its correctives count.
         attachment: where the M markers sit on it; its ``residual``, where it has one, is added to the points.
         alignment: moves marker space into rig space, one similarity; none if absent. Errors count in rig space.
         sparsity: :math:`\beta`, mm² a marker for a weight of 1; see ``sparsity_by_rule``. A tensor of one number is
@@ -59,6 +65,7 @@ class MarkerSolver(nn.Module):
 
     basis: Tensor
     rest: Tensor
+    corrective_basis: Tensor | None
 
     def __init__(
         self,
@@ -76,6 +83,9 @@ class MarkerSolver(nn.Module):
             rest = rest + attachment.residual.to(rest)
         basis = attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous()
         self._register(rig.names, tuple(attachment.labels or ()), basis, rest, alignment, sparsity, ridge)
+        if rig.correctives is not None:
+            moved = attachment.on(faces, rig.correctives.deltas).permute(1, 2, 0).contiguous()
+            self._correct(rig.correctives.definitions, moved)
 
     def _register(
         self,
@@ -98,8 +108,17 @@ class MarkerSolver(nn.Module):
         for name in ("scale", "rotation", "translation"):
             moved = None if alignment is None else getattr(alignment, name).to(rest)
             self.register_buffer(f"alignment_{name}", moved)
+        self.activation: CorrectiveActivation | None = None
+        self.register_buffer("corrective_basis", None)
         self._prepared: dict[float, Prepared[BoxQP]] = {}
+        self._prepared_rows: Prepared[tuple[Tensor, Tensor]] = Prepared()
         self.regularization(self.rest)  # a negative weight is an error here, not at the first solve
+
+    def _correct(self, definitions: Sequence[Corrective], basis: Tensor) -> None:
+        """Takes up correctives and what a unit of each adds to the markers, (M,3,C)."""
+        activation = CorrectiveActivation(definitions, self.names)
+        self.activation = activation if basis.is_meta else activation.to(basis.device)
+        self.corrective_basis = basis
 
     def _penalty(self, name: str, value: float | Tensor) -> float | Tensor:
         """A number as it is; a tensor of one as a scalar that moves and saves with the module."""
@@ -120,6 +139,7 @@ class MarkerSolver(nn.Module):
             "sparsity": penalty_value(self.sparsity),
             "ridge": penalty_value(self.ridge),
             "aligned": self.alignment is not None,
+            **({} if self.activation is None else {"correctives": self.activation.records()}),
             # In the state, with their shapes.
             "tensors": {
                 name: list(value.shape)
@@ -133,7 +153,7 @@ class MarkerSolver(nn.Module):
         """A solver of zeros for the state to be loaded into, without the rig it came from.
 
         Raises:
-            NameMismatchError: a name or a label is no text, or there twice.
+            NameMismatchError: a name or a label is no text, or there twice, or a corrective is none.
             ValueRangeError: ``sparsity`` or ``ridge`` is negative or not finite.
         """
         names, labels = config["names"], config["labels"]
@@ -153,6 +173,9 @@ class MarkerSolver(nn.Module):
             for name in ("sparsity", "ridge")
         )
         self._register(names, labels, basis, rest, alignment, sparsity, ridge)
+        if "correctives" in config:
+            definitions = definitions_from_records(config["correctives"])
+            self._correct(definitions, torch.zeros(len(labels), 3, len(definitions)))
         return self
 
     @property
@@ -166,15 +189,37 @@ class MarkerSolver(nn.Module):
         shapes = len(self.names)
         return sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
 
-    def energy(self, markers: Tensor) -> Quadratic:
+    def energy(self, markers: Tensor) -> Quadratic | CorrectiveEnergy:
         """What the solve minimises for markers (B,M,3), float64."""
+        if self.activation is None or self.corrective_basis is None:
+            return self._linear_energy(markers)
+        rest, targets = self.rest.double(), self._in_rig_space(markers.double())
+        basis = torch.cat([self.basis, self.corrective_basis], 2).double()
+        return CorrectiveEnergy(marker_term(basis, rest, targets), self.activation) + self.regularization(rest)
+
+    def _linear_energy(self, markers: Tensor) -> Quadratic:
         term = marker_term(self.basis.double(), self.rest.double(), self._in_rig_space(markers.double()))
         return term + self.regularization(term.H)
 
+    def points(self, weights: Tensor) -> Tensor:
+        """Where the markers' sites are at weights (B,N): (B,M,3) in rig space, float64."""
+        weights = weights.double()
+        points = self.rest.double() + torch.einsum("mcn,bn->bmc", self.basis.double(), weights)
+        if self.activation is None or self.corrective_basis is None:
+            return points
+        return points + torch.einsum("mcn,bn->bmc", self.corrective_basis.double(), self.activation(weights))
+
+    @property
+    def every_basis(self) -> Tensor:
+        """What a unit of each shape, and of each corrective, adds to the markers, (M,3,N+C).
+
+        A model of the rig that is linear: it knows every motion that the rig has, and more.
+        """
+        return self.basis if self.corrective_basis is None else torch.cat([self.basis, self.corrective_basis], 2)
+
     def squared_distance(self, markers: Tensor, weights: Tensor) -> Tensor:
         """Mean squared distance of the seen markers (B,M,3) to the rig at weights (B,N): (B,), mm² in rig space."""
-        points = self.rest.double() + torch.einsum("mcn,bn->bmc", self.basis.double(), weights.double())
-        squared = (points - self._in_rig_space(markers.double())).square().sum(-1)
+        squared = (self.points(weights) - self._in_rig_space(markers.double())).square().sum(-1)
         return squared.nanmean(-1)
 
     def forward(self, markers: Tensor, initial: Tensor | None = None) -> Tensor:
@@ -198,13 +243,15 @@ class MarkerSolver(nn.Module):
         tolerance = _TOLERANCE_FLOAT64 if markers.dtype == torch.float64 else _TOLERANCE_FLOAT32
         initial = None if initial is None else initial.double()
         gaps = missing.any(-1)
+        if self.activation is not None:
+            return self._corrected(markers, gaps, initial, tolerance).to(markers.dtype)
         if not bool(gaps.any()):
             return self._complete(markers, initial, tolerance).to(markers.dtype)
         whole = (~gaps).nonzero()[:, 0]
         rows, parts = [whole], [self._complete(markers[whole], None if initial is None else initial[whole], tolerance)]
         # A frame with gaps has an H of its own; a chunk of them bounds the memory.
         for chunk in gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // len(self.names) ** 2)):
-            energy = self.energy(markers[chunk])
+            energy = self._linear_energy(markers[chunk])
             rows.append(chunk)
             guess = None if initial is None else initial[chunk]
             parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
@@ -241,6 +288,53 @@ class MarkerSolver(nn.Module):
         offset = self.rest.double() - self._in_rig_space(markers.double())
         f = (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
         return self._shared(tolerance)(f, initial)
+
+    def _corrected(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
+        """Weights (B,N), float64, with correctives: Gauss-Newton from the answer without, or from a guess (B,N)."""
+        guessed = initial is not None
+        if initial is None:
+            with torch.no_grad():
+                initial = self.without_correctives()(markers.detach()).double()
+        lower, upper = torch.zeros_like(initial[0]), torch.ones_like(initial[0])
+        rows, parts = [], []
+        whole = (~gaps).nonzero()[:, 0]
+        size = self.basis.shape[-1] + (0 if self.corrective_basis is None else self.corrective_basis.shape[-1])
+        for chunk in [whole, *gaps.nonzero()[:, 0].split(max(1, _CHUNK_NUMBERS // size**2))]:
+            if len(chunk):
+                energy = self.complete_energy(markers[chunk]) if chunk is whole else self.energy(markers[chunk])
+                assert isinstance(energy, CorrectiveEnergy)
+                rows.append(chunk)
+                parts.append(least_in_box(energy, initial[chunk], lower, upper, tolerance, not guessed))
+        return torch.zeros_like(initial).index_copy(0, torch.cat(rows), torch.cat(parts))
+
+    def complete_energy(self, markers: Tensor) -> CorrectiveEnergy | Quadratic:
+        """``energy`` of markers without gaps, its H formed on first use."""
+        parts = (self.basis, self.corrective_basis, self.rest, self.ridge)
+        if torch.is_grad_enabled() and any(isinstance(part, Tensor) and part.requires_grad for part in parts):
+            return self.energy(markers)
+        assert self.corrective_basis is not None
+        assert self.activation is not None
+        H, rows = self._prepared_rows.get((self.basis, self.corrective_basis), self._extended_rows)
+        offset = (self.rest.double() - self._in_rig_space(markers.double())).flatten(1)
+        share = 2.0 / len(self.rest)
+        term = Quadratic(H, share * (offset @ rows), 0.5 * share * offset.square().sum(1))
+        return CorrectiveEnergy(term, self.activation) + self.regularization(H)
+
+    def _extended_rows(self) -> tuple[Tensor, Tensor]:
+        """Of shapes and correctives: H (N+C,N+C) of complete frames, and what each does to the markers (3M,N+C)."""
+        assert self.corrective_basis is not None
+        rows = torch.cat([self.basis, self.corrective_basis], 2).double().flatten(0, 1)
+        return (2.0 / len(self.rest)) * (rows.T @ rows), rows
+
+    def without_correctives(self) -> MarkerSolver:
+        """The same solver of the rig's shapes alone; the solver itself where there are no correctives."""
+        if self.activation is None:
+            return self
+        linear = copy.copy(self)
+        linear._buffers = {**self._buffers, "corrective_basis": None}
+        linear._modules = {}
+        linear.activation = None
+        return linear
 
     def _shared(self, tolerance: float) -> BoxQP:
         """The problem of complete frames: prepared once, and anew where what it is made of has changed."""

@@ -48,6 +48,7 @@ def align_take(
     Source: thesis 4.1.2.
     """
     attachment.check(rig.neutral)
+    rig = rig.linear("align_take")
     affine, paths = _seen_sites(rig, attachment, take)
     rest = affine[..., 0]
     if not insist:
@@ -95,7 +96,7 @@ def rest_residual(
         markers = solver.arrange(take.markers)
         shown = ~torch.isnan(markers).any(-1).all(1)
         markers = markers[shown].double()
-        on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), solver(markers))
+        on_rig = solver.points(solver(markers))
         moved = markers if alignment is None else alignment.apply(markers)
         residual = (moved - on_rig).nanmean(0)
         before = torch.zeros_like(residual) if attachment.residual is None else attachment.residual.double()

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from scipy.fft import dct, idct
 from torch import Tensor
 
-from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
+from torchface.capture.corrective_energy import CorrectiveEnergy
+from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, penalty_value
+from torchface.capture.markers.sparsity import with_sparsity
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
 from torchface.take import Take, Track
+from torchface.temporal import bridged
 
 SMOOTHNESS = 10.0
 """At 60 frames a second, mm² a marker for a squared second difference of 1: noise of 0.3 mm hardly shows."""
@@ -24,6 +28,9 @@ SPARSITY_RATIO = 0.1
 _RHO, _RELAXATION = 0.12, 1.8
 _MAX_ITERATIONS, _TOLERANCE = 400, 2e-4
 _REFERENCE_FPS = 60.0
+# With correctives: steps at most, halvings of each, frames whose mean curvature stands for all, and the share of the
+# energy that a step has to take off for another to follow.
+_CORRECTED_STEPS, _HALVINGS, _HESSIAN_FRAMES, _LEAST_FALL = 20, 6, 64, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +96,8 @@ class WholeTakeSolver:
             raise ValueRangeError("markers: found infinite coordinates, expected millimetres, or NaN for not seen")
         if not len(markers) or bool(torch.isnan(markers).any(-1).all()):
             raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
-        return self._solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
+        solve = self._solve if self.markers.activation is None else self._solve_corrected
+        return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
 
     def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
         """What the solve minimises, over all frames."""
@@ -97,18 +105,11 @@ class WholeTakeSolver:
         solver = self.markers
         seen = markers.double() if solver.alignment is None else solver.alignment.apply(markers.double())
         w = weights.double()
-        points = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), w)
+        points = solver.points(w)
         data = (points - seen).square().sum(-1).nan_to_num(0.0).sum() / points.shape[1]
-        size = curvature(w).abs()
-        huber = torch.where(
-            size <= huber_threshold, size.square(), 2 * huber_threshold * size - huber_threshold * huber_threshold
-        )
-        if huber_threshold == math.inf:
-            huber = size.square()
+        huber = _huber(w, huber_threshold)
         penalty = self.sparsity or 0.0
-        return float(
-            data + penalty * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber.sum()
-        )
+        return float(data + penalty * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber)
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
@@ -132,35 +133,148 @@ class WholeTakeSolver:
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
         H.diagonal().add_(2 * penalty_value(solver.ridge))
-        values, vectors = torch.linalg.eigh(H)
-        rho = _RHO * float(H.diagonal().mean())
-        waves = torch.arange(len(seen), dtype=torch.float64) * (math.pi / len(seen))
-        bending = (2 - 2 * torch.cos(waves)).square()
-        divisor = values + (2 * smoothness) * bending[:, None] + rho
+        smooth = _SmoothProblem.of(H, len(seen), smoothness, huber_threshold)
         gaps = torch.isnan(seen).any(-1)
         seen_mask = ~gaps[..., None]
         offset = torch.where(seen_mask, rest - seen.nan_to_num(0.0), 0.0).flatten(1) @ rows * (2.0 / count)
         frames = gaps.any(-1).nonzero()[:, 0]
         hidden = gaps[frames].repeat_interleave(3, dim=1)
         z = seen.new_zeros(len(seen), shapes)
-        dual = torch.zeros_like(z)
         penalty = self.sparsity or 0.0
-        for _ in range(_MAX_ITERATIONS):
+
+        def slope(z: Tensor) -> Tensor:
             f = offset + penalty
             if len(frames):
                 f[frames] -= (torch.where(hidden, z[frames] @ rows.T, 0.0) @ rows) * (2.0 / count)
-            if huber_threshold != math.inf:
+            return f
+
+        return smooth.least(slope, z, torch.zeros_like(z))[0]
+
+    def _solve_corrected(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:
+        """With correctives: steps to the least of the problem above, with the mean frame's H in place of each frame's.
+
+        A step is taken as far as the energy falls. The start is each frame's own solution.
+        """
+        solver = with_sparsity(self.markers, self.sparsity or 0.0)
+        data = _TakeData.of(solver, markers)
+        rows = frames_seen(markers)
+        w = bridged(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
+        H = data.hessian(w)
+        smooth = _SmoothProblem.of(H, len(w), smoothness, huber_threshold)
+        dual = torch.zeros_like(w)
+        value = data.value(w) + smoothness * float(_huber(w, huber_threshold))
+        for _ in range(_CORRECTED_STEPS):
+            f = data.gradient(w) - w @ H
+            found, dual = smooth.least(lambda _, f=f: f, w, dual)  # type: ignore[misc]
+            step, length = found - w, 1.0
+            for _ in range(_HALVINGS):
+                there = w + length * step
+                reached = data.value(there) + smoothness * float(_huber(there, huber_threshold))
+                if reached < value:
+                    break
+                length *= 0.5
+            else:
+                break
+            fallen, value, w = value - reached, reached, there
+            if fallen < _LEAST_FALL * value:
+                break
+        return w
+
+
+@dataclass(frozen=True, eq=False)
+class _SmoothProblem:
+    r"""The smooth part of the problem in the basis that makes it diagonal: eigenvectors of H, cosines over time."""
+
+    vectors: Tensor
+    divisor: Tensor
+    rho: float
+    smoothness: float
+    huber_threshold: float
+
+    @staticmethod
+    def of(H: Tensor, frames: int, smoothness: float, huber_threshold: float) -> _SmoothProblem:
+        values, vectors = torch.linalg.eigh(H)
+        rho = _RHO * float(H.diagonal().mean())
+        waves = torch.arange(frames, dtype=torch.float64) * (math.pi / frames)
+        bending = (2 - 2 * torch.cos(waves)).square()
+        divisor = values + (2 * smoothness) * bending[:, None] + rho
+        return _SmoothProblem(vectors, divisor, rho, smoothness, huber_threshold)
+
+    def least(self, slope: Callable[[Tensor], Tensor], z: Tensor, dual: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (T,N) and the scaled dual there, from a start; ``slope`` gives f at weights."""
+        for _ in range(_MAX_ITERATIONS):
+            f = slope(z)
+            if self.huber_threshold != math.inf:
                 difference = curvature(z)
-                excess = difference.sign() * (difference.abs() - huber_threshold).clamp(min=0)
-                f = f - 2 * smoothness * curvature(excess)
-            spectrum = _transform((rho * (z - dual) - f) @ vectors) / divisor
-            x = _inverse_transform(spectrum) @ vectors.T
+                excess = difference.sign() * (difference.abs() - self.huber_threshold).clamp(min=0)
+                f = f - 2 * self.smoothness * curvature(excess)
+            spectrum = _transform((self.rho * (z - dual) - f) @ self.vectors) / self.divisor
+            x = _inverse_transform(spectrum) @ self.vectors.T
             v = _RELAXATION * x + (1 - _RELAXATION) * z + dual
             before, z = z, v.clamp(0, 1)
             dual = v - z
             if float((z - before).abs().max()) < _TOLERANCE:
                 break
-        return z
+        return z, dual
+
+
+@dataclass(frozen=True, eq=False)
+class _TakeData:
+    """What markers ask of each frame of a rig with correctives, over all M markers, seen or not.
+
+    Args:
+        solver: of the markers.
+        energy: of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
+        seen: in rig space, (T,M,3).
+    """
+
+    solver: MarkerSolver
+    energy: CorrectiveEnergy | None
+    seen: Tensor
+
+    @staticmethod
+    def of(solver: MarkerSolver, markers: Tensor) -> _TakeData:
+        alignment = solver.alignment
+        whole = None if bool(torch.isnan(markers).any()) else solver.complete_energy(markers)
+        seen = markers if alignment is None else alignment.apply(markers)
+        return _TakeData(solver, whole if isinstance(whole, CorrectiveEnergy) else None, seen)
+
+    def value(self, weights: Tensor) -> float:
+        if self.energy is not None:
+            return float(self.energy.value(weights).sum())
+        own = self.solver.regularization(weights).value(weights).sum()
+        return float(self._residual(weights).square().sum() / self.seen.shape[1] + own)
+
+    def gradient(self, weights: Tensor) -> Tensor:
+        """(T,N) at weights (T,N)."""
+        if self.energy is not None:
+            return self.energy.gradient(weights)
+        activation = self.solver.activation
+        assert activation is not None
+        rows = self.solver.every_basis.double().flatten(0, 1)
+        slope = (2.0 / self.seen.shape[1]) * (self._residual(weights).flatten(1) @ rows)
+        shapes = weights.shape[1]
+        own = self.solver.regularization(weights)
+        by_correctives = activation.slope(activation.derivative(weights), slope[:, shapes:])
+        return slope[:, :shapes] + by_correctives + weights @ own.H + own.f
+
+    def hessian(self, weights: Tensor) -> Tensor:
+        """The mean of some frames' (N,N), as if they showed every marker."""
+        some = weights[:: max(1, len(weights) // _HESSIAN_FRAMES)]
+        whole = self.solver.complete_energy(torch.zeros(len(some), *self.seen.shape[1:]).to(weights))
+        assert isinstance(whole, CorrectiveEnergy)
+        return whole.linearised(some).H.mean(0)
+
+    def _residual(self, weights: Tensor) -> Tensor:
+        return (self.solver.points(weights) - self.seen).nan_to_num(0.0)
+
+
+def _huber(weights: Tensor, threshold: float) -> Tensor:
+    """The sum of Huber's function of all second differences."""
+    size = curvature(weights).abs()
+    if threshold == math.inf:
+        return size.square().sum()
+    return torch.where(size <= threshold, size.square(), 2 * threshold * size - threshold * threshold).sum()
 
 
 def curvature(weights: Tensor) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torchface.correctives import CorrectiveActivation
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves, outermost
 from torchface.rig import BlendshapeRig
@@ -30,6 +32,7 @@ class FacePoints:
         rows: which points each contour landmark may be, (J,C) into P; the first is the landmark itself.
         valid: which of them count, (J,C) bool.
         side: of the face, +1 toward positive x, (J,).
+        activation, corrective_basis: of C correctives, and what a unit of each adds, (P,3,C); none if absent.
     """
 
     rest: Tensor
@@ -37,6 +40,8 @@ class FacePoints:
     rows: Tensor
     valid: Tensor
     side: Tensor
+    activation: CorrectiveActivation | None = None
+    corrective_basis: Tensor | None = None
 
     @staticmethod
     def of(rig: BlendshapeRig, landmark_vertices: Tensor, slides: bool = True) -> FacePoints:
@@ -59,11 +64,13 @@ class FacePoints:
             raise ValueRangeError(
                 f"landmark_vertices: found {int(marks.min())} to {int(marks.max())}, expected ids below {count}"
             )
-        stacked = torch.cat([rig.vertices[None], rig.deltas]).detach()
+        correctives = [] if rig.correctives is None else [rig.correctives.deltas]
+        stacked = torch.cat([rig.vertices[None], rig.deltas, *correctives]).detach()
         if not slides:
             values = stacked[:, marks].double()
             own = torch.arange(JAW, device=marks.device)[:, None]
-            return FacePoints._made(values, own, torch.ones_like(own, dtype=torch.bool), marks.new_zeros(JAW).double())
+            every, middle = torch.ones_like(own, dtype=torch.bool), marks.new_zeros(JAW).double()
+            return FacePoints._made(rig, values, own, every, middle)
         x, y = rig.vertices[:, 0].abs(), rig.vertices[:, 1]
         wing, top, bottom = float(x[marks[[31, 35]]].max()), float(y[marks[27]]), float(y[marks[33]])
         nose = (x < 1.2 * wing) & (y < top) & (y > bottom - 0.1 * (top - bottom))
@@ -80,6 +87,7 @@ class FacePoints:
         compact = torch.zeros(LANDMARKS + curves.valid.numel(), dtype=torch.long)
         compact[kept] = torch.arange(len(kept))
         return FacePoints._made(
+            rig,
             points[:, kept.to(marks.device)],
             compact[rows].to(marks.device),
             curves.valid.to(marks.device),
@@ -87,13 +95,36 @@ class FacePoints:
         )
 
     @staticmethod
-    def _made(values: Tensor, rows: Tensor, valid: Tensor, side: Tensor) -> FacePoints:
-        return FacePoints(values[0].contiguous(), values[1:].permute(1, 2, 0).contiguous(), rows, valid, side)
+    def _made(rig: BlendshapeRig, values: Tensor, rows: Tensor, valid: Tensor, side: Tensor) -> FacePoints:
+        basis = values[1:].permute(1, 2, 0).contiguous()
+        shapes = len(rig.names)
+        made = FacePoints(values[0].contiguous(), basis[..., :shapes].contiguous(), rows, valid, side)
+        if rig.activation is None:
+            return made
+        more = basis[..., shapes:].contiguous()
+        return replace(made, activation=copy.deepcopy(rig.activation), corrective_basis=more)
 
     def at(self, weights: Tensor) -> Tensor:
         """Positions (B,P,3) at weights (B,N)."""
         moved = weights @ self.basis.flatten(0, 1).T
+        if self.activation is not None and self.corrective_basis is not None:
+            moved = moved + self.activation(weights) @ self.corrective_basis.flatten(0, 1).T
         return self.rest + moved.unflatten(1, self.rest.shape)
+
+    def linearised(self, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Some points at weights (B,N), (B,L,3), and what a unit more of each weight adds there, (B,L,3,N).
+
+        Args:
+            weights: (B,N).
+            rows: which points, (B,L).
+        """
+        basis = self.basis[rows]
+        placed = self.rest[rows] + (basis.flatten(1, 2) @ weights[..., None]).view(*rows.shape, 3)
+        if self.activation is None or self.corrective_basis is None:
+            return placed, basis
+        more = self.corrective_basis[rows].flatten(1, 2)
+        placed = placed + (more @ self.activation(weights)[..., None]).view(placed.shape)
+        return placed, basis + (more @ self.activation.jacobian(weights)).view(basis.shape)
 
     def chosen(self, weights: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Tensor) -> Tensor:
         """Which point each landmark is in each frame, rows (B,68) into the points.

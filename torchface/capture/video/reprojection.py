@@ -99,8 +99,7 @@ def linearise(
     Source: thesis 4.2.6, equation 40.
     """
     count, shapes = len(state.weights), points.basis.shape[-1]
-    basis = points.basis[rows]
-    placed = points.rest[rows] + (basis.flatten(1, 2) @ state.weights[..., None]).view(count, -1, 3)
+    placed, basis = points.linearised(state.weights, rows)
     turned = placed @ state.rotation.transpose(-1, -2)
     pixels, by_place = pixel_jacobian(turned + state.translation[:, None], intrinsics)
     # Residuals and their derivatives by the points' places go through the same products.

@@ -16,6 +16,7 @@ from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
 from torchface.capture.video.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.video.video_settings import VideoSettings
 from torchface.capture.video.weight_walk import relative_trust
+from torchface.correctives import CorrectiveActivation, definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig
@@ -49,6 +50,7 @@ class VideoSolverParts(nn.Module):
     rows: Tensor
     valid: Tensor
     side: Tensor
+    corrective_basis: Tensor | None
     intrinsics: Tensor
     landmark_weights: Tensor
     lower: Tensor
@@ -100,6 +102,8 @@ class VideoSolverParts(nn.Module):
         like = points.rest
         for name in _POINTS:
             self.register_buffer(name, getattr(points, name).detach())
+        self.activation = points.activation
+        self.register_buffer("corrective_basis", points.corrective_basis)
         self.register_buffer("intrinsics", intrinsics.to(like, copy=True))
         self.register_buffer("landmark_weights", landmark_weights.to(like, copy=True))
         # What follows from settings alone is on the CPU also where a solver is being rebuilt without memory.
@@ -128,7 +132,9 @@ class VideoSolverParts(nn.Module):
     @property
     def points(self) -> FacePoints:
         """Of the rig, float64."""
-        return FacePoints(self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double())
+        more = None if self.corrective_basis is None else self.corrective_basis.double()
+        found = self.rest.double(), self.basis.double(), self.rows, self.valid, self.side.double()
+        return FacePoints(*found, self.activation, more)
 
     @property
     def walks(self) -> bool:
@@ -167,6 +173,7 @@ class VideoSolverParts(nn.Module):
             "settings": asdict(self.settings),
             "prior": _described(self.prior, _PRIORS),
             "dynamics": _described(self.dynamics, _DYNAMICS),
+            **({} if self.activation is None else {"correctives": self.activation.records()}),
         }
 
     @classmethod
@@ -195,12 +202,15 @@ class VideoSolverParts(nn.Module):
                 learned.require(names)
         self = cls.__new__(cls)
         nn.Module.__init__(self)
+        definitions = definitions_from_records(config.get("correctives", []))
         points = FacePoints(
             torch.zeros(count, 3, dtype=torch.float64),
             torch.zeros(count, 3, len(names), dtype=torch.float64),
             torch.zeros(JAW, curve, dtype=torch.int64),
             torch.zeros(JAW, curve, dtype=torch.bool),
             torch.zeros(JAW, dtype=torch.float64),
+            CorrectiveActivation(definitions, names) if definitions else None,
+            torch.zeros(count, 3, len(definitions), dtype=torch.float64) if definitions else None,
         )
         K, weights = torch.zeros(3, 3), torch.zeros(LANDMARKS)
         self._hold(names, points, K, weights, prior, dynamics, VideoSettings(**settings))
@@ -224,7 +234,8 @@ class VideoSolverParts(nn.Module):
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
         """As modules do; but another rig's contour may have more or fewer points than this one's."""
-        found = {name: state_dict.get(prefix + name) for name in _POINTS}
+        names = _POINTS if self.corrective_basis is None else (*_POINTS, "corrective_basis")
+        found = {name: state_dict.get(prefix + name) for name in names}
         shapes = {name: tuple(value.shape) for name, value in found.items() if isinstance(value, Tensor)}
         count, curve = (shapes.get(name, (0, 0))[axis] for name, axis in (("rest", 0), ("rows", -1)))
         expected = {
@@ -234,6 +245,8 @@ class VideoSolverParts(nn.Module):
             "valid": (JAW, curve),
             "side": (JAW,),
         }
+        if self.corrective_basis is not None:
+            expected["corrective_basis"] = (count, 3, self.corrective_basis.shape[-1])
         if shapes == expected and count >= LANDMARKS:
             for name, shape in shapes.items():
                 own = getattr(self, name)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchface.capture.energy import Quadratic
 from torchface.capture.video.face_points import LANDMARKS
-from torchface.capture.video.fixed_point_gradient import attach_gradients
 from torchface.capture.video.frame_states import FrameTerms, Solved, VideoSolution, VideoState
 from torchface.capture.video.reprojection import HeadState, linearise
 from torchface.capture.video.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
@@ -19,6 +18,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
+from torchface.optim.fixed_point_gradient import attach_gradients
 from torchface.optim.warm_active_set import solve_from_active_set
 
 _MIN_LANDMARKS = 6

@@ -143,7 +143,7 @@ class WebcamSolver(nn.Module):
             raise NameMismatchError(
                 f"rig: found none of ARKit's shapes among {', '.join(rig.names[:5])}, expected some"
             )
-        points = FacePoints.of(rig, rig.neutral.landmarks)
+        points = FacePoints.of(rig.linear("WebcamSolver"), rig.neutral.landmarks)
         person = PersonPrior.of(identity_modes, self.settings.coefficients)
         self.layout = StateLayout(len(rig.names), self.settings.coefficients)
         self.strength = self.settings.prior_strength

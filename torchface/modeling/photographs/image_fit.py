@@ -115,6 +115,7 @@ def fit_images(
     Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
     """
     progress = progress or silent
+    rig = rig.linear("fit_images")
     vertices = checked_landmark_vertices(model, rig, landmark_vertices)
     sizes = checked_sizes(landmarks, image_size)
     if images is not None:

@@ -80,7 +80,7 @@ def transfer_deformation(
     lips meet as the source's do. The source's own face gets the source's own shapes.
 
     Args:
-        source: the template: N shapes, V vertices, millimetres.
+        source: the template: N shapes, V vertices, millimetres; its correctives are transferred too.
         target: the new neutral, of the same topology, millimetres.
         contact_weight: how firmly lids and lips keep their gap; 0 leaves that out, and lets parts come through.
         progress: called with each step and how far it is.
@@ -114,7 +114,8 @@ def transfer_with_report(
     if contact_weight > 0 and float((job.goal - job.rest).abs().max()) > _ANOTHER_FACE:
         own = BlendshapeRig(target.to("cpu").with_vertices(job.goal), moved, source.names)
         moved = clear_parts(own, inner_parts(source)).deltas
-    return TransferredRig(job.rig(source, target, moved), transfer_report(job, source.names))
+    correctives = job.correctives(source, progress)
+    return TransferredRig(job.rig(source, target, moved, correctives), transfer_report(job, source.names))
 
 
 def transfer_report(job: ShapeTransfer, names: tuple[str, ...]) -> TransferReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,9 +152,9 @@ def rig_from_examples(
         progress("learning from examples", number + 1, job.schedule.iterations)
     transfer = job.transfer
     return ExampleRig(
-        rig=transfer.rig(template, neutral, job.prior + job.personal),
+        rig=transfer.rig(template, neutral, job.prior + job.personal, job.correctives),
         weights=job.weights.to(weights),
-        transferred=transfer.rig(template, neutral, job.prior),
+        transferred=transfer.rig(template, neutral, job.prior, job.correctives),
         errors=torch.stack(job.errors) * float(transfer.similarity.scale[0]),
         angles=angles_between(job.prior, job.prior + job.personal),
         report=transfer_report(transfer, template.names),
@@ -188,8 +189,11 @@ class _Rigging:
         self.prior = self.transfer.transfer()
         self.personal = torch.zeros_like(self.prior)
         placed = self.transfer.similarity.inverse().apply(examples.detach().double().cpu())
-        self.offsets = placed - self.transfer.goal
+        self.shown = placed - self.transfer.goal
         self.given = self.weights = weights.detach().double().cpu()
+        self.correctives = self.transfer.correctives(template)
+        self.activation = copy.deepcopy(template.activation)
+        self.offsets = self._less_correctives()
         # What only the normals' columns of the gradients hold is not demanded of vertices; the rest is linear in them.
         self.operator = gradient_operator(self.transfer.goal, faces)
         self.prior_gradients = self._gradients(self.prior)
@@ -198,6 +202,12 @@ class _Rigging:
         self.vertex_compliance = self._vertex_means(self.compliance).T.contiguous()  # (V,N)
         self.left = self._left_by_transfer()
         self.errors = [self.example_errors()]
+
+    def _less_correctives(self) -> Tensor:
+        """What the shapes alone have to explain of the examples at their weights, (M,V,3)."""
+        if self.activation is None or self.correctives is None:
+            return self.shown
+        return self.shown - torch.tensordot(self.activation.cpu()(self.weights), self.correctives.deltas, 1)
 
     def _left_by_transfer(self) -> float:
         """The squared distance between an example and the transferred rig's nearest pose, square millimetres.
@@ -270,6 +280,9 @@ class _Rigging:
         hold = gamma * self.left * torch.where(self.given > 0, 1.0, self.schedule.unnamed)
         pull = self.offsets.flatten(1) @ shapes.T + hold * self.given
         self.weights = box_qp(shapes @ shapes.T + hold.diag_embed(), -pull, start=self.weights)
+        if self.correctives is not None:
+            self.offsets = self._less_correctives()
+            self.example_gradients = self._gradients(self.offsets)
 
     def example_errors(self) -> Tensor:
         missing = self.offsets - _combined(self.weights, self.prior + self.personal)

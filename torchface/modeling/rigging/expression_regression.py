@@ -261,11 +261,13 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
     split = (translation > 0) & ((translation > 0).sum(0) > 1)
     # All of them: a shape that undoes another is transferred on top of it.
     needless = bool(predictable.all()) and not bool(split.any())
-    transferred = torch.zeros_like(template.deltas) if needless else transfer_deformation(template, neutral).deltas
+    moved = template if needless and template.correctives is None else transfer_deformation(template, neutral)
+    transferred = torch.zeros_like(template.deltas) if needless else moved.deltas
     # Deltas of halves add up to those of their whole.
     named = torch.einsum("nm,mvc->nvc", (translation > 0).to(predicted), predicted)
     named = (named * _shares_of_the_whole(transferred, split)).to(transferred)
-    return BlendshapeRig(neutral, torch.where(predictable[:, None, None], named, transferred), template.names)
+    deltas = torch.where(predictable[:, None, None], named, transferred)
+    return BlendshapeRig(neutral, deltas, template.names, moved.correctives)
 
 
 def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
     changed |= _cleared(deltas, moving, again, clearance)
     whole = rig.deltas.detach().clone()
     whole[changed.to(whole.device)] = deltas[changed].to(whole)
-    return BlendshapeRig(rig.neutral, whole, rig.names) if bool(changed.any()) else rig
+    return BlendshapeRig(rig.neutral, whole, rig.names, rig.correctives) if bool(changed.any()) else rig
 
 
 def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: Clearance) -> Tensor:

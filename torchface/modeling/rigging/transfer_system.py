@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from torchface.correctives import Correctives
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.contact import ContactPairs
 from torchface.geometry.meshes.deformation import degenerate_triangles, triangle_frames
@@ -99,10 +101,60 @@ class ShapeTransfer:
             self.reconstruction.prepare(~self.moving[shape], asked),
         )
 
-    def rig(self, source: BlendshapeRig, target: Mesh, moved: Tensor) -> BlendshapeRig:
-        """The target's rig with deltas (N,V,3) that were solved in the source's frame."""
+    def correctives(self, source: BlendshapeRig, progress: Progress | None = None) -> Correctives | None:
+        r"""The source's correctives on the target, in the source's frame.
+
+        A corrective is transferred as what it adds to the gradients of the pose in which its drivers are fully on,
+        :math:`S_t(P + D) - S_t(P)`, with the source's shapes and other correctives in the pose P. So it stays as local
+        as it is, and one of no effect has none.
+        """
+        correctives, activation = source.correctives, source.activation
+        if correctives is None or activation is None:
+            return None
+        progress = progress or silent
+        added = correctives.deltas.detach().double().cpu()
+        row = {name: i for i, name in enumerate(source.names)}
+        weights = torch.zeros(len(added), len(row), dtype=torch.float64)
+        for i, definition in enumerate(correctives.definitions):
+            weights[i, [row[driver] for driver in definition.drivers]] = definition.peak or 1.0
+        on = copy.deepcopy(activation).cpu()(weights)
+        moved = torch.zeros_like(added)
+        for i, delta in enumerate(added):  # each moves other vertices, hence is a system of its own
+            pose = self.rest + torch.tensordot(weights[i], self.deltas, 1) + torch.tensordot(on[i], added, 1) - delta
+            moved[i] = self._added(pose, delta)
+            progress("transferring correctives", i + 1, len(added))
+        return correctives.with_deltas(moved)
+
+    def rig(
+        self, source: BlendshapeRig, target: Mesh, moved: Tensor, correctives: Correctives | None = None
+    ) -> BlendshapeRig:
+        """The target's rig with deltas (N,V,3), and correctives, that were solved in the source's frame."""
         neutral = target.to(source.deltas.device)
-        return BlendshapeRig(neutral, self.similarity.apply_vectors(moved).to(neutral.vertices), source.names)
+        if correctives is not None:
+            placed = self.similarity.apply_vectors(correctives.deltas).to(neutral.vertices)
+            correctives = correctives.with_deltas(placed)
+        deltas = self.similarity.apply_vectors(moved).to(neutral.vertices)
+        return BlendshapeRig(neutral, deltas, source.names, correctives)
+
+    def _added(self, pose: Tensor, delta: Tensor) -> Tensor:
+        """What a displacement (V,3) of a pose of the source (V,3) becomes on the target, (V,3)."""
+        moving = delta.norm(dim=-1) > STILL
+        active = moving[self.faces].any(1) & ~self.flat
+        faces = self.faces[active]
+        gradients = torch.zeros(1, len(self.faces), 3, 3, dtype=torch.float64)
+        change = triangle_frames(pose + delta, faces) - triangle_frames(pose, faces)
+        gradients[0, active] = change @ self.inverse_frames[active]
+        strengths = self.links.strength(delta, _LINK_TOLERANCE), torch.ones(len(self.seams.closed), dtype=torch.float64)
+        constraints = []
+        for pairs, weight, strength in zip(
+            (self.links.pairs, self.seams.closed), (_LINK_WEIGHT, self.contact_weight), strengths, strict=True
+        ):
+            moves = moving[pairs].any(1)
+            if bool(moves.any()):
+                first, second = pairs[moves].T
+                offsets = delta[first] - delta[second]
+                constraints.append(offset_constraints(pairs[moves], offsets, weight * strength[moves], len(delta)))
+        return self.reconstruction.solve(gradients, delta[None], ~moving, constraints)[0]
 
     def _solve(self, group: list[int], moved: Tensor) -> Tensor:
         """How far each vertex goes in the shapes of a group, (G,V,3), in the source's frame."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture.markers import Cleanup, HelmetMotion
 from torchface.geometry.similarity import Similarity
+from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.workflows.solve.head_camera import Predicted
 from torchface.workflows.solve.weight_stream import StreamReport
@@ -54,6 +55,7 @@ class SolveReport:
         predicted: what the head camera saw, where there was a video.
         sent: what was streamed, where that was asked for.
         warnings: what the user should know before they use the weights.
+        rig: what was solved, where it is to be shown.
     """
 
     take: Take
@@ -66,6 +68,7 @@ class SolveReport:
     predicted: Predicted | None = None
     sent: StreamReport | None = None
     warnings: tuple[str, ...] = ()
+    rig: BlendshapeRig | None = None
 
     def lines(self) -> list[str]:
         """For people to read."""

@@ -92,7 +92,11 @@ def _offsets(rig: BlendshapeRig, solution: Solution, weights: Tensor) -> Tensor:
     if sites.residual is not None:
         rest = rest + sites.residual.to(rest)
     basis = sites.on(faces, rig.deltas)
-    return solution.markers.float() - rest - torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
+    moved = torch.einsum("tn,nmc->tmc", weights.to(basis), basis)
+    if rig.activation is not None and rig.corrective_deltas is not None:
+        more = sites.on(faces, rig.corrective_deltas)
+        moved = moved + torch.einsum("tn,nmc->tmc", rig.activation(weights.to(more)), more)
+    return solution.markers.float() - rest - moved
 
 
 def _player(folder: Path, rig: BlendshapeRig, solution: Solution, weights: Tensor, errors: Tensor, fps: float) -> str:

@@ -26,6 +26,7 @@ from torchface.evaluation import marker_rmse
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, save_animation
+from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.udp_sending import find_receiver
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.progress import Progress, silent
@@ -191,6 +192,8 @@ def solve_take(
     """
     progress = progress or silent
     check_writable(out, live_link, animation, folder=report)
+    if animation is not None:
+        check_animation_ending(animation)
     if stream is not None:
         find_receiver(stream)
     progress("reading the rig")
@@ -230,6 +233,7 @@ def solve_take(
         solution.cleanup,
         predicted,
         warnings=(*notes, *solution.warnings, *written),
+        rig=loaded,
     )
     if report is not None:
         from torchface.workflows.solve.solve_page import write_solve_page  # matplotlib takes its time

@@ -98,7 +98,7 @@ def check_explained(solver: MarkerSolver, take: Take, slip: bool, insist: bool =
     aligned = solver.alignment is not None
     if solver.alignment is not None:
         markers = solver.alignment.apply(markers)
-    fit = check_fit(torch.cat([solver.rest[..., None], solver.basis], dim=2), markers, slip)
+    fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
     if fit.refused and not insist:
         raise AlignmentError(
             f"{_source(take)}: the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm "

@@ -98,6 +98,7 @@ def fit_attachment(
     """
     progress = progress or silent
     initial.check(rig.neutral)
+    rig = rig.linear("fit_attachment")
     paths = marker_paths(rom, initial)
     motion = SurfaceMotion.of(rig, normals=standoff)
     initial_points = motion.at(motion.points, initial)[..., 0]

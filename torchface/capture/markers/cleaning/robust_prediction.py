@@ -55,7 +55,7 @@ def predict_markers(
         slip: the helmet may move; six rigid columns model it.
         ignored: markers that are predicted from the others alone, (M,) bool.
     """
-    rest, columns = solver.rest.double(), solver.basis.double()
+    rest, columns = solver.rest.double(), solver.every_basis.double()
     shapes = columns.shape[2]
     lower, upper = rest.new_zeros(shapes), rest.new_ones(shapes)
     ridge, penalty = rest.new_full((shapes,), 2 * _RIDGE), rest.new_full((shapes,), penalty_value(solver.sparsity))

@@ -211,7 +211,7 @@ def _expected_over_time(solver: MarkerSolver, seen: Tensor, fps: float) -> Tenso
         return solver.rest.double().expand_as(seen)
     alignment = solver.alignment
     weights = WholeTakeSolver(solver)(seen if alignment is None else alignment.inverse().apply(seen), fps)
-    on_rig = solver.rest.double() + torch.einsum("mcn,tn->tmc", solver.basis.double(), weights)
+    on_rig = solver.points(weights)
     return on_rig + (seen - on_rig).nanmedian(0).values.nan_to_num(0.0)
 
 

@@ -1,0 +1,202 @@
+"""Markers of a rig with correctives: planted weights, scipy's solvers, finite differences."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from torchface import Attachment, BlendshapeRig, load_rig, load_take
+from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
+from torchface.capture.corrective_energy import CorrectiveEnergy
+from torchface.correctives import Corrective, Correctives
+from torchface.errors import NameMismatchError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.planted_correctives import planted_correctives
+from torchface.temporal import bridged
+
+SHAPES = 16
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    linear = performer(texture=False)
+    reach = linear.deltas.norm(dim=-1)
+    far = reach.amax(1).argsort(descending=True)[:SHAPES].tolist()
+    linear = linear.select([linear.names[i] for i in far])
+    return BlendshapeRig(linear.neutral, linear.deltas, linear.names, planted_correctives(linear, 30)).double()
+
+
+@pytest.fixture(scope="module")
+def attachment(rig: BlendshapeRig) -> Attachment:
+    moved = (rig.deltas.norm(dim=-1).amax(0) > 1).nonzero()[:, 0]
+    return Attachment.from_vertices(rig.neutral, moved[:: len(moved) // 80][:80])
+
+
+@pytest.fixture(scope="module")
+def truth() -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    active = torch.rand(5, SHAPES, generator=generator) < 0.4
+    return (active * torch.rand(5, SHAPES, generator=generator)).double()
+
+
+@pytest.fixture(scope="module")
+def markers(rig: BlendshapeRig, attachment: Attachment, truth: Tensor) -> Tensor:
+    return attachment.on(rig.neutral.faces, rig(truth))
+
+
+def solver_of(rig: BlendshapeRig, attachment: Attachment) -> MarkerSolver:
+    return MarkerSolver(rig, attachment, sparsity=0.0, ridge=1e-9)
+
+
+def test_planted_weights_come_back(rig: BlendshapeRig, attachment: Attachment, truth: Tensor, markers: Tensor) -> None:
+    solver = solver_of(rig, attachment)
+    assert (solver(markers) - truth).abs().max() < 1e-5
+    linear = solver.without_correctives()(markers)
+    assert (linear - truth).abs().mean() > 0.02
+    assert solver.without_correctives().activation is None
+    assert solver.activation is not None
+    torch.testing.assert_close(solver.points(truth), markers)
+
+
+def test_gaps_guesses_and_batches_change_nothing(
+    rig: BlendshapeRig, attachment: Attachment, truth: Tensor, markers: Tensor
+) -> None:
+    solver = solver_of(rig, attachment)
+    hidden = markers.clone()
+    hidden[::2, ::7] = torch.nan
+    assert (solver(hidden) - truth).abs().max() < 1e-4
+    whole = solver(markers)
+    one_by_one = torch.cat([solver(frame) for frame in markers.split(1)])
+    assert (whole - one_by_one).abs().max() < 1e-8
+    assert (whole - solver(markers, truth)).abs().max() < 1e-6
+
+
+def test_scipy_finds_nothing_better_nearby(
+    rig: BlendshapeRig, attachment: Attachment, truth: Tensor, markers: Tensor
+) -> None:
+    solver = MarkerSolver(rig, attachment)
+    noisy = markers[:2] + 0.3 * torch.randn(2, *markers.shape[1:], generator=torch.Generator().manual_seed(2)).double()
+    energy, found, start = solver.energy(noisy), solver(noisy), solver.without_correctives()(noisy)
+    assert isinstance(energy, CorrectiveEnergy)
+    scale = float(np.sqrt(1 / len(attachment.triangles)))
+
+    def residuals(w: np.ndarray, frame: int) -> np.ndarray:
+        points = solver.points(torch.from_numpy(w)[None])[0] - noisy[frame]
+        # The penalty, linear in weights that are not negative, as a square.
+        sparse = np.sqrt(solver.sparsity * w.clip(0) + 1e-18)
+        return np.concatenate([scale * points.flatten().numpy(), sparse, np.sqrt(solver.ridge) * w])
+
+    for frame in range(2):
+        peer = least_squares(residuals, found[frame].numpy().clip(1e-6, 1 - 1e-6), bounds=(0, 1), args=(frame,))
+        here = energy.rows(torch.tensor([frame]))
+        ours = float(here.value(found[frame : frame + 1]))
+        assert ours < float(here.value(torch.from_numpy(peer.x)[None])) + 1e-6
+        assert np.abs(peer.x - found[frame].numpy()).max() < 1e-2
+        assert ours < float(here.value(start[frame : frame + 1])) - 1e-3
+
+
+def test_weights_are_differentiable_in_the_markers(rig: BlendshapeRig, attachment: Attachment, markers: Tensor) -> None:
+    solver = MarkerSolver(rig, attachment)
+    noise = torch.randn(2, *markers.shape[1:], generator=torch.Generator().manual_seed(3)).double()
+    seen = (markers[:2] + 0.5 * noise).requires_grad_()
+    direction = torch.randn(2, SHAPES, generator=torch.Generator().manual_seed(4)).double()
+    (slope,) = torch.autograd.grad((solver(seen) * direction).sum(), seen)
+    step = 1e-4 * noise
+    with torch.no_grad():
+        change = ((solver(seen + step) - solver(seen - step)) * direction).sum() / 2
+    torch.testing.assert_close((slope * step).sum(), change, rtol=1e-3, atol=1e-9)
+
+
+def test_the_helmets_motion_is_told_from_correctives(
+    rig: BlendshapeRig, attachment: Attachment, truth: Tensor, markers: Tensor
+) -> None:
+    solver = HelmetSolver(rig, attachment, sparsity=0.0, ridge=1e-9)
+    turned = rotation_matrix(torch.tensor([[0.03, -0.05, 0.02]], dtype=torch.float64)).expand(len(markers), -1, -1)
+    pivot = solver.markers.rest.mean(0)
+    slipped = (markers - pivot) @ turned.transpose(1, 2) + pivot + torch.tensor([4.0, -3.0, 2.0]).double()
+    weights, motion = solver(slipped)
+    assert (weights - truth).abs().max() < 2e-3
+    assert (motion.undo(slipped) - markers).norm(dim=-1).max() < 2e-2
+
+
+def test_predictions_pull_solves_with_correctives_too(
+    rig: BlendshapeRig, attachment: Attachment, truth: Tensor, markers: Tensor
+) -> None:
+    solver = HybridSolver(MarkerSolver(rig, attachment))
+    gamma = torch.zeros_like(truth)
+    alone = solver(markers, truth, gamma)
+    torch.testing.assert_close(alone, solver.markers(markers))
+    gamma[:, 3] = 1e6
+    predicted = torch.full_like(truth, 0.25)
+    pulled = solver(markers, predicted, gamma)
+    assert (pulled[:, 3] - 0.25).abs().max() < 1e-3
+    energy = solver.energy(markers, predicted, gamma)
+    assert (energy.value(pulled) < energy.value(alone)).all()
+
+
+def test_a_whole_take_is_smoothed_with_correctives(rig: BlendshapeRig, attachment: Attachment) -> None:
+    at = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
+    curves = (0.4 * torch.sin(5 * at + torch.arange(SHAPES)) + 0.3).clamp(min=0)
+    exact = attachment.on(rig.neutral.faces, rig(curves))
+    seen = exact + 0.3 * torch.randn(exact.shape, generator=torch.Generator().manual_seed(5)).double()
+    seen[20:23, ::3] = torch.nan
+    seen[30] = torch.nan
+    solver = MarkerSolver(rig, attachment)
+    whole = WholeTakeSolver(solver)
+    smooth = whole(seen)
+    shown = ~torch.isnan(seen).any(-1).all(1)
+    alone = bridged(solver(seen[shown]), shown.nonzero()[:, 0], len(seen))
+    assert whole.energy(seen, smooth) < whole.energy(seen, alone)
+    far, further = ((rig(w) - rig(curves)).norm(dim=-1).mean() for w in (smooth, alone))
+    assert far < 0.7 * further
+    rough = [(w[2:] - 2 * w[1:-1] + w[:-2]).square().mean() for w in (smooth, alone)]
+    assert rough[0] < 0.1 * rough[1]
+    # Without gaps the energy is formed another way.
+    full = torch.where(torch.isnan(seen), exact, seen)
+    nearly = full.clone()
+    nearly[0, 0] = torch.nan
+    assert (whole(full) - whole(nearly)).abs().mean() < 2e-3
+
+
+def test_a_solver_is_rebuilt_from_its_state(rig: BlendshapeRig, attachment: Attachment, markers: Tensor) -> None:
+    solver = MarkerSolver(rig, attachment)
+    again = MarkerSolver.from_config(copy.deepcopy(solver.config)).double()
+    again.load_state_dict(solver.state_dict())
+    torch.testing.assert_close(again(markers[:2]), solver(markers[:2]))
+    with pytest.raises(NameMismatchError, match=r"correctives\[0\]: found 7"):
+        MarkerSolver.from_config(solver.config | {"correctives": [7]})
+
+
+@pytest.mark.real
+def test_a_real_take_on_a_real_rig_with_correctives(ict_folder: Path, performances: list[Path]) -> None:
+    rig = load_rig(ict_folder, part="face")
+    jaw, smile = rig.index(["jawOpen", "mouthSmile_L"])
+    definitions = (
+        Corrective("open_smile", ("jawOpen", "mouthSmile_L")),
+        Corrective("blink_half", ("eyeBlink_L",), 0.5),
+    )
+    both = (rig.deltas[jaw].norm(dim=-1) * rig.deltas[smile].norm(dim=-1)).sqrt()[:, None]
+    blink = rig.deltas[rig.index(["eyeBlink_L"])[0]]
+    deltas = torch.stack([0.5 * both * torch.tensor([0.6, 0.0, 0.8]), 0.3 * blink.roll(1, 1)])
+    rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, Correctives(deltas, definitions))
+    take = load_take(performances[0]).weights
+    assert take is not None
+    weights = rig.weights_from(take)
+    assert rig.activation is not None
+    on = rig.activation(weights) * deltas.norm(dim=-1).amax(1)
+    weights = weights[on.sum(1).argsort(descending=True)[:10]]
+    moved = (rig.deltas.norm(dim=-1).amax(0) > 1).nonzero()[:, 0]
+    attachment = Attachment.from_vertices(rig.neutral, moved[:: len(moved) // 120][:120])
+    seen = attachment.on(rig.neutral.faces, rig(weights))
+    seen = seen + 0.1 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(1))
+    solver = MarkerSolver(rig, attachment)
+    ours, linear = solver(seen), solver.without_correctives()(seen)
+    far, further = (float((rig(w) - rig(weights)).norm(dim=-1).mean()) for w in (ours, linear))
+    assert far < 0.85 * further

@@ -1,0 +1,76 @@
+"""The marker solve's graph of a rig with correctives: near the exact solve, and what ONNX Runtime computes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnxruntime
+import pytest
+import torch
+
+from torchface import Attachment, BlendshapeRig
+from torchface.capture import MarkerSolver
+from torchface.errors import ValueRangeError
+from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_model import corrective_model
+from torchface.onnx.live_solver import LiveMarkerSolver
+from torchface.onnx.solver_graph import SolverGraph
+from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames
+from torchface.synthetic import performer
+from torchface.synthetic.head.planted_correctives import planted_correctives
+
+
+@pytest.fixture(scope="module")
+def solver() -> MarkerSolver:
+    whole = performer(texture=False)
+    far = whole.deltas.norm(dim=-1).amax(1).argsort(descending=True)[:10].tolist()
+    rig = whole.select([whole.names[i] for i in far])
+    rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 20))
+    moved = (rig.deltas.norm(dim=-1).amax(0) > 1).nonzero()[:, 0]
+    return MarkerSolver(rig, Attachment.from_vertices(rig.neutral, moved[:: len(moved) // 40][:40]))
+
+
+def test_fixed_steps_come_near_the_exact_solve(solver: MarkerSolver) -> None:
+    markers = random_frames(solver, 30)
+    graph, cold = CorrectiveGraph(solver), torch.zeros(30, 10)
+    for shown in (markers, hide_markers(markers, 0.2)):
+        energy, exact = solver.energy(shown), solver(shown)
+        least = energy.value(exact.double())
+        found = graph(shown, cold)
+        gap = (energy.value(found.double()) - least) / least
+        assert gap.median() < 1e-4
+        assert gap.max() < 0.05
+        linear = solver.without_correctives()(shown)
+        assert ((energy.value(linear.double()) - least) / least).median() > 10 * gap.median().clamp(min=1e-6)
+    nothing = torch.full_like(markers[:1], torch.nan)
+    torch.testing.assert_close(graph(nothing, torch.full((1, 10), 0.25)), torch.full((1, 10), 0.25))
+
+
+def test_the_other_graph_is_refused(solver: MarkerSolver) -> None:
+    with pytest.raises(ValueRangeError, match="found a rig with correctives"):
+        SolverGraph(solver)
+    with pytest.raises(ValueRangeError, match="found a rig without correctives"):
+        CorrectiveGraph(solver.without_correctives())
+
+
+def test_onnx_runtime_computes_the_graph(solver: MarkerSolver) -> None:
+    graph = CorrectiveGraph(solver, steps=3)
+    model = corrective_model(graph)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    assert session.get_modelmeta().custom_metadata_map["correctives"] == "20"
+    shown = hide_markers(random_frames(solver, 3), 0.2)
+    shown[2] = torch.nan
+    start = torch.rand(3, 10, generator=torch.Generator().manual_seed(1))
+    (found,) = session.run(None, {"markers": shown.numpy(), "previous": start.numpy()})
+    assert (torch.from_numpy(found) - graph(shown, start)).abs().max() < 1e-5
+
+
+@pytest.mark.bench
+def test_a_file_is_written_and_checked(solver: MarkerSolver, tmp_path: Path) -> None:
+    report = export_marker_solver(solver, tmp_path / "solver.onnx")
+    assert all(gap.parity < 1e-5 for gap in report.gaps)
+    print(report)
+    frames = random_frames(solver, 5)
+    live = LiveMarkerSolver(solver)
+    steps = torch.stack([live.step(frame) for frame in frames])
+    assert (steps - solver(frames)).abs().mean() < 0.02

@@ -1,0 +1,82 @@
+"""A rig's correctives in glTF: morph targets after the shapes', and in ``mesh.extras.torchface.correctives`` when each
+acts, as ``{"name": target, "drivers": [shape, ...], "peak": weight}``; only in-betweens have a peak.
+
+Other programs see plain morph targets, whose weights ``save_animation`` writes with the shapes'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.correctives import Corrective, Correctives, definitions_from_records
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.io.gltf.container import Document
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+
+_FIELD = "correctives"
+
+
+def write_correctives(definitions: Sequence[Corrective]) -> dict[str, Any]:
+    """The JSON of correctives; empty where there are none."""
+    return {_FIELD: [definition.record() for definition in definitions]} if definitions else {}
+
+
+def scene_correctives(document: Document) -> tuple[Corrective, ...]:
+    """The definitions of the first mesh that has any.
+
+    Raises:
+        FileFormatError: as of ``read_correctives``.
+    """
+    for i, mesh in enumerate(document.objects("meshes")):
+        extras = mesh.get("extras")
+        ours = extras.get("torchface") if isinstance(extras, dict) else None
+        if isinstance(ours, dict) and ours.get(_FIELD):
+            return read_correctives(document, ours, f"meshes[{i}].extras.torchface")
+    return ()
+
+
+def read_correctives(document: Document, extras: Mapping[str, Any], place: str) -> tuple[Corrective, ...]:
+    """The definitions that a record of ours holds; none where it has no such field.
+
+    Raises:
+        FileFormatError: the field is broken, or defines what no rig can have.
+    """
+    try:
+        return definitions_from_records(extras.get(_FIELD, []))
+    except (NameMismatchError, ValueRangeError) as error:
+        raise FileFormatError(f"{document.path}: {place}: {error}") from error
+
+
+def rig_of_targets(
+    document: Document, neutral: Mesh, deltas: Tensor, names: Sequence[str], definitions: Sequence[Corrective]
+) -> BlendshapeRig:
+    """The rig of a file's morph targets (N+C,V,3), of which some are correctives.
+
+    Raises:
+        FileFormatError: a corrective has no target or a driver that is no shape.
+    """
+    if not definitions:
+        return BlendshapeRig(neutral, deltas, names)
+    row = {name: i for i, name in enumerate(names)}
+    own = {definition.name for definition in definitions}
+    shapes = [name for name in names if name not in own]
+    for definition in definitions:
+        missing = [name for name in (definition.name, *definition.drivers) if name not in row]
+        if missing:
+            found = f"a corrective {definition.name[:60]!r} and no morph target {missing[0][:60]!r}"
+            raise document.error(_FIELD, found, "a target for it and for each driver")
+    correctives = Correctives(deltas[[row[definition.name] for definition in definitions]], tuple(definitions))
+    return BlendshapeRig(neutral, deltas[[row[name] for name in shapes]], shapes, correctives)
+
+
+def all_targets(rig: BlendshapeRig) -> tuple[Tensor, tuple[str, ...]]:
+    """The deltas (N+C,V,3) and names of a rig's shapes and correctives, as they go into a file."""
+    correctives = rig.correctives
+    if correctives is None:
+        return rig.deltas, rig.names
+    return torch.cat([rig.deltas, correctives.deltas]), (*rig.names, *correctives.names)

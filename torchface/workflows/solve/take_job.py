@@ -1,0 +1,95 @@
+"""One marker take of many, solved from file to file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchface.files.content_keys import content_key
+from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.contact_sheet import face_picture
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
+from torchface.workflows.solve.head_camera import HeadCamera
+from torchface.workflows.solve.solve_take import SolveSettings, solve_take
+
+_METHOD = "solve/1"
+
+
+@dataclass(frozen=True)
+class TakeJob:
+    """How each take is solved; ``{name}`` in a path is the take's name.
+
+    Args:
+        rig, attachment: see :func:`solve_take`.
+        settings, part, camera, options: see :func:`solve_take`.
+        animation, report, live_link: what is to be written of each besides the weights, and where.
+    """
+
+    rig: Path
+    attachment: Path
+    settings: SolveSettings
+    options: MarkerOptions = DEFAULT_OPTIONS
+    part: str | None = None
+    camera: HeadCamera | None = None
+    animation: Path | None = None
+    report: Path | None = None
+    live_link: Path | None = None
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that the take's weights depend on."""
+        return content_key(
+            _METHOD,
+            take=item.path,
+            rig=item.own(self.rig),
+            attachment=item.own(self.attachment),
+            settings=self.settings,
+            part=self.part,
+            camera=None if self.camera is None else item.owned(self.camera),
+            options=item.owned(self.options),
+            written=[str(path) for path in (self.animation, self.report, self.live_link)],
+        )
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Solves a take and writes ``NAME.csv``.
+
+        Raises:
+            TorchfaceError: it cannot be solved.
+        """
+        weights, animation, live_link = out / f"{item.name}.csv", item.own(self.animation), item.own(self.live_link)
+        done = solve_take(
+            item.own(self.rig),
+            item.path,
+            item.own(self.attachment),
+            weights,
+            animation,
+            self.settings,
+            self.part,
+            item.own(self.report),
+            camera=None if self.camera is None else item.owned(self.camera),
+            options=item.owned(self.options),
+            live_link=live_link,
+        )
+        assert done.rig is not None
+        assert done.take.weights is not None
+        values = done.take.weights.values[..., 0]
+        shown = values[values.norm(dim=1).argmax()].to(done.rig.deltas)
+        with torch.no_grad():
+            picture = face_picture(done.rig.neutral.with_vertices(done.rig(shown[None])[0]))
+        median = float(done.rmse.nanmedian())
+        return Made(
+            (weights,),
+            {
+                "rmse_mm": median,
+                "rmse_p95_mm": float(done.rmse.nanquantile(0.95)),
+                "seen": done.seen,
+                "frames": len(done.take),
+                "fps": float(done.take.fps),
+                "solve_seconds": done.seconds,
+            },
+            f"{median:.2f} mm, {len(done.take)} frames",
+            done.warnings,
+            picture,
+        )
