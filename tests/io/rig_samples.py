@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from hypothesis import strategies as st
 
+from torchface.correctives import Corrective, Correctives
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -50,6 +51,18 @@ def sheet_rig() -> BlendshapeRig:
     deltas[0, 3:] = 0
     deltas[2] = 0
     return BlendshapeRig(mesh, deltas, ("jawOpen", "mouthSmileLeft", "eyeBlinkRight"))
+
+
+def corrective_sheet() -> BlendshapeRig:
+    """The sheet's rig with a product of two, one of three, and an in-between."""
+    rig = sheet_rig()
+    definitions = (
+        Corrective("jaw_smile", ("jawOpen", "mouthSmileLeft")),
+        Corrective("all", ("eyeBlinkRight", "jawOpen", "mouthSmileLeft")),
+        Corrective("jaw_third", ("jawOpen",), 1 / 3),
+    )
+    deltas = torch.randn(3, len(rig.vertices), 3, generator=torch.Generator().manual_seed(3))
+    return BlendshapeRig(rig.neutral, rig.deltas, rig.names, Correctives(deltas, definitions))
 
 
 def sheet_take(frames: int = 5) -> Take:

@@ -1,7 +1,8 @@
 """Files in and out: meshes, rigs, takes; lengths become millimetres coming in and the file's unit going out."""
 
+from torchface.io.animation_files import load_animation, save_animation
 from torchface.io.camera_files import load_calibration, save_calibration
-from torchface.io.gltf import ShapeMatch, load_detail_maps, save_animation
+from torchface.io.gltf import load_detail_maps, load_region_maps
 from torchface.io.images.image_files import load_image, save_image, save_image16
 from torchface.io.images.normal_map_files import load_normal_map, save_normal_map
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
@@ -18,6 +19,7 @@ from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.io.rig_files import load_rig, save_rig
 from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.rigs.rig_folder import load_obj_folder
+from torchface.io.scenes.weight_keys import ShapeMatch
 from torchface.io.take_files import load_take, save_take
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "MeshSequence",
     "MeshSequenceWriter",
     "ShapeMatch",
+    "load_animation",
     "load_calibration",
     "load_correspondences",
     "load_detail_maps",
@@ -38,6 +41,7 @@ __all__ = [
     "load_mesh",
     "load_normal_map",
     "load_obj_folder",
+    "load_region_maps",
     "load_rig",
     "load_take",
     "save_animation",

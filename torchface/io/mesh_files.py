@@ -1,4 +1,4 @@
-"""Meshes by path: OBJ, PLY, STL, OFF, glTF."""
+"""Meshes by path: OBJ, PLY, STL, OFF, glTF, USD."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from torchface.io.meshes.obj import read_obj, write_obj
 from torchface.io.meshes.off import read_off, write_off
 from torchface.io.meshes.ply import read_ply, write_ply
 from torchface.io.meshes.stl import read_stl, write_stl
+from torchface.io.usd import USD_ENDINGS, read_usd_mesh, write_usd_mesh
 from torchface.mesh import Mesh
 
 _READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}
-_WRITERS = {".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".off": write_off, ".glb": save_gltf_mesh}
+_WRITERS = {
+    **{".obj": write_obj, ".ply": write_ply, ".stl": write_stl, ".off": write_off, ".glb": save_gltf_mesh},
+    **dict.fromkeys(USD_ENDINGS, write_usd_mesh),
+}
 _GLTF = (".glb", ".gltf")
 MESH_ENDINGS = tuple(_READERS)
-"""What :func:`load_mesh` reads beside glTF, which may hold a rig."""
+"""What :func:`load_mesh` reads beside glTF and USD, which may hold a rig."""
 
 
 def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -25,28 +29,34 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Args:
         path: ``.obj`` (polygons, seams, vertex colours, the material's image), ``.ply`` (polygons, vertex colours),
             ``.stl`` (triangles, equal corners merged), ``.off`` (triangles), ``.glb`` or ``.gltf`` (the whole
-            scene, morph targets at rest). Vertices keep the file's order.
-        unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, millimetres for the others.
+            scene, morph targets at rest), ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` (the same). Vertices keep the
+            file's order.
+        unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD,
+            millimetres for the others.
 
     Raises:
         FileFormatError: the file is missing, broken, or of another kind.
         TopologyError: a face names a vertex that is not there.
         ValueRangeError: another unit.
+        MissingExtraError: USD, and usd-core is not installed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix in _GLTF:
         return read_gltf_mesh(path, unit or "m")
+    if suffix in USD_ENDINGS:
+        return read_usd_mesh(path, unit)
     if suffix not in _READERS:
-        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {', '.join([*_READERS, *_GLTF])}")
+        known = ", ".join([*_READERS, *_GLTF, *USD_ENDINGS])
+        raise FileFormatError(f"{path}: found the suffix {suffix!r}, expected one of {known}")
     return _READERS[suffix](path, unit or "mm")
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Writes a mesh: ``.obj``, ``.ply``, ``.stl`` and ``.off`` in millimetres, ``.glb`` in metres.
+    """Writes a mesh: ``.obj``, ``.ply``, ``.stl`` and ``.off`` in millimetres, ``.glb`` and USD in metres.
 
-    OBJ keeps polygons, seams and colours and puts the texture beside itself; ``.glb`` keeps all and the annotations;
-    PLY keeps polygons and colours, STL and OFF triangles. The file appears only when it is complete.
+    OBJ keeps polygons, seams and colours and puts the texture beside itself; ``.glb`` and USD keep all and the
+    annotations; PLY keeps polygons and colours, STL and OFF triangles. The file appears only when it is complete.
 
     Raises:
         FileFormatError: another suffix, or the folder cannot be written to.

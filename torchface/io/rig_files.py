@@ -1,4 +1,4 @@
-"""Rigs by path: a glTF file, a folder of OBJ files, ICT-FaceKit's folder."""
+"""Rigs by path: glTF and USD files, a folder of OBJ files, ICT-FaceKit's folder."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from pathlib import Path
 
 from torchface.errors import FileFormatError
 from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.io.gltf import read_gltf_rig, write_gltf_rig
 from torchface.io.rigs.ict_facekit import is_ict_folder, load_ict_facekit, region
 from torchface.io.rigs.rig_folder import load_obj_folder, save_obj_folder
+from torchface.io.scenes.weight_keys import WeightKeys
+from torchface.io.usd import USD_ENDINGS, read_usd_rig, require_usd, write_usd_rig
 from torchface.rig import BlendshapeRig
+
+GLTF_ENDINGS = (".glb", ".gltf")
+SCENE_ENDINGS = (*GLTF_ENDINGS, *USD_ENDINGS)
+"""Files that may hold a rig, or a mesh without shapes."""
+_WRITTEN = ", ".join((".glb", *USD_ENDINGS))
 
 
 def load_rig(
@@ -23,9 +31,11 @@ def load_rig(
     """A rig in millimetres from where its authors left it.
 
     Args:
-        path: a ``.glb`` or ``.gltf`` with morph targets; ICT-FaceKit's ``FaceXModel`` folder; or a folder of OBJ files,
-            one of them neutral, every other a shape of its file's name.
-        unit: ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, centimetres for ICT, millimetres for OBJ.
+        path: a ``.glb`` or ``.gltf`` with morph targets; a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` with blend
+            shapes; ICT-FaceKit's ``FaceXModel`` folder; or a folder of OBJ files, one of them neutral, every other a
+            shape of its file's name.
+        unit: ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD, centimetres for
+            ICT, millimetres for OBJ.
         part: keep this annotated region only, such as ``"face"`` of an ICT head.
         shapes: keep these, in this order; all (for ICT the 53 expressions) if absent.
         neutral: the name of the neutral's file in an OBJ folder; if absent the one with "neutral" in it.
@@ -34,38 +44,73 @@ def load_rig(
         FileFormatError: the path is missing or none of these, or a file is broken; the message names it.
         NameMismatchError: a shape or part that is not there.
         TopologyError: shapes of different vertex counts or faces.
+        MissingExtraError: USD, and usd-core is not installed.
     """
     path = Path(path)
     if path.is_dir():
         if is_ict_folder(path) and neutral is None:
             return load_ict_facekit(path, shapes, part, unit)
         rig = load_obj_folder(path, unit or "mm", neutral)
-    elif path.suffix.lower() in (".glb", ".gltf") or not path.exists():
+    elif path.suffix.lower() in USD_ENDINGS:
+        rig = read_usd_rig(path, unit)
+    elif path.suffix.lower() in GLTF_ENDINGS or not path.exists():
         rig = read_gltf_rig(path, unit or "m")
     else:
-        raise FileFormatError(f"{path}: found a file that is no .glb or .gltf, expected one, or a folder of OBJ files")
+        raise FileFormatError(
+            f"{path}: found a file that is no {', '.join(SCENE_ENDINGS)}, expected one, or a folder of OBJ files"
+        )
     rig = rig if shapes is None else rig.select(shapes)
     return rig if part is None else rig.part(region(rig.neutral, part))
 
 
-def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | None = None) -> None:
+def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None = None) -> None:
     """Writes a rig for other programs, and so that ``load_rig`` gives the same one.
 
     Args:
         rig: the rig.
-        path: a ``.glb``, see ``torchface.io.gltf``; or a name without an ending, for a folder of ``neutral.obj`` and
-            an OBJ a shape, see ``save_obj_folder``. It appears only when it is complete.
-        detail: wrinkle maps of its shapes.
+        path: a ``.glb``, see ``torchface.io.gltf``; a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``, see
+            ``torchface.io.usd``; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape, see
+            ``save_obj_folder``. It appears only when it is complete.
+        detail: wrinkle maps of its shapes, which USD has no place for, or of its regions, for ``.glb`` alone.
 
     Raises:
         FileFormatError: another ending, a folder that holds another rig, or one that cannot be written to.
-        TopologyError: for a ``.glb`` the mesh has no triangle, or wrinkle maps and no texture coordinates.
+        TopologyError: for a file the mesh has no triangle, or wrinkle maps and no texture coordinates.
         NameMismatchError: a wrinkle map belongs to no shape of the rig, or a shape's name is no file's name.
+        MissingExtraError: USD, and usd-core is not installed.
     """
+    write_rig(rig, path, detail, None)
+
+
+def write_rig(
+    rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None, keys: WeightKeys | None
+) -> None:
+    """Writes a rig, with ``keys`` as the animation of its shapes; see :func:`save_rig`."""
+    check_rig_ending(path, detail is not None)
     suffix = Path(path).suffix.lower()
     if suffix == ".glb":
-        write_gltf_rig(rig, path, detail)
-    elif suffix == "":
-        save_obj_folder(rig, path, detail)
+        write_gltf_rig(rig, path, detail, keys)
+    elif suffix in USD_ENDINGS:
+        write_usd_rig(rig, path, keys)
+    elif isinstance(detail, RegionMaps):
+        raise FileFormatError(f"{path}: found wrinkle maps by region for a folder of OBJ files, expected .glb for them")
     else:
-        raise FileFormatError(f"{path}: found the ending {suffix!r}, expected .glb, or none for a folder of OBJ files")
+        save_obj_folder(rig, path, detail)
+
+
+def check_rig_ending(path: str | Path, has_detail: bool = False) -> None:
+    """Refuses what no rig can be written to.
+
+    Raises:
+        FileFormatError: another ending; or USD, and there are wrinkle maps.
+        MissingExtraError: USD, and usd-core is not installed.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".glb", "", *USD_ENDINGS):
+        raise FileFormatError(
+            f"{path}: found the ending {suffix!r}, expected {_WRITTEN}, or none for a folder of OBJ files"
+        )
+    if suffix in USD_ENDINGS:
+        require_usd()
+        if has_detail:
+            raise FileFormatError(f"{path}: found wrinkle maps for a USD file, expected .glb or a folder for them")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io import load_detail_maps, load_rig, save_animation, save_rig
+from torchface.io import load_detail_maps, load_mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.part_colors.eyes import eye_centre
 from torchface.io.gltf.part_colors.lashes import painted_lashes
@@ -288,6 +288,16 @@ def test_without_regions_a_mesh_stays_one_primitive(tmp_path: Path) -> None:
     save_rig(bare, tmp_path / "bare.glb")
     assert len(Written(tmp_path / "bare.glb").root["meshes"][0]["primitives"]) == 1
     assert torch.equal(load_rig(tmp_path / "bare.glb").neutral.faces, rig.neutral.faces)
+
+
+def test_an_eyeball_of_shells_too_coarse_for_a_cornea_is_written(tmp_path: Path) -> None:
+    shells = [trimesh.creation.icosphere(subdivisions=0, radius=radius) for radius in (12.0, 11.0)]
+    skin = trimesh.Trimesh([[50, 0, 0], [60, 0, 0], [50, 10, 0]], [[0, 1, 2]])
+    whole = trimesh.util.concatenate([*shells, skin])
+    notes = Annotations(regions={"eyeball_left": torch.arange(len(whole.vertices)) < 24})
+    mesh = Mesh(torch.tensor(whole.vertices).float(), torch.tensor(whole.faces).long(), annotations=notes)
+    save_mesh(mesh, tmp_path / "eye.glb")
+    assert torch.equal(load_mesh(tmp_path / "eye.glb").faces, mesh.faces)
 
 
 def test_parts_that_another_program_edited_are_still_read(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rig_samples import quad_sheet, sheet_rig, sheet_take
+from rig_samples import corrective_sheet, quad_sheet, sheet_rig, sheet_take
 from test_gltf_parts import head
 
 from torchface.geometry.meshes.normal_maps import DetailMaps
@@ -75,6 +75,18 @@ def test_a_small_rig_is_valid_and_moves_alike_in_three(node: str, tmp_path: Path
     seen = run(node, "load.mjs", tmp_path / "rig.glb")
     assert seen["meshes"][0]["textured"]
     assert seen["pictures"] == 1
+
+
+def test_three_plays_correctives_as_the_rig_does(node: str, tmp_path: Path) -> None:
+    rig = corrective_sheet()
+    assert rig.activation is not None
+    save_rig(rig, tmp_path / "rig.glb")
+    assert_valid(node, tmp_path / "rig.glb")
+    weights = torch.tensor([[0.5, 0.25, 1.0]])
+    every = torch.cat([weights, rig.activation(weights)], 1)[0]
+    seen = run(node, "load.mjs", tmp_path / "rig.glb", *[f"{weight:.9g}" for weight in every.tolist()])["meshes"]
+    corners = np.array(seen[0]["positions"]).reshape(-1, 3)[np.array(seen[0]["indices"]).reshape(-1, 3)]
+    assert np.abs(corners - rig(weights)[0][rig.neutral.faces].numpy() / 1000).max() < 1e-5
 
 
 def assert_parts_are_valid_and_three_moves_them(node: str, path: Path, rig: BlendshapeRig) -> None:

@@ -104,14 +104,15 @@ def blend_normal_maps(maps: Tensor, weights: Tensor, neutral: Tensor | None = No
     if rest is None:
         if neutral is None:
             raise ShapeError("blend_normal_maps: found no map, expected at least one or a neutral's")
-        rest = _slopes(neutral)
+        rest = normal_slopes(neutral)
     total = rest * (1 - weights.sum().to(rest))
     for i in weights.nonzero()[:, 0].tolist():  # a loop over shapes: all at once would take gigabytes at 4096 squared
-        total = total + weights[i].to(rest) * _slopes(maps[i])
+        total = total + weights[i].to(rest) * normal_slopes(maps[i])
     return torch.nn.functional.normalize(torch.cat([total, torch.ones_like(total[:1])]), dim=0)
 
 
-def _slopes(normals: Tensor) -> Tensor:
+def normal_slopes(normals: Tensor) -> Tensor:
+    """Slopes (2,H,W) of the heights that unit vectors (3,H,W) are the normals of; (...,H,W) alike."""
     return normals[:2] / normals[2:].clamp(min=_MIN_Z)
 
 

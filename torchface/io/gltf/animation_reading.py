@@ -9,16 +9,12 @@ import numpy as np
 import torch
 
 from torchface.io.gltf.accessors import read_floats
-from torchface.io.gltf.container import Document, read_document, shown
+from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.primitive_reading import read_target_names
-from torchface.io.tables.frame_rates import simplest_rate
-from torchface.io.tables.numbered_csv import DEFAULT_RATE
-from torchface.number_checks import MAX_FPS, MIN_FPS
+from torchface.io.tables.frame_rates import rate_of_keys
 from torchface.take import Take, Track
 
-_UNEVEN = 0.01
-# Cameras drop a few frames in a row. Keys further apart are poses that a program blends: baked, they are frames.
-_LONGEST_GAP = 10.0
 _CUBIC = "CUBICSPLINE"
 
 
@@ -30,7 +26,8 @@ def read_gltf_weights(path: str | Path) -> Take | None:
 
     Returns:
         weights (T,N,1), by the names of the morph targets. Of several meshes with a shape of one name the first's
-        weights count. Frames that come unevenly have their times in ``extras["seconds"]``, from 0.
+        weights count; correctives follow the others and are left out. Frames that come unevenly have their times in
+        ``extras["seconds"]``, from 0.
 
     Raises:
         FileFormatError: not glTF 2, broken, or keys that are no frames: out of order, or with gaps of ten frames.
@@ -42,6 +39,7 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     weights: dict[str, np.ndarray] = {}
     times: np.ndarray | None = None
     meshes: set[int] = set()
+    followers = {corrective.name for corrective in scene_correctives(document)}
     for number, row in enumerate(channels):
         channel = document.record(row, f"{place}.channels[{number}]")
         target = document.record(channel.get("target"), f"{place}.channels[{number}].target")
@@ -57,11 +55,12 @@ def read_gltf_weights(path: str | Path) -> Take | None:
             raise document.error(f"{place}.channels[{number}]", "keys at other times", "those of the first channel")
         times = here
         for name, column in zip(names, values.T, strict=True):
-            weights.setdefault(name, column)
-    if times is None:
+            if name not in followers:
+                weights.setdefault(name, column)
+    if times is None or not weights:
         return None
     stacked = np.stack(list(weights.values()), axis=1)
-    rate, seconds = _rate(document, times)
+    rate, seconds = rate_of_keys(times, lambda found, expected: document.error(place, found, expected))
     extras = {} if seconds is None else {"seconds": seconds}
     return Take(rate, weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]), extras=extras)
 
@@ -86,24 +85,3 @@ def _channel(
     if len(times) == 0:
         raise document.error(f"{place}.input", "no key", "at least one")
     return times, names, values
-
-
-def _rate(document: Document, times: np.ndarray) -> tuple[float, torch.Tensor | None]:
-    """Frames a second, and when each is shown, (T,), if they come unevenly; keys are rounded to single precision."""
-    if len(times) == 1:
-        return DEFAULT_RATE, None
-    steps = np.diff(times.astype(np.float64))
-    usual = float(np.median(steps))
-    if not (steps.min() > 0 and steps.max() <= _LONGEST_GAP * usual):
-        worst = float(steps.min() if not steps.min() > 0 else steps.max())
-        found = f"keys {shown(worst)} s apart, the median being {usual:.6f}"
-        expected = f"frames, rising and at most {_LONGEST_GAP:.0f} steps apart: bake the animation"
-        raise document.error("animations[0]", found, expected)
-    step = (float(times[-1]) - float(times[0])) / (len(times) - 1)
-    even = bool(np.abs(steps - step).max() <= _UNEVEN * step)
-    slack = 2 * float(np.spacing(np.float32(times[-1])))
-    step = step if even else usual
-    rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
-    if not MIN_FPS <= rate <= MAX_FPS:
-        raise document.error("animations[0]", f"{rate:.4g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
-    return rate, None if even else torch.from_numpy(times.astype(np.float64) - float(times[0]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.mesh_extras import read_annotations, read_order, read_polygons
 from torchface.io.gltf.part_joining import rejoined
 from torchface.io.gltf.primitive_reading import BYTES_A_CORNER, BYTES_A_VERTEX, Part, read_part
@@ -21,7 +20,8 @@ from torchface.io.gltf.scene import Instance, instances
 from torchface.io.gltf.seam_welding import weld
 from torchface.io.images.image_files import decode_image
 from torchface.io.length_units import millimetres_per
-from torchface.mesh import Annotations, Mesh
+from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
+from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
 
@@ -29,7 +29,8 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
     """The rig in a glTF file: every mesh of the scene, moved by its node, morph targets joined by name.
 
     Names come from ``mesh.extras.targetNames``, where Blender and three.js write and look for them; without they are
-    ``target_0`` and so on. A scene of several meshes gets a region a node. Vertices split at seams become one again.
+    ``target_0`` and so on; those that the file calls correctives become those. A scene of several meshes gets a region
+    a node. Vertices split at seams become one again.
 
     Args:
         path: a ``.glb`` or ``.gltf``.
@@ -44,7 +45,7 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
         count = len(document.objects("meshes"))
         meshes = f"its {count} meshes" if count != 1 else "its one mesh"
         raise FileFormatError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
-    return BlendshapeRig(neutral, deltas, names)
+    return rig_of_targets(document, neutral, deltas, names, scene_correctives(document))
 
 
 def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
@@ -57,22 +58,6 @@ def read_gltf_mesh(path: str | Path, unit: str = "m") -> Mesh:
 
 
 _AT_ONCE = 2**20  # numbers
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """An instance in millimetres, with its vertices welded."""
-
-    name: str
-    vertices: Tensor
-    faces: Tensor
-    uvs: Tensor | None
-    uv_faces: Tensor | None
-    colors: Tensor | None
-    polygons: Tensor | None
-    annotations: Annotations | None
-    deltas: Tensor
-    names: tuple[str, ...]
 
 
 def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ...]]:
@@ -92,22 +77,12 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
     pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
     texture = next((part.texture for _, part in found if part.texture is not None), None)
     del parts, found, part, whole  # their shapes fit the memory once, not twice
-    names = tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
-    total = sum(len(piece.vertices) for piece in pieces)
     image = None if texture is None else read_texture(document, texture)
-    if len(pieces) == 1:
-        return _join(pieces, image), pieces[0].deltas, names
-    document.reserve((12 * len(names) + len(pieces)) * total, "the scene's morph targets")
-    deltas = torch.zeros(len(names), total, 3)
-    row = {name: i for i, name in enumerate(names)}
-    first = 0
-    for piece in pieces:
-        deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
-        first += len(piece.vertices)
-    return _join(pieces, image), deltas, names
+    document.reserve(joined_size(pieces), "the scene's morph targets")
+    return join_meshes(pieces, image), join_deltas(pieces), all_names(pieces)
 
 
-def _piece(document: Document, instance: Instance, part: Part, scale: float) -> _Piece:
+def _piece(document: Document, instance: Instance, part: Part, scale: float) -> Piece:
     place = f"meshes[{instance.mesh}].extras.torchface"
     joined = weld(part)
     linear, translation = instance.transform[:3, :3] * scale, instance.transform[:3, 3] * scale
@@ -127,7 +102,7 @@ def _piece(document: Document, instance: Instance, part: Part, scale: float) -> 
     uvs = uv_faces = None
     if part.uvs is not None:
         uvs, uv_faces = _texture_coordinates(part.uvs, joined.vertex_of, triangles)
-    return _Piece(
+    return Piece(
         instance.name,
         torch.from_numpy(vertices),
         torch.from_numpy(np.ascontiguousarray(faces)),
@@ -157,33 +132,6 @@ def _moved(
 ) -> NDArray[np.float32]:
     with np.errstate(over="ignore", invalid="ignore"):
         return (points @ linear.T + translation).astype(np.float32)
-
-
-def _join(pieces: list[_Piece], texture: Tensor | None) -> Mesh:
-    """One mesh of all; of several, polygons stay only for a single piece, and each piece becomes a region."""
-    if len(pieces) == 1:
-        one = pieces[0]
-        return Mesh(one.vertices, one.faces, one.uvs, one.uv_faces, one.colors, texture, one.polygons, one.annotations)
-    counts = [len(piece.vertices) for piece in pieces]
-    faces = torch.cat([piece.faces + first for piece, first in zip(pieces, _starts(counts), strict=True)])
-    uvs = uv_faces = colors = None
-    if any(piece.uvs is not None for piece in pieces):
-        sets = [torch.zeros(1, 2) if piece.uvs is None else piece.uvs for piece in pieces]
-        rows = [torch.zeros_like(piece.faces) if piece.uv_faces is None else piece.uv_faces for piece in pieces]
-        uvs = torch.cat(sets)
-        uv_faces = torch.cat([row + first for row, first in zip(rows, _starts(list(map(len, sets))), strict=True)])
-    if any(piece.colors is not None for piece in pieces):
-        colors = torch.cat([torch.ones_like(p.vertices) if p.colors is None else p.colors for p in pieces])
-    regions: dict[str, Tensor] = {}
-    owner = torch.repeat_interleave(torch.arange(len(pieces)), torch.tensor(counts))
-    for i, piece in enumerate(pieces):
-        regions[piece.name] = regions.get(piece.name, torch.zeros(len(owner), dtype=torch.bool)) | (owner == i)
-    vertices = torch.cat([piece.vertices for piece in pieces])
-    return Mesh(vertices, faces, uvs, uv_faces, colors, texture, annotations=Annotations(regions=regions))
-
-
-def _starts(counts: list[int]) -> list[int]:
-    return [0, *accumulate(counts[:-1])]
 
 
 def read_texture(document: Document, index: int) -> Tensor | None:

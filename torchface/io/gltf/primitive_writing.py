@@ -38,7 +38,7 @@ class PrimitiveWriter:
         self, mesh: Mesh, split: Split, buffers: BufferWriter, tangents: NDArray[np.float32] | None = None
     ) -> None:
         self.mesh, self.split, self.buffers, self.tangents = mesh, split, buffers, tangents
-        self.normals = _normals(mesh.vertices.detach().double(), mesh.faces)
+        self.normals = shading_normals(mesh.vertices.detach().double(), mesh.faces)
         self._written: list[tuple[dict[str, Any], NDArray[np.int64]]] = []
 
     def add(self, surface: Surface, material: int, origin: Tensor) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class PrimitiveWriter:
         """Morph targets (N,V,3), millimetres, for all primitives: positions and normals."""
         rest = self.mesh.vertices.detach().double()
         for delta in deltas.detach().cpu().double():  # one shape at a time: all normals at once would fill the memory
-            rotated = (_normals(rest + delta, self.mesh.faces) - self.normals).float().numpy()
+            rotated = (shading_normals(rest + delta, self.mesh.faces) - self.normals).float().numpy()
             rotated *= np.einsum("ij,ij->i", rotated, rotated)[:, None] >= MIN_ROTATION * MIN_ROTATION
             moved = delta.float().numpy()
             moved = moved * (np.einsum("ij,ij->i", moved, moved)[:, None] >= MIN_MOVE * MIN_MOVE)
@@ -115,7 +115,8 @@ def metres(millimetres: NDArray[Any]) -> NDArray[np.float32]:
     return (millimetres / np.float64(millimetres_per("m"))).astype(np.float32)
 
 
-def _normals(vertices: Tensor, faces: Tensor) -> Tensor:
+def shading_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals (V,3), also where a vertex is loose or its triangles have no area."""
     normals = vertex_normals(vertices, faces)
     normals[normals.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0], dtype=normals.dtype)  # loose, or without area
     return normals

@@ -85,14 +85,11 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
     names = [_name(document, entry, i) for i, entry in enumerate(listed)]
     if len(set(names)) != len(names):
         raise document.error(f"extras.torchface.{_LIST}", names, "each shape once")
-    unpacked, allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
+    reader = TextureReader(document, path)
     found: list[Tensor] = []
-    neutral = _normal_texture(document, mesh)
+    neutral = normal_texture(document, mesh)
     for index in ([] if neutral is None else [neutral]) + [entry.get("texture") for entry in listed]:
-        image = _image(document, index)
-        unpacked += image.numel() * 4
-        if unpacked > allowed:
-            raise document.error(_LIST, f"maps that unpack to {unpacked} bytes", f"at most {allowed}")
+        image = reader.read(index, _LIST)
         if found and image.shape != found[0].shape:
             raise document.error(_LIST, f"maps of {tuple(image.shape[1:])} and {tuple(found[0].shape[1:])}", "one size")
         found.append(decode_normals(image))
@@ -105,15 +102,23 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
 
 def _listed(document: Document) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The list of the first mesh that has one, and that mesh; else the first mesh."""
-    meshes = document.objects("meshes")
-    for i, mesh in enumerate(meshes):
+    found = list_of_first_mesh(document, _LIST)
+    if found is None:
+        meshes = document.objects("meshes")
+        return [], meshes[0] if meshes else {}
+    mesh, place = found
+    rows = document.array(mesh["extras"]["torchface"], _LIST, place.removesuffix(f".{_LIST}"))
+    return [document.record(row, f"{place}[{k}]") for k, row in enumerate(rows)], mesh
+
+
+def list_of_first_mesh(document: Document, key: str) -> tuple[dict[str, Any], str] | None:
+    """The first mesh whose ``extras.torchface`` holds something under a key, and that place in words."""
+    for i, mesh in enumerate(document.objects("meshes")):
         extras = mesh.get("extras")
         ours = extras.get("torchface") if isinstance(extras, dict) else None
-        if isinstance(ours, dict) and ours.get(_LIST):
-            place = f"meshes[{i}].extras.torchface"
-            rows = document.array(ours, _LIST, place)
-            return [document.record(row, f"{place}.{_LIST}[{k}]") for k, row in enumerate(rows)], mesh
-    return [], meshes[0] if meshes else {}
+        if isinstance(ours, dict) and ours.get(key):
+            return mesh, f"meshes[{i}].extras.torchface.{key}"
+    return None
 
 
 def _name(document: Document, entry: dict[str, Any], index: int) -> str:
@@ -123,7 +128,8 @@ def _name(document: Document, entry: dict[str, Any], index: int) -> str:
     return name
 
 
-def _normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
+def normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
+    """The index of the first normal texture among a mesh's materials."""
     for i, row in enumerate(document.array(mesh, "primitives", "mesh")):
         primitive = document.record(row, f"primitives[{i}]")
         if primitive.get("material") is not None:
@@ -134,10 +140,30 @@ def _normal_texture(document: Document, mesh: dict[str, Any]) -> int | None:
     return None
 
 
-def _image(document: Document, index: object) -> Tensor:
-    document.item("textures", index, f"{_LIST}.texture")
-    assert isinstance(index, int)
-    image = read_texture(document, index)
-    if image is None:
-        raise document.error(f"textures[{index}]", "no source", "a PNG or JPEG")
-    return image
+class TextureReader:
+    """Reads a file's textures, as long as they unpack to no more than such a file can hold.
+
+    Args:
+        document: of the file.
+        path: the file.
+    """
+
+    def __init__(self, document: Document, path: str | Path) -> None:
+        self._document = document
+        self._unpacked, self._allowed = 0, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
+
+    def read(self, index: object, place: str) -> Tensor:
+        """An image (3,H,W) in [0,1].
+
+        Raises:
+            FileFormatError: there is no such texture, or it is one too many.
+        """
+        self._document.item("textures", index, f"{place}.texture")
+        assert isinstance(index, int)
+        image = read_texture(self._document, index)
+        if image is None:
+            raise self._document.error(f"textures[{index}]", "no source", "a PNG or JPEG")
+        self._unpacked += image.numel() * 4
+        if self._unpacked > self._allowed:
+            raise self._document.error(place, f"maps that unpack to {self._unpacked} bytes", f"at most {self._allowed}")
+        return image

@@ -13,6 +13,7 @@ from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.container import Document
+from torchface.io.gltf.corrective_extras import all_targets, read_correctives, rig_of_targets, write_correctives
 from torchface.io.gltf.mesh_extras import read_annotations, write_extras
 from torchface.io.images.normal_map_files import save_normal_map
 from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices, write_obj, write_obj_shapes
@@ -57,13 +58,16 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
         names = list(dict.fromkeys([*(name for name in listed if name in files), *files]))
         mesh = replace(mesh, annotations=read_annotations(notes, notes.root.get("mesh"), "mesh", len(mesh.vertices)))
     deltas = [read_obj_vertices(files[name], mesh, topology, unit) - mesh.vertices for name in names]
-    return BlendshapeRig(mesh, torch.stack(deltas), tuple(names))
+    if notes is None:
+        return BlendshapeRig(mesh, torch.stack(deltas), tuple(names))
+    return rig_of_targets(notes, mesh, torch.stack(deltas), names, read_correctives(notes, notes.root, "document"))
 
 
 def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps | None = None) -> None:
     """Writes ``neutral.obj`` and an OBJ a shape, in millimetres, vertices and polygons in the rig's own order.
 
-    Landmarks, regions, the mirror map and the order of the shapes are in ``rig.json``; the texture lies beside the
+    Landmarks, regions, the mirror map, the order of the shapes and when correctives act are in ``rig.json``; a
+    corrective's OBJ is the neutral with its delta alone. The texture lies beside the
     neutral, wrinkle maps are called ``<shape>_normals.png``. ``load_obj_folder`` gives the same rig.
 
     Args:
@@ -88,11 +92,14 @@ def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps |
 def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
     mesh = rig.neutral.to("cpu")
     write_obj(mesh, folder / f"{NEUTRAL}.obj")
-    moved = ((name, mesh.vertices + delta.cpu()) for name, delta in zip(rig.names, rig.deltas, strict=True))
+    deltas, names = all_targets(rig)
+    moved = ((name, mesh.vertices + delta.cpu()) for name, delta in zip(names, deltas, strict=True))
     write_obj_shapes(mesh, moved, folder / f"{NEUTRAL}.obj")
     notes = write_extras(mesh)
     notes.pop("polygons", None)  # the OBJ files have them
-    write_json(folder / NOTES, {"shapes": list(rig.names), "mesh": notes}, indent=None)
+    correctives = () if rig.correctives is None else rig.correctives.definitions
+    found = {"shapes": list(names), "mesh": notes, **write_correctives(correctives)}
+    write_json(folder / NOTES, found, indent=None)
     if detail is not None:
         maps: list[tuple[str, Any]] = list(zip(detail.names, detail.maps, strict=True))
         maps += [] if detail.neutral is None else [(NEUTRAL, detail.neutral)]
@@ -102,11 +109,12 @@ def _write(rig: BlendshapeRig, folder: Path, detail: DetailMaps | None) -> None:
 
 def _check_names(rig: BlendshapeRig, folder: Path) -> None:
     """Refuses shapes whose names make no files, and a folder in which other shapes would mix with these."""
-    for name in rig.names:
+    names = (*rig.names, *(() if rig.correctives is None else rig.correctives.names))
+    for name in names:
         if not name or Path(name).name != name or name.startswith(".") or "\0" in name or name.lower() == NEUTRAL:
             raise NameMismatchError(f"{folder}: found a shape {name!r}, expected file names; write a .glb instead")
     there = [path.name for path in folder.glob("*.obj")] if folder.is_dir() else []
-    others = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *rig.names)]
+    others = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *names)]
     if others:
         raise FileFormatError(
             f"{folder}: found OBJ files of another rig ({', '.join(others[:3])}), expected an empty or a new folder"

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from torchface.errors import FileFormatError
+from torchface.number_checks import MAX_FPS, MIN_FPS
 from torchface.take import Take
 
 COMMON_RATES = (
@@ -19,7 +20,13 @@ COMMON_RATES = (
 )
 """Rates that cameras run at."""
 
+DEFAULT_RATE = 60.0
+"""Frames a second of a file of one frame at time 0, from which none follows."""
+
 _MAX_FRAME_NUMBER = 2**32 - 1
+_UNEVEN = 0.01
+# Cameras drop a few frames in a row. Keys further apart are poses that a program blends: baked, they are frames.
+_LONGEST_GAP = 10.0
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
@@ -34,6 +41,37 @@ def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
     usual = sorted(COMMON_RATES, key=lambda other: abs(other - rate))[:2]
     fractions = [float(Fraction(rate).limit_denominator(largest)) for largest in (1, 10, 1001)]
     return next((candidate for candidate in (*usual, *fractions) if candidate > 0 and agrees(candidate)), rate)
+
+
+def rate_of_keys(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> tuple[float, torch.Tensor | None]:
+    """Frames a second of an animation's keys at ``times`` (T,), seconds in single precision; and when each is shown,
+    (T,) from 0, where they come unevenly.
+
+    Args:
+        times: of the keys.
+        error: makes an error of what was found and what was expected.
+
+    Raises:
+        FileFormatError: keys out of order, with gaps of ten frames, or at a rate that no film has.
+    """
+    if len(times) == 1:
+        return DEFAULT_RATE, None
+    steps = np.diff(times.astype(np.float64))
+    usual = float(np.median(steps))
+    if not (steps.min() > 0 and steps.max() <= _LONGEST_GAP * usual):
+        worst = float(steps.min() if not steps.min() > 0 else steps.max())
+        raise error(
+            f"keys {worst} s apart, the median being {usual:.6f}",
+            f"frames, rising and at most {_LONGEST_GAP:.0f} steps apart: bake the animation",
+        )
+    step = (float(times[-1]) - float(times[0])) / (len(times) - 1)
+    even = bool(np.abs(steps - step).max() <= _UNEVEN * step)
+    slack = 2 * float(np.spacing(np.float32(times[-1])))
+    step = step if even else usual
+    rate = simplest_rate(1 / step, lambda other: abs((len(times) - 1) * (1 / other - step)) <= slack)
+    if not MIN_FPS <= rate <= MAX_FPS:
+        raise error(f"{rate:.4g} frames a second", f"{MIN_FPS} to {MAX_FPS:.0f}")
+    return rate, None if even else torch.from_numpy(times.astype(np.float64) - float(times[0]))
 
 
 def frame_gaps(steps: np.ndarray) -> tuple[tuple[int, int], ...]:

@@ -10,14 +10,11 @@ import numpy as np
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.csv_table import Table, TableReader, number_texts, write_table
-from torchface.io.tables.frame_rates import frame_numbers, numbering_extras, simplest_rate
+from torchface.io.tables.frame_rates import DEFAULT_RATE, frame_numbers, numbering_extras, simplest_rate
 from torchface.number_checks import check_rate
 from torchface.take import Take
 
 COLUMNS = ("frame", "time")
-DEFAULT_RATE = 60.0
-"""Frames a second of a file of one frame at time 0, from which none follows."""
-
 _FULL, _MILLISECONDS = 1e-9, 1e-3
 
 

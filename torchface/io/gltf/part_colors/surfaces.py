@@ -68,7 +68,7 @@ def surfaces(mesh: Mesh, has_image: bool) -> list[Surface]:
             found.append(Surface(triangles, material, "texture", part))
         elif material is EYEBALL:
             layers = painted_eye(mesh, triangles)
-            found += [Surface(rows, made, "material", part, paint) for rows, made, paint in layers]
+            found += [Surface(rows, made, "material", part, paint) for rows, made, paint in layers if len(rows)]
         else:
             paint = painted_lashes(mesh, triangles, material) if material is EYELASHES else None
             found.append(Surface(triangles, material, "material", part, paint))

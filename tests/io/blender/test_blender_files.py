@@ -1,0 +1,88 @@
+"""Without Blender: what runs it, and what is said where it is missing or fails."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from rig_samples import corrective_sheet, sheet_rig
+
+from torchface.cli import main
+from torchface.errors import FileFormatError, MissingExtraError
+from torchface.io import load_rig, save_mesh, save_rig
+from torchface.io.blender import blender_command, read_blender_file, write_blender_file
+from torchface.io.blender.blender_files import PROGRAM
+
+
+def program(path: Path, text: str) -> Path:
+    """A stand-in for Blender."""
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without Blender."""
+    monkeypatch.delenv(PROGRAM, raising=False)
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else found(name))
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+
+
+@pytest.mark.usefixtures("nothing")
+def test_without_blender_the_ways_to_have_it_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MissingExtraError, match=rf"neither bpy nor Blender.*{PROGRAM}.*pip install '\.\[blender\]'"):
+        read_blender_file(tmp_path / "rig.fbx")
+    save_rig(sheet_rig(), tmp_path / "rig.glb")
+    with pytest.raises(SystemExit) as ended:
+        main(["convert", str(tmp_path / "rig.glb"), str(tmp_path / "rig.fbx")])
+    assert ended.value.code == 2
+    assert "neither bpy nor Blender" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_program_that_is_named_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    blender = program(tmp_path / "blender-4.5", "exit 0")
+    monkeypatch.setenv(PROGRAM, str(blender))
+    assert blender_command()[:2] == [str(blender), "--background"]
+    assert blender_command()[-1] == "--"
+    monkeypatch.setenv(PROGRAM, sys.executable)
+    assert blender_command()[:2] == [sys.executable, "-I"]
+    monkeypatch.setenv(PROGRAM, str(tmp_path / "gone"))
+    with pytest.raises(MissingExtraError, match=r"found no program .*gone"):
+        blender_command()
+
+
+def test_a_blender_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(PROGRAM, str(program(tmp_path / "blender", "echo it broke; exit 7")))
+    (tmp_path / "rig.fbx").write_bytes(b"Kaydara")
+    with pytest.raises(FileFormatError, match=r"rig\.fbx: Blender ended with status 7 \(it broke\)"):
+        read_blender_file(tmp_path / "rig.fbx")
+    monkeypatch.setenv(PROGRAM, str(program(tmp_path / "blender", "kill -SEGV $$")))
+    with pytest.raises(FileFormatError, match="Blender ended with SIGSEGV"):
+        write_blender_file(sheet_rig(), tmp_path / "new.fbx")
+    monkeypatch.setenv(PROGRAM, str(program(tmp_path / "blender", "exit 0")))
+    with pytest.raises(FileFormatError, match="Blender wrote nothing"):
+        write_blender_file(sheet_rig(), tmp_path / "new.fbx")
+    with pytest.raises(FileFormatError, match="correctives, which shape keys cannot hold"):
+        write_blender_file(corrective_sheet(), tmp_path / "new.fbx")
+    assert not (tmp_path / "new.fbx").exists()
+
+
+def test_files_are_converted_without_blender_where_it_is_not_needed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = sheet_rig()
+    save_rig(rig, tmp_path / "rig.glb")
+    main(["convert", str(tmp_path / "rig.glb"), str(tmp_path / "folder"), "--part", "lower"])
+    assert "3 shapes, 12 vertices" in capsys.readouterr().err
+    assert load_rig(tmp_path / "folder").names == rig.names
+    save_mesh(rig.neutral, tmp_path / "scan.obj")
+    main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "scan.ply")])
+    assert "0 shapes, 30 vertices" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["convert", str(tmp_path / "scan.obj"), str(tmp_path / "other")])
+    assert "found a mesh without shapes, expected a rig" in " ".join(capsys.readouterr().err.split())

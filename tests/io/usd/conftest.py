@@ -1,0 +1,3 @@
+from reading_here import same_process
+
+__all__ = ["same_process"]

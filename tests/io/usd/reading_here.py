@@ -1,0 +1,30 @@
+"""USD files read without a process of their own, which takes half a second each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from torchface.errors import FileFormatError
+from torchface.io.scene_processes.scene_arrays import Scene
+from torchface.io.usd import stage_process, usd_reading
+
+pytest.importorskip("pxr")
+
+
+def read_here(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:
+    """What ``read_scene`` gives, by the same functions in this process."""
+    try:
+        record, arrays = stage_process.extract(path.absolute(), lambda size: None)
+    except stage_process.Refused as refused:
+        raise FileFormatError(f"{path}: found {refused.found}, expected {refused.expected}") from None
+    return Scene(path, json.loads(json.dumps(record)), arrays)
+
+
+@pytest.fixture
+def same_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reads USD files in this process."""
+    monkeypatch.setattr(usd_reading, "read_scene", read_here)

@@ -1,0 +1,45 @@
+"""``torchface convert``: a rig with its animation, or a mesh, as another kind of file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
+
+
+def convert(
+    source: Annotated[Positional[Path], arg(metavar="FILE")],
+    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    unit: str | None = None,
+    part: str | None = None,
+    names: Literal["arkit"] | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write a rig with its animation, or a mesh, as another kind of file, FBX and Blender's own among them.
+
+    FBX and Blender files go through Blender in a process of its own: the program, or its package bpy
+    (pip install '.[blender]' in a checkout, Python 3.11); TORCHFACE_BLENDER names the one to take, or a Python with
+    bpy. See docs/blender.md.
+
+    Args:
+        source: A rig (.glb, .gltf, USD, .fbx, .blend, a folder of OBJ files, ICT-FaceKit's FaceXModel folder) or a mesh
+            (.obj, .ply, .stl, .off).
+        out: .glb, .usda, .usdc, .usd, .usdz, .fbx, .blend, or a name without an ending for a folder of OBJ files; a
+            mesh without shapes also as .obj, .ply, .stl, .off.
+        unit: Unit of FILE (mm, cm, m) where it is not the format's own.
+        part: Keep this region only, such as face.
+        names: Names of the written shapes. "arkit": ARKit's where the rig's mean the same. All keep theirs if absent.
+        quiet: Show no progress.
+    """
+    from torchface.workflows.convert_file import convert_file
+
+    with progress_bars(quiet) as progress:
+        done = convert_file(source, out, unit, part, names, progress)
+    shapes = 0 if done.rig is None else len(done.rig.names)
+    frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.fps:g} a second"
+    console.print(f"{shapes} shapes, {len(done.mesh.vertices):,} vertices{frames}", highlight=False)
+    print_lines(done.notes)
+    print_path(out)

@@ -1,0 +1,122 @@
+"""Wrinkle maps by region in a ``.glb``: the neutral's normals as the material's normal texture, where every viewer
+shows them; the rest as textures that ``mesh.extras.torchface.wrinkleRegions`` lists::
+
+    {"regions": [names], "normals": [texture, one a map], "heights": [texture, ...], "heightRange": [low, high],
+     "masks": [texture, ...]}
+
+Heights and masks come three a texture, in red, green and blue, all values linear. A height is ``low + value * (high -
+low)`` millimetres; normals are as in ``wrinkleMaps``. A texel shows map m by the sum over regions of mask times weight;
+slopes of normals and heights add up so.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.geometry.meshes.normal_maps import decode_normals, encode_normals
+from torchface.geometry.meshes.region_maps import RegionMaps
+from torchface.io.gltf.buffers import BufferWriter
+from torchface.io.gltf.container import Document, read_document
+from torchface.io.gltf.wrinkle_maps import TextureReader, list_of_first_mesh, normal_texture
+from torchface.io.images.image_files import encode_png
+
+_KEY = "wrinkleRegions"
+_LEAST_RANGE = 1e-3  # millimetres
+
+
+def write_region_maps(maps: RegionMaps, root: dict[str, Any], buffers: BufferWriter) -> None:
+    """Adds maps to a document under construction whose first mesh and material are the face's."""
+
+    def texture(image: Tensor, name: str) -> int:
+        return buffers.texture(root, encode_png(image), name=name)
+
+    neutral = texture(encode_normals(maps.neutral), "neutral_normals")
+    root["materials"][0]["normalTexture"] = {"index": neutral}
+    low, high = float(maps.heights.min()), float(maps.heights.max())
+    high = max(high, low + _LEAST_RANGE)
+    root["meshes"][0]["extras"]["torchface"][_KEY] = {
+        "regions": list(maps.regions),
+        "normals": [texture(encode_normals(one), f"wrinkle_{i}_normals") for i, one in enumerate(maps.normals)],
+        "heights": [
+            texture(one, f"wrinkle_heights_{i}") for i, one in enumerate(_packed((maps.heights - low) / (high - low)))
+        ],
+        "heightRange": [low, high],
+        "masks": [texture(one, f"region_masks_{i}") for i, one in enumerate(_packed(maps.masks))],
+    }
+
+
+def load_region_maps(path: str | Path) -> RegionMaps | None:
+    """The wrinkle maps by region of a ``.glb``; none where it has none.
+
+    Raises:
+        FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
+    """
+    document = read_document(path)
+    found = list_of_first_mesh(document, _KEY)
+    if found is None:
+        return None
+    mesh, place = found
+    listed = document.record(mesh["extras"]["torchface"][_KEY], place)
+    regions = document.array(listed, "regions", place)
+    if not regions or not all(isinstance(name, str) and name for name in regions) or len(set(regions)) < len(regions):
+        raise document.error(f"{place}.regions", regions, "names, each once")
+    reader = TextureReader(document, path)
+    neutral = normal_texture(document, mesh)
+    if neutral is None:
+        raise document.error(place, "a material without a normal texture", "the normals of the face at rest in it")
+    normals = _stacked(document, reader, [neutral, *document.array(listed, "normals", place)], f"{place}.normals")
+    count = len(normals) - 1
+    if count < 1:
+        raise document.error(f"{place}.normals", "no map", "one or more")
+    heights = _stacked(document, reader, _textures(document, listed, "heights", count, place), f"{place}.heights")
+    masks = _stacked(document, reader, _textures(document, listed, "masks", len(regions), place), f"{place}.masks")
+    if heights.shape[2:] != normals.shape[2:]:
+        raise document.error(
+            place, f"maps of {tuple(normals.shape[2:])} and heights of {tuple(heights.shape[2:])}", "one size"
+        )
+    low, high = _range(document, listed, place)
+    decoded = torch.stack([decode_normals(one) for one in normals])
+    return RegionMaps(
+        tuple(regions),
+        decoded[1:],
+        low + (high - low) * heights.flatten(0, 1)[:count],
+        masks.flatten(0, 1)[: len(regions)],
+        decoded[0],
+    )
+
+
+def _packed(channels: Tensor) -> list[Tensor]:
+    """Channels (C,H,W) as images (3,H,W), the last filled up with zeros."""
+    missing = -len(channels) % 3
+    return list(torch.cat([channels, channels.new_zeros(missing, *channels.shape[1:])]).unflatten(0, (-1, 3)))
+
+
+def _textures(document: Document, listed: dict[str, Any], key: str, channels: int, place: str) -> list[Any]:
+    """As many textures as hold the channels."""
+    found = document.array(listed, key, place)
+    wanted = math.ceil(channels / 3)
+    if len(found) != wanted:
+        raise document.error(f"{place}.{key}", f"{len(found)} textures", f"{wanted}, three channels each")
+    return found
+
+
+def _stacked(document: Document, reader: TextureReader, indices: list[Any], place: str) -> Tensor:
+    images: list[Tensor] = []
+    for index in indices:
+        image = reader.read(index, place)
+        if images and image.shape != images[0].shape:
+            raise document.error(place, f"{tuple(images[0].shape[1:])} and {tuple(image.shape[1:])}", "one size")
+        images.append(image)
+    return torch.stack(images)
+
+
+def _range(document: Document, listed: dict[str, Any], place: str) -> tuple[float, float]:
+    found = document.numbers(listed, "heightRange", place, 2)
+    if found is None or not found[0] < found[1]:
+        raise document.error(f"{place}.heightRange", found, "two numbers, the lower first, millimetres")
+    return float(found[0]), float(found[1])

@@ -1,0 +1,315 @@
+"""A scene as a process hands it over: records in ``scene.json``, their arrays in ``arrays.npz``.
+
+``scene.json`` holds ``metres_per_unit``, ``up`` (``"Y"`` or ``"Z"``), ``bytes`` of the files read, ``meshes`` and
+``animation``. A mesh has its ``name``, the ``place`` for errors, the ``matrix`` of 16 numbers from its points to the
+scene (for rows), ``notes`` (JSON of ``torchface.io.gltf.mesh_extras`` and ``corrective_extras``) and ``shapes``, with a
+``name`` each and ``between``, its in-betweens, with a ``name`` and a ``weight``. Mesh 0's arrays are ``0/points``
+(V,3), ``0/counts`` (P,), ``0/corners`` (C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light,
+``0/texture``, an encoded image, and for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they
+belong to, if these are not all, and ``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``,
+and the arrays ``animation/times`` (T,), seconds, and ``animation/weights`` (T,N).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchface.color_space import to_srgb
+from torchface.correctives import Corrective
+from torchface.errors import FileFormatError
+from torchface.files.documents import parse_json
+from torchface.io.gltf.container import Document
+from torchface.io.gltf.corrective_extras import read_correctives, rig_of_targets
+from torchface.io.gltf.mesh_extras import read_annotations
+from torchface.io.images.image_files import decode_image
+from torchface.io.length_units import millimetres_per
+from torchface.io.meshes.polygons import pad_polygons
+from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
+from torchface.io.tables.frame_rates import rate_of_keys
+from torchface.mesh import Mesh, fan_triangulation
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+
+_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 32
+_LARGEST = 2**33
+_AXES = {"Y": np.eye(3), "Z": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])}  # for rows: z becomes y, y becomes -z
+_METRES_PER_UNIT = (1e-6, 1e6)
+_KEY, _SAME_PEAK = "\0", 1e-6
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a process found in a file; nothing of it is trusted.
+
+    Args:
+        path: the file, for errors.
+        record: of ``scene.json``.
+        arrays: of ``arrays.npz``.
+    """
+
+    path: Path
+    record: dict[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+
+
+def load_scene(path: Path, folder: Path) -> Scene:
+    """What a process left in ``folder`` of the file ``path``.
+
+    Raises:
+        FileFormatError: it refused the file.
+    """
+    refused = folder / "refused.json"
+    if refused.exists():
+        found, expected = json.loads(refused.read_text())
+        raise FileFormatError(f"{path}: found {found}, expected {expected}")
+    with np.load(folder / "arrays.npz", allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    return Scene(path, json.loads((folder / "scene.json").read_text()), arrays)
+
+
+def scene_rig(scene: Scene, unit: str | None = None) -> BlendshapeRig | None:
+    """All meshes together as a rig, in millimetres, y up; none where nothing has a shape.
+
+    Args:
+        scene: what was found.
+        unit: of the file's numbers; what the file says if absent.
+
+    Raises:
+        FileFormatError: numbers that are NaN, out of range, or that unpack to far more than the file; or correctives
+            that no rig can have.
+    """
+    pieces = _pieces(scene, unit)
+    names = all_names(pieces)
+    if not names:
+        return None
+    definitions, renamed = _definitions(scene, names)
+    document = Document(scene.path, {})
+    named = [renamed.get(name, name) for name in names]
+    return rig_of_targets(document, _mesh(scene, pieces), join_deltas(pieces), named, definitions)
+
+
+def scene_mesh(scene: Scene, unit: str | None = None) -> Mesh:
+    """All meshes together at rest; see :func:`scene_rig`."""
+    return _mesh(scene, _pieces(scene, unit))
+
+
+def _pieces(scene: Scene, unit: str | None) -> list[Piece]:
+    pieces = [_piece(scene, number, unit) for number in range(len(scene.record["meshes"]))]
+    _reserve(scene, joined_size(pieces))
+    return pieces
+
+
+def _mesh(scene: Scene, pieces: list[Piece]) -> Mesh:
+    images = [scene.arrays[name] for i in range(len(pieces)) if (name := f"{i}/texture") in scene.arrays]
+    texture = decode_image(images[0].tobytes(), f"{scene.path}: its texture") if images else None
+    return join_meshes(pieces, texture)
+
+
+def _definitions(scene: Scene, names: Sequence[str]) -> tuple[list[Corrective], dict[str, str]]:
+    """The scene's correctives, and what the keys of in-betweens among ``names`` are called.
+
+    Those that torchface noted come first, in their order; an in-between that nobody noted has its name in the file, or
+    its shape's before it where that is taken.
+    """
+    noted = _noted_correctives(scene)
+    found = [one for one in noted if not one.is_in_between]
+    own = {name: None for name in names if _KEY not in name} | {one.name: None for one in noted}
+    renamed: dict[str, str] = {}
+    between = [(shape["name"], one) for mesh in _named_meshes(scene) for shape in mesh for one in shape["between"]]
+    for driver, one in between:
+        key, peak = _key(driver, one["weight"]), one["weight"]
+        if key in renamed:
+            continue
+        same = [other for other in noted if other.drivers == (driver,) and abs((other.peak or 0.0) - peak) < _SAME_PEAK]
+        if same:
+            renamed[key] = same[0].name
+            found.append(same[0])
+            continue
+        free = next(name for name in _names_to_try(driver, one["name"]) if name not in own)
+        own[free] = None
+        renamed[key] = free
+        found.append(Corrective(free, (driver,), peak))
+    return sorted(found, key=lambda one: noted.index(one) if one in noted else len(noted)), renamed
+
+
+def _names_to_try(driver: str, name: str) -> Iterator[str]:
+    yield name
+    yield f"{driver}_{name}"
+    for number in count(2):
+        yield f"{driver}_{name}_{number}"
+
+
+def _key(driver: str, peak: float) -> str:
+    """What an in-between is called until all meshes are together: no name has such a sign in it."""
+    return f"{driver}{_KEY}{peak:.6f}"
+
+
+def _noted_correctives(scene: Scene) -> tuple[Corrective, ...]:
+    """Those that torchface noted at the first mesh with any."""
+    for mesh in scene.record["meshes"]:
+        if (notes := _notes(mesh)).get("correctives"):
+            return read_correctives(Document(scene.path, {}), notes, mesh["place"])
+    return ()
+
+
+def _named_meshes(scene: Scene) -> list[list[dict[str, Any]]]:
+    """The shapes of each mesh, under the names that they have in the rig."""
+    found = []
+    for mesh in scene.record["meshes"]:
+        names = _names(mesh, [shape["name"] for shape in mesh["shapes"]])
+        found.append([shape | {"name": name} for shape, name in zip(mesh["shapes"], names, strict=True)])
+    return found
+
+
+def scene_weights(scene: Scene) -> Take | None:
+    """The animation of the scene's shapes; see ``torchface.io.load_animation``.
+
+    Raises:
+        FileFormatError: keys that are no frames, or NaN.
+    """
+    if scene.record.get("animation") is None:
+        return None
+    renamed: dict[str, str] = {}
+    for mesh in scene.record["meshes"]:
+        tokens = [shape["name"] for shape in mesh["shapes"]]
+        for token, name in zip(tokens, _names(mesh, tokens), strict=True):
+            renamed.setdefault(token, name)
+    names = scene.record["animation"]["names"]
+    followers = {corrective.name for corrective in _noted_correctives(scene)}
+    columns = [column for column, name in enumerate(names) if renamed.get(name, name) not in followers]
+    columns = [column for column in columns if names[column] in renamed]
+    if not columns:
+        return None
+    times, weights = scene.arrays["animation/times"], scene.arrays["animation/weights"][:, columns]
+    if not np.isfinite(times).all() or not np.isfinite(weights).all():
+        raise FileFormatError(f"{scene.path}: animation: found NaN or infinity, expected numbers")
+
+    def error(found: str, expected: str) -> FileFormatError:
+        return FileFormatError(f"{scene.path}: animation: found {found}, expected {expected}")
+
+    rate, seconds = rate_of_keys(times - times[0], error)
+    track = Track(tuple(renamed[names[column]] for column in columns), torch.from_numpy(weights.copy())[..., None])
+    return Take(rate, weights=track, extras={} if seconds is None else {"seconds": seconds})
+
+
+def _piece(scene: Scene, number: int, unit: str | None) -> Piece:
+    record = scene.record["meshes"][number]
+    arrays = {name.partition("/")[2]: array for name, array in scene.arrays.items() if name.startswith(f"{number}/")}
+    points, place = arrays["points"], f"{scene.path}: {record['place']}"
+    linear, translation = _transform(scene, record, unit)
+    shapes, names = record["shapes"], list(_names(record, [shape["name"] for shape in record["shapes"]]))
+    _reserve(scene, 12 * len(points) * sum(1 + len(shape["between"]) for shape in shapes))
+    vertices = _finite(points @ linear + translation, f"{place}: points")
+    deltas = np.zeros((sum(1 + len(shape["between"]) for shape in shapes), len(points), 3), np.float32)
+    for number, shape in enumerate(shapes):  # each has rows of its own
+        where = f"{place}: {shape['name'][:40]}"
+        rows = arrays.get(f"shape/{number}/rows")
+        _place_offsets(arrays[f"shape/{number}/offsets"], rows, deltas[number], linear, where)
+        for step, between in enumerate(shape["between"]):
+            if not 0 < between["weight"] < 1:
+                found = f"an in-between at the weight {between['weight']:g}"
+                raise FileFormatError(f"{where}: found {found}, expected one between 0 and 1")
+            target = deltas[len(names)]
+            _place_offsets(arrays[f"shape/{number}/between/{step}"], rows, target, linear, where)
+            target -= np.float32(between["weight"]) * deltas[number]  # the rig moves as far without it
+            names.append(_key(names[number], between["weight"]))
+    sizes, polygons = arrays["counts"], pad_polygons(place, arrays["counts"], arrays["corners"])
+    faces, uvs, uv_faces = fan_triangulation(polygons), None, None
+    if "uvs" in arrays:
+        uvs = torch.from_numpy(_finite(arrays["uvs"], f"{place}: texture coordinates"))
+        uv_faces = fan_triangulation(pad_polygons(place, sizes, arrays["uv_corners"]))
+    colors = None
+    if "colors" in arrays:
+        light = _finite(arrays["colors"], f"{place}: colours").clip(0, 1)
+        colors = to_srgb(torch.from_numpy(light))
+    notes = _notes(record)
+    document = Document(scene.path, {})
+    return Piece(
+        record["name"],
+        torch.from_numpy(vertices),
+        faces,
+        uvs,
+        uv_faces,
+        colors,
+        polygons if polygons.shape[1] > 3 else None,
+        read_annotations(document, notes, record["place"], len(points)),
+        torch.from_numpy(deltas),
+        tuple(names),
+    )
+
+
+def _transform(
+    scene: Scene, record: dict[str, Any], unit: str | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """From points to millimetres, y up: rows times (3,3), plus (3,)."""
+    per_unit, up = scene.record["metres_per_unit"], scene.record["up"]
+    low, high = _METRES_PER_UNIT
+    if not low <= per_unit <= high:
+        raise FileFormatError(f"{scene.path}: found metersPerUnit = {per_unit}, expected {low} to {high}")
+    if up not in _AXES:
+        raise FileFormatError(f"{scene.path}: found upAxis = {up!r:.20}, expected Y or Z")
+    scale = per_unit * millimetres_per("m") if unit is None else millimetres_per(unit)
+    matrix = np.array(record["matrix"], np.float64).reshape(4, 4)
+    return matrix[:3, :3] @ _AXES[up] * scale, matrix[3, :3] @ _AXES[up] * scale
+
+
+def _place_offsets(
+    offsets: NDArray[np.float32],
+    rows: NDArray[np.int64] | None,
+    target: NDArray[np.float32],
+    linear: NDArray[np.float64],
+    place: str,
+) -> None:
+    """Writes a shape's offsets to their rows of ``target`` (V,3), millimetres."""
+    if rows is None and len(offsets) not in (0, len(target)):
+        raise FileFormatError(f"{place}: found {len(offsets)} offsets, expected one for each of {len(target)} points")
+    if rows is not None and len(rows) != len(offsets):
+        raise FileFormatError(f"{place}: found {len(offsets)} offsets for {len(rows)} points, expected one each")
+    if rows is not None and len(rows) and not 0 <= rows.min() <= rows.max() < len(target):
+        found = f"{rows.min()} to {rows.max()}"
+        raise FileFormatError(f"{place}: found offsets of the points {found}, expected 0 to {len(target) - 1}")
+    if len(offsets):
+        target[slice(None) if rows is None else rows] = _finite(offsets @ linear, f"{place}: offsets")
+
+
+def _names(record: dict[str, Any], tokens: list[str]) -> tuple[str, ...]:
+    """The shapes' names: where the file's tokens could not hold them, as they were noted beside."""
+    noted = _notes(record).get("shapes")
+    if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
+        return tuple(tokens)
+    return tuple(noted) if len(noted) == len(set(noted)) == len(tokens) else tuple(tokens)
+
+
+def _notes(record: dict[str, Any]) -> dict[str, Any]:
+    """What torchface noted of the mesh; nothing where another program has changed it beyond reading."""
+    if record["notes"] is None:
+        return {}
+    try:
+        found = parse_json(record["notes"].encode())
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _finite(values: NDArray[Any], place: str) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        found = values.astype(np.float32)
+    if not np.isfinite(found).all():
+        bad = int((~np.isfinite(found)).any(-1).sum())
+        raise FileFormatError(f"{place}: found NaN or infinity in {bad} of {len(found)} rows, expected finite numbers")
+    return found
+
+
+def _reserve(scene: Scene, size: int) -> None:
+    limit = min(_LARGEST, max(_UNPACKED_ALWAYS, _UNPACKED_PER_BYTE * scene.record["bytes"]))
+    if size > limit:
+        raise FileFormatError(f"{scene.path}: found shapes that unpack to {size} bytes, expected at most {limit}")

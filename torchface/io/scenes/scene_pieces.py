@@ -1,0 +1,92 @@
+"""The meshes of a scene put together as one rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+from torchface.mesh import Annotations, Mesh
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A mesh of a scene, in millimetres and the scene's place.
+
+    Args:
+        name: of the node or prim; the region that it becomes.
+        vertices: (V,3).
+        faces: (F,3).
+        uvs: (U,2).
+        uv_faces: (F,3).
+        colors: (V,3).
+        polygons: (P,K), padded with -1.
+        annotations: of its vertices.
+        deltas: (N,V,3).
+        names: of its N shapes.
+    """
+
+    name: str
+    vertices: Tensor
+    faces: Tensor
+    uvs: Tensor | None
+    uv_faces: Tensor | None
+    colors: Tensor | None
+    polygons: Tensor | None
+    annotations: Annotations | None
+    deltas: Tensor
+    names: tuple[str, ...]
+
+
+def all_names(pieces: Sequence[Piece]) -> tuple[str, ...]:
+    """The names of all shapes, each once."""
+    return tuple(dict.fromkeys(name for piece in pieces for name in piece.names))
+
+
+def joined_size(pieces: Sequence[Piece]) -> int:
+    """Bytes that shapes and regions take when pieces are joined; none for a single one."""
+    total = sum(len(piece.vertices) for piece in pieces)
+    return 0 if len(pieces) == 1 else (12 * len(all_names(pieces)) + len(pieces)) * total
+
+
+def join_deltas(pieces: Sequence[Piece]) -> Tensor:
+    """The deltas of all shapes of ``all_names`` over all vertices; a piece that lacks a shape does not move by it."""
+    if len(pieces) == 1:
+        return pieces[0].deltas
+    row = {name: i for i, name in enumerate(all_names(pieces))}
+    deltas = torch.zeros(len(row), sum(len(piece.vertices) for piece in pieces), 3)
+    first = 0
+    for piece in pieces:
+        deltas[[row[name] for name in piece.names], first : first + len(piece.vertices)] = piece.deltas
+        first += len(piece.vertices)
+    return deltas
+
+
+def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
+    """One mesh of all; of several, polygons stay only for a single piece, and each piece becomes a region."""
+    if len(pieces) == 1:
+        one = pieces[0]
+        return Mesh(one.vertices, one.faces, one.uvs, one.uv_faces, one.colors, texture, one.polygons, one.annotations)
+    counts = [len(piece.vertices) for piece in pieces]
+    faces = torch.cat([piece.faces + first for piece, first in zip(pieces, _starts(counts), strict=True)])
+    uvs = uv_faces = colors = None
+    if any(piece.uvs is not None for piece in pieces):
+        sets = [torch.zeros(1, 2) if piece.uvs is None else piece.uvs for piece in pieces]
+        rows = [torch.zeros_like(piece.faces) if piece.uv_faces is None else piece.uv_faces for piece in pieces]
+        uvs = torch.cat(sets)
+        uv_faces = torch.cat([row + first for row, first in zip(rows, _starts(list(map(len, sets))), strict=True)])
+    if any(piece.colors is not None for piece in pieces):
+        colors = torch.cat([torch.ones_like(p.vertices) if p.colors is None else p.colors for p in pieces])
+    regions: dict[str, Tensor] = {}
+    owner = torch.repeat_interleave(torch.arange(len(pieces)), torch.tensor(counts))
+    for i, piece in enumerate(pieces):
+        regions[piece.name] = regions.get(piece.name, torch.zeros(len(owner), dtype=torch.bool)) | (owner == i)
+    vertices = torch.cat([piece.vertices for piece in pieces])
+    return Mesh(vertices, faces, uvs, uv_faces, colors, texture, annotations=Annotations(regions=regions))
+
+
+def _starts(counts: list[int]) -> list[int]:
+    return [0, *accumulate(counts[:-1])]

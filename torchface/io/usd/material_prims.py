@@ -1,0 +1,157 @@
+"""Materials of a head as UsdPreviewSurface: the mesh's texture or colours, painted images, a plain colour else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchface.color_space import to_linear
+from torchface.io.gltf.part_colors.surfaces import Surface, surfaces
+from torchface.io.gltf.region_materials import PartMaterial
+from torchface.io.images.image_files import encode_png
+from torchface.mesh import Mesh
+
+PAINTED = "torchface_painted"
+"""The key of a material's ``customData`` that tells an image made for a part that had none from the mesh's texture."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What some polygons are made of.
+
+    Args:
+        name: of the subset and the material.
+        material: roughness, opacity and the plain colour.
+        image: file name and pixels, (3,H,W) or (4,H,W), in the mesh's layout.
+        colored: by the vertices' colours.
+        painted: the image is none of the mesh's own.
+    """
+
+    name: str
+    material: PartMaterial
+    image: tuple[str, Tensor] | None = None
+    colored: bool = False
+    painted: bool = False
+
+
+def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem: str) -> dict[str, bytes]:
+    """Binds materials to a mesh prim; parts that regions name are ``GeomSubset``s of its polygons.
+
+    Args:
+        usd: the library.
+        stage: where ``root`` is.
+        prim: the mesh's.
+        mesh: on the CPU.
+        root: path of the prim that gets a scope of materials.
+        stem: what names of image files begin with.
+
+    Returns:
+        PNG files by name, which belong beside the layer.
+    """
+    scope = usd.UsdGeom.Scope.Define(stage, f"{root}/materials").GetPath()
+    looks = _polygons_by_look(mesh, stem)
+    binding = usd.UsdShade.MaterialBindingAPI.Apply(prim)
+    for look, polygons in looks.items():
+        made = _material(usd, stage, f"{scope}/{look.name}", look)
+        if len(looks) == 1:
+            binding.Bind(made)
+            break
+        indices = usd.Vt.IntArray.FromNumpy(polygons.astype(np.int32))
+        subset = binding.CreateMaterialBindSubset(look.name, indices, usd.UsdGeom.Tokens.face)
+        usd.UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(made)
+    if len(looks) > 1:
+        binding.SetMaterialBindSubsetsFamilyType(usd.UsdGeom.Tokens.partition)
+    images = dict(look.image for look in looks if look.image is not None)
+    return {name: encode_png(image) for name, image in images.items()}
+
+
+def _polygons_by_look(mesh: Mesh, stem: str) -> dict[_Look, NDArray[np.int64]]:
+    """Rows of the polygons of each look; a polygon is made of what its first triangle is made of."""
+    looks: list[_Look] = []
+    of_triangle = np.zeros(len(mesh.faces), np.int64)
+    plain: dict[str, int] = {}
+    for surface in surfaces(mesh, mesh.texture is not None):
+        number = plain.get(surface.material.name) if _is_plain(surface) else None
+        if number is None:
+            number = len(looks)
+            looks.append(_look(surface, mesh, stem, [look.name for look in looks]))
+            if _is_plain(surface):
+                plain[surface.material.name] = number
+        of_triangle[surface.triangles.numpy()] = number
+    first = torch.arange(len(mesh.faces))
+    if mesh.polygons is not None:
+        triangles = (mesh.polygons >= 0).sum(1) - 2
+        first = triangles.cumsum(0) - triangles
+    of_polygon = of_triangle[first.cpu().numpy()]
+    rows = {look: np.flatnonzero(of_polygon == number) for number, look in enumerate(looks)}
+    return {look: polygons for look, polygons in rows.items() if len(polygons)}
+
+
+def _is_plain(surface: Surface) -> bool:
+    return surface.color_source == "material" and (surface.paint is None or surface.paint.image is None)
+
+
+def _look(surface: Surface, mesh: Mesh, stem: str, used: list[str]) -> _Look:
+    names = (surface.material.name, *(f"{surface.material.name}_{number}" for number in range(2, len(used) + 2)))
+    name = next(name for name in names if name not in used)
+    if surface.color_source == "texture" and mesh.texture is not None:
+        return _Look(name, surface.material, (f"{stem}.png", mesh.texture))
+    if surface.color_source == "colors":
+        return _Look(name, surface.material, colored=True)
+    if surface.paint is not None and surface.paint.image is not None:
+        return _Look(name, surface.material, (f"{stem}_{name}.png", surface.paint.image), painted=True)
+    return _Look(name, surface.material)
+
+
+def _material(usd: Any, stage: Any, path: str, look: _Look) -> Any:
+    shade, types = usd.UsdShade, usd.Sdf.ValueTypeNames
+    material = shade.Material.Define(stage, path)
+    surface = shade.Shader.Define(stage, f"{path}/surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", types.Float).Set(look.material.roughness)
+    surface.CreateInput("metallic", types.Float).Set(0.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    color, opacity = surface.CreateInput("diffuseColor", types.Color3f), look.material.opacity
+    if look.image is not None:
+        texture = _texture(usd, stage, path, look.image[0])
+        color.ConnectToSource(texture.CreateOutput("rgb", types.Float3))
+        if look.material.alpha != "OPAQUE" and len(look.image[1]) == 4:
+            surface.CreateInput("opacity", types.Float).ConnectToSource(texture.CreateOutput("a", types.Float))
+            if look.material.alpha == "MASK":
+                surface.CreateInput("opacityThreshold", types.Float).Set(0.5)
+    elif look.colored:
+        reader = _reader(usd, stage, f"{path}/colors", "UsdPrimvarReader_float3", "displayColor")
+        color.ConnectToSource(reader.CreateOutput("result", types.Float3))
+    else:
+        color.Set(usd.Gf.Vec3f(*to_linear(torch.tensor(look.material.color)).tolist()))
+        if opacity < 1:
+            surface.CreateInput("opacity", types.Float).Set(opacity)
+    if look.painted:
+        material.GetPrim().SetCustomDataByKey(PAINTED, True)
+    return material
+
+
+def _texture(usd: Any, stage: Any, path: str, image: str) -> Any:
+    types = usd.Sdf.ValueTypeNames
+    coordinates = _reader(usd, stage, f"{path}/coordinates", "UsdPrimvarReader_float2", "st")
+    texture = usd.UsdShade.Shader.Define(stage, f"{path}/texture")
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", types.Asset).Set(f"./{image}")
+    texture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    for side in ("wrapS", "wrapT"):
+        texture.CreateInput(side, types.Token).Set("repeat")
+    result = coordinates.CreateOutput("result", types.Float2)
+    texture.CreateInput("st", types.Float2).ConnectToSource(result)
+    return texture
+
+
+def _reader(usd: Any, stage: Any, path: str, kind: str, primvar: str) -> Any:
+    reader = usd.UsdShade.Shader.Define(stage, path)
+    reader.CreateIdAttr(kind)
+    reader.CreateInput("varname", usd.Sdf.ValueTypeNames.String).Set(primvar)
+    return reader

@@ -1,0 +1,35 @@
+"""OpenUSD's own library, which is an extra: asked for in one place."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from types import SimpleNamespace
+from typing import Any
+
+from torchface.errors import MissingExtraError
+
+_MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "Vt")
+
+
+def require_usd() -> None:
+    """Checks that usd-core is installed.
+
+    Raises:
+        MissingExtraError: it is not.
+    """
+    if importlib.util.find_spec("pxr") is None:
+        raise MissingExtraError(
+            "USD: usd-core is not installed, expected it for .usd, .usda, .usdc and .usdz; pip install usd-core, or in "
+            "a checkout pip install '.[usd]'"
+        )
+
+
+def usd_library() -> Any:
+    """The modules of ``pxr`` as attributes.
+
+    Raises:
+        MissingExtraError: usd-core is not installed.
+    """
+    require_usd()
+    return SimpleNamespace(**{name: importlib.import_module(f"pxr.{name}") for name in _MODULES})

@@ -1,0 +1,84 @@
+"""A USD scene as one rig: all its meshes put together, blend shapes of the same name joined."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from torchface.errors import FileFormatError
+from torchface.files.whole_files import LARGEST_FILE
+from torchface.io.scene_processes.reading_process import read_scene
+from torchface.io.scene_processes.scene_arrays import Scene, scene_mesh, scene_rig, scene_weights
+from torchface.io.usd import stage_process
+from torchface.io.usd.usd_library import require_usd
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+
+_SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 120.0, 10.0
+
+
+def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
+    """The rig in a USD file: every mesh that the scene shows, in its place, blend shapes joined by name.
+
+    Lengths become millimetres by ``metersPerUnit``, axes y up by ``upAxis``. Names are the tokens of
+    ``skel:blendShapes``; in-betweens, and the combinations that torchface noted, are its correctives. Vertices and
+    polygons keep the file's order; a scene of several meshes gets a region a mesh.
+    The file is read by another process, whose memory and time are bounded by the files' size.
+
+    Args:
+        path: ``.usd``, ``.usda``, ``.usdc`` or ``.usdz``; what it references lies in its folder or below.
+        unit: what the file's numbers are, where its ``metersPerUnit`` is wrong.
+
+    Raises:
+        MissingExtraError: usd-core is not installed.
+        FileFormatError: not USD, truncated, broken, animated otherwise than by blend shapes, composed of layers or
+            images outside its folder, or without blend shapes.
+    """
+    rig = scene_rig(_scene(path), unit)
+    if rig is None:
+        raise FileFormatError(f"{path}: found no blend shape on its meshes, expected at least one for a rig")
+    return rig
+
+
+def read_usd_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """The scene of a USD file as one mesh, blend shapes at rest; see :func:`read_usd_rig`."""
+    return scene_mesh(_scene(path), unit)
+
+
+def read_usd_weights(path: str | Path) -> Take | None:
+    """The weights that a file's ``SkelAnimation`` gives its shapes; none where nothing moves them.
+
+    Raises:
+        MissingExtraError: usd-core is not installed.
+        FileFormatError: as :func:`read_usd_rig`; or keys that are no frames.
+    """
+    return scene_weights(_scene(path))
+
+
+def _scene(path: str | Path) -> Scene:
+    require_usd()
+    path = Path(path)
+    size = checked_size(path)
+    script = str(Path(stage_process.__file__).resolve())
+    seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * size / 2**20
+    return read_scene([sys.executable, "-P", script], path, "OpenUSD", seconds)
+
+
+def checked_size(path: Path) -> int:
+    """Bytes of a plain file that is there, not empty and not beyond reason.
+
+    Raises:
+        FileFormatError: it is not.
+    """
+    try:
+        if not path.exists():
+            raise FileFormatError(f"{path}: found no such file, expected an existing one")
+        if not path.is_file():
+            raise FileFormatError(f"{path}: found a folder or a device, expected a plain file")
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise FileFormatError(f"{path}: cannot be read ({error})") from error
+    if not 0 < size <= LARGEST_FILE:
+        raise FileFormatError(f"{path}: found {size} bytes, expected 1 to {LARGEST_FILE}")
+    return size

@@ -1,0 +1,126 @@
+"""A rig, its animation or a mesh from one kind of file to another, FBX and Blender's own by way of Blender."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchface.errors import FileFormatError
+from torchface.files.whole_files import check_writable, make_folder
+from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
+from torchface.io.blender import BLENDER_ENDINGS, blender_command, read_blender_file, write_blender_file
+from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
+from torchface.io.rigs.ict_facekit import region
+from torchface.io.scenes.weight_keys import weight_keys
+from torchface.io.usd import require_usd
+from torchface.mesh import Mesh, submesh
+from torchface.progress import Progress, silent
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
+
+
+@dataclass(frozen=True, eq=False)
+class Converted:
+    """What was written.
+
+    Args:
+        mesh: at rest.
+        rig: as written, where there are shapes.
+        take: its animation, where there is one.
+        notes: what the new file has no place for, and how shapes were named.
+    """
+
+    mesh: Mesh
+    rig: BlendshapeRig | None
+    take: Take | None
+    notes: tuple[str, ...]
+
+
+def convert_file(
+    source: Path,
+    out: Path,
+    unit: str | None = None,
+    part: str | None = None,
+    names: Naming | None = None,
+    progress: Progress | None = None,
+) -> Converted:
+    """Reads whatever holds a rig or a mesh and writes it as ``out``'s ending says.
+
+    Args:
+        source: a rig or mesh, ``.fbx`` or ``.blend``.
+        out: ``.glb``, USD, ``.fbx``, ``.blend``, or a name without an ending for a folder of OBJ files; for what has no
+            shapes any mesh's ending.
+        unit: of the source's numbers, where it is not the format's own.
+        part: keep this annotated region only.
+        names: how shapes are called in ``out``; see ``rig_names``.
+        progress: called with each step.
+
+    Raises:
+        MissingExtraError: Blender or usd-core is needed, and is not installed.
+        TorchfaceError: a file is broken, or cannot be written.
+    """
+    progress = progress or silent
+    if out.suffix.lower() in BLENDER_ENDINGS:
+        require_usd()
+    if {source.suffix.lower(), out.suffix.lower()} & set(BLENDER_ENDINGS):
+        blender_command()
+    if out.suffix:
+        check_writable(out)
+    else:
+        check_writable(folder=out)
+    progress("reading")
+    found = _read(source, unit, part)
+    progress("writing")
+    make_folder(out.parent)
+    if found.rig is None:
+        if out.suffix.lower() in BLENDER_ENDINGS or not out.suffix:
+            raise FileFormatError(f"{source}: found a mesh without shapes, expected a rig to write {out.name} from")
+        save_mesh(found.mesh, out)
+        return found
+    rig = renamed(found.rig, names)
+    detail = load_detail_maps(source) if source.suffix.lower() in GLTF_ENDINGS and part is None else None
+    notes = _write(rig, found.take, renamed_detail(detail, found.rig, names), out)
+    return Converted(rig.neutral, rig, found.take, (*naming_lines(found.rig, names), *notes))
+
+
+def _read(source: Path, unit: str | None, part: str | None) -> Converted:
+    suffix = source.suffix.lower()
+    if suffix in BLENDER_ENDINGS:
+        scene = read_blender_file(source, unit)
+        mesh, rig, take = scene.mesh, scene.rig, scene.take
+    elif suffix in MESH_ENDINGS:
+        mesh, rig, take = load_mesh(source, unit), None, None
+    else:
+        try:
+            rig = load_rig(source, unit)
+        except FileFormatError:  # no shapes: a mesh; what is no mesh either raises its own error
+            if source.is_dir():
+                raise
+            rig = None
+        mesh = load_mesh(source, unit) if rig is None else rig.neutral
+        take = load_animation(source) if suffix in SCENE_ENDINGS and rig is not None else None
+    if part is not None:
+        keep = region(mesh, part)
+        mesh, rig = submesh(mesh, keep).mesh, None if rig is None else rig.part(keep)
+    return Converted(mesh, rig, take, ())
+
+
+def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | None, out: Path) -> list[str]:
+    """Writes the rig with what ``out`` has a place for; says what it has none for."""
+    suffix, notes = out.suffix.lower(), []
+    if take is not None and not suffix:
+        notes.append("a folder of OBJ files has no place for the animation, which is left out")
+        take = None
+    if detail is not None and suffix not in ("", ".glb"):
+        notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
+        detail = None
+    keys = None if take is None else weight_keys(rig, take)[0]
+    if suffix in BLENDER_ENDINGS:
+        write_blender_file(rig, out, keys)
+    else:
+        check_rig_ending(out)
+        write_rig(rig, out, detail, keys)
+    return notes
