@@ -23,7 +23,7 @@ from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
-from torchface.workflows.attach_markers import load_sites
+from torchface.workflows.attach.attach_markers import load_sites
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
@@ -106,7 +106,7 @@ def test_transfer_writes_arkits_names_and_a_folder_in_the_templates_order(
     assert torch.equal(actor.neutral.polygons, dome_rig.neutral.polygons)
     with pytest.raises(SystemExit):
         run("transfer", shoot / "halves.glb", shoot / "neutral.obj", "--out", shoot / "actor.fbx")
-    assert "expected .glb, or none for a folder" in " ".join(capsys.readouterr().err.split())
+    assert "expected .glb, .usd, .usda, .usdc, .usdz, or none for a folder" in " ".join(capsys.readouterr().err.split())
 
 
 def test_render_and_info_and_export(shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:

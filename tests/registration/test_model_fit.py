@@ -16,9 +16,10 @@ from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes, load_mesh, save_mesh
 from torchface.mesh import Mesh
 from torchface.modeling import HeadModel, MorphableModel
-from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register, register_corpus
-from torchface.registration.corpus.scan_job import CorpusJob
+from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register
 from torchface.registration.model_fit import LinearShape, shape_model
+from torchface.workflows.register.register_scans import register_scans
+from torchface.workflows.register.scan_job import ScanJob
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +101,7 @@ def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mas
         register(mask, mask, model="heads")  # type: ignore[arg-type]
 
 
+@pytest.mark.usefixtures("coarse_figures")
 def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned: Callable, tmp_path: Path) -> None:
     short = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
     (tmp_path / "scans").mkdir()
@@ -109,16 +111,16 @@ def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned:
         points = {"points": face[mask.landmarks].tolist()}
         (tmp_path / "scans" / f"{number}.ljson").write_text(json.dumps({"version": 2, "landmarks": points}))
     settings = {"landmarks": tmp_path / "scans", "schedule": short, "texture_size": 0}
-    done = register_corpus(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
-    assert len(done.registered) == 2
-    sent = pickle.loads(pickle.dumps(CorpusJob(mask, tmp_path, short, 0, model=LinearShape.of(waves))))
+    done = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
+    assert len(done.done) == 2
+    sent = pickle.loads(pickle.dumps(ScanJob(mask, short, 0, model=LinearShape.of(waves))))
     assert torch.equal(sent.model.modes, waves.modes.float())
-    for entry in done.registered:
-        marks = load_scan_landmarks(tmp_path / "scans" / f"{entry.name}.ljson", mask, entry.scan)
-        alone = register(mask, load_mesh(entry.scan), marks, model=LinearShape.of(waves), schedule=short)
-        assert (load_mesh(entry.result).vertices - alone.mesh.vertices).abs().max() < 1e-3
-    again = register_corpus(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
-    assert all(entry.reused for entry in again.entries)
+    for entry in done.done:
+        marks = load_scan_landmarks(tmp_path / "scans" / f"{entry.name}.ljson", mask, entry.item.path)
+        alone = register(mask, load_mesh(entry.item.path), marks, model=LinearShape.of(waves), schedule=short)
+        assert (load_mesh(entry.results[0]).vertices - alone.mesh.vertices).abs().max() < 1e-3
+    again = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
+    assert all(entry.reused for entry in again.outcomes)
     other = Waves(waves.mean, 1.1 * waves.modes)
-    changed = register_corpus(mask, [tmp_path / "scans"], tmp_path / "out", model=other, **settings)
-    assert not any(entry.reused for entry in changed.entries)
+    changed = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=other, **settings)
+    assert not any(entry.reused for entry in changed.outcomes)

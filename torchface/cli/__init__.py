@@ -19,6 +19,7 @@ from torchface import __version__
 from torchface.cli.annotate import annotate
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
+from torchface.cli.convert import convert
 from torchface.cli.demo import demo
 from torchface.cli.enhance import enhance
 from torchface.cli.evaluate import evaluate
@@ -56,6 +57,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "enhance": enhance,
     "evaluate": evaluate,
     "calibrate": calibrate,
+    "convert": convert,
     "render": render,
     "info": info,
     "view": view,

@@ -7,12 +7,20 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
+
+_COLUMNS = (
+    Column("marker error", "error_mm", "{:.2f} mm"),
+    Column("worst marker", "worst_mm", "{:.2f} mm"),
+    Column("markers", "markers", "{}"),
+    Column("frames", "frames", "{}"),
+)
 
 
 def attach(
     rig: Annotated[Positional[Path], arg(metavar="RIG")],
-    rom: Annotated[Positional[Path], arg(metavar="ROM")],
+    rom: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROM...")],
     out: Path = Path("attachment.json"),
     initial: Path | None = None,
     standoff: bool = False,
@@ -23,6 +31,9 @@ def attach(
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     insist: bool = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Find where markers sit on a rig from a range-of-motion take, and write them as attachment JSON.
@@ -30,9 +41,14 @@ def attach(
     Swapped labels, spikes and the motion of a slipping helmet are taken out; sites and shapes that the take leaves
     uncertain are named, and what the rig does not explain ends in an error.
 
+    Several takes, or a folder of them: OUT is a folder, for NAME.json and NAME.png of each. {name} in an option's
+    path is the take's name. One that cannot be worked on is reported and skipped, and the exit status is 1; started
+    again, the command goes on where it was.
+
     Args:
-        rig: The performer's rig: a .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        rig: The performer's rig: a .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         rom: Markers over a range of motion: .c3d, .trc or .csv. Every expression, strongly; no frame need be neutral.
+            Or several, or folders of them.
         out: The attachment to write.
         initial: Where the markers sit roughly: an attachment or landmarks as `torchface pick` writes them, labelled
             like the markers. Without it the pose is found by the markers' shape alone.
@@ -49,12 +65,26 @@ def attach(
             uncertain.
         quiet: Show no progress.
     """
+    from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock
-    from torchface.workflows.attach_markers import attach as find_sites
+    from torchface.workflows.attach.attach_markers import attach as find_sites
+    from torchface.workflows.attach.motion_job import MOTIONS, MotionJob
+    from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MarkerOptions
 
+    options = MarkerOptions(unit, labels, frames, flip)
+    if cluster is not None or is_batch(rom, MOTIONS):
+        check_folder(out)
+        if picture is not None:
+            raise ValueRangeError("--picture: found many takes, of which each gets OUT/NAME.png without it")
+        job = MotionJob(rig, initial, standoff, part, options, insist)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(job, MOTIONS, find_items(rom, MOTIONS), out, where, progress, skipped_lines(quiet))
+        show_batch(batch, _COLUMNS, "error_mm")
+        return
     with file_lock(out), progress_bars(quiet) as progress:
-        options = MarkerOptions(unit, labels, frames, flip)
-        report = find_sites(rig, rom, out, initial, standoff, picture, part, progress, options, insist)
+        report = find_sites(rig, rom[0], out, initial, standoff, picture, part, progress, options, insist)
     print_lines(report.lines())
     print_path(out)

@@ -25,7 +25,8 @@ def demo(
     everything is the embedded performer's and nothing else is needed.
 
     Args:
-        template: Rig to transfer: a .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        template: Rig to transfer: a .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel
+            folder.
         take: Weight take that moves the head, such as a Live Link Face CSV.
         target: Neutral mesh with the template's topology; ICT-FaceKit's folder needs none (a random head is drawn).
         out: Folder for the report, rig, take, weights, animation and solver.

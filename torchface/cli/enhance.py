@@ -7,11 +7,14 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
+
+_COLUMNS = (Column("frames", "frames", "{}"), Column("unlike any seen", "outside", "{:.0%}"))
 
 
 def enhance(
-    animation: Annotated[Positional[Path], arg(metavar="INPUT")],
+    animation: Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT...")],
     *,
     model: str,
     out: Path = Path("out/enhanced"),
@@ -31,6 +34,9 @@ def enhance(
     retime: bool = False,
     no_video: bool = False,
     height: int = 380,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Enhance a coarse animation with the wrinkles, creases and pores of a captured actor.
@@ -41,6 +47,10 @@ def enhance(
 
     Writes into OUT: enhanced.safetensors (every frame's mesh), enhanced.glb, comparison.mp4, frames.csv (how near the
     model comes, by region), summary.json and the report index.html. Killed and started again, it goes on where it was.
+
+    Several inputs, or a folder that holds some (and no mesh of its own): OUT gets a folder NAME of each. {name} in an
+    option's path is the input's name. One that cannot be worked on is reported and skipped, and the exit status is 1;
+    started again, the command goes on where it was.
 
     Args:
         animation: What is to be enhanced.
@@ -68,6 +78,9 @@ def enhance(
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
+    from torchface.workflows.batch.batch_items import find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.enhance.animation_job import ANIMATIONS, AnimationJob
     from torchface.workflows.enhance.coarse_input import InputSettings
     from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation
     from torchface.workflows.enhance.enhance_page import write_enhance_page
@@ -76,8 +89,17 @@ def enhance(
     checked_count("--height", height, *PICTURE_HEIGHTS)
     given = InputSettings(rig, attachment, pairs, part, neutral, fps, MarkerOptions(unit, labels, None, flip))
     settings = EnhanceSettings(given, meshes, not no_glb, glb_megabytes, detail, not no_video, retime)
+    if cluster is not None or is_batch(animation, ANIMATIONS):
+        job = AnimationJob(model, settings, height)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(
+                job, ANIMATIONS, find_items(animation, ANIMATIONS), out, where, progress, skipped_lines(quiet)
+            )
+        show_batch(batch, _COLUMNS, "outside")
+        return
     with job_lock(out), progress_bars(quiet) as progress:
-        done = enhance_animation(animation, model, out, settings, progress)
+        done = enhance_animation(animation[0], model, out, settings, progress)
         progress("writing the report")
         page = write_enhance_page(done, out, height)
     print_lines(done.lines())

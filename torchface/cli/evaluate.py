@@ -8,7 +8,15 @@ from typing import Annotated
 from rich.table import Table
 from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.progress import Quiet, console, print_path, progress_bars
+
+_COLUMNS = (
+    Column("mean", "mean_mm", "{:.3f} mm"),
+    Column("95 %", "p95_mm", "{:.3f} mm"),
+    Column("largest", "largest_mm", "{:.2f} mm"),
+    Column("frames", "frames", "{}"),
+)
 
 
 def evaluate(
@@ -26,6 +34,9 @@ def evaluate(
     as_is: bool = False,
     scale: float | None = None,
     height: int = 290,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare a result with the truth: error of every vertex, by region, by shape, over time, as heat maps.
@@ -36,6 +47,11 @@ def evaluate(
 
     Writes OUT/index.html with its images, OUT/regions.csv, frames.csv, shapes.csv where both have weights, and
     summary.json.
+
+    A RESULT that is a folder of several results: each is compared with the truth of its name in the folder TRUTH, or
+    with the one TRUTH, and OUT gets a folder NAME of each. {name} in an option's path is the
+    result's name. One that cannot be worked on is reported and skipped, and the exit status is 1; started again, the
+    command goes on where it was.
 
     Args:
         result: What came back.
@@ -58,15 +74,27 @@ def evaluate(
     from torchface.files.job_lock import job_lock
     from torchface.number_checks import checked_count
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS
+    from torchface.workflows.batch.batch_items import find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings
     from torchface.workflows.evaluate.compare_with_truth import evaluate as run
     from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
+    from torchface.workflows.evaluate.result_job import RESULTS, ResultJob
 
     if align and as_is:
         raise ValueRangeError("evaluate: found --align and --as-is, expected one of the two")
     checked_count("--height", height, *PICTURE_HEIGHTS)
     choice = True if align else False if as_is else None
     settings = EvaluationSettings(rig, truth_rig, part, frames, scans, landmarks, unit, choice, scale)
+    if cluster is not None or is_batch([result], RESULTS):
+        if len(truth) != 1:
+            raise ValueRangeError(f"truth: found {len(truth)} places for many results, expected one")
+        job = ResultJob(truth[0], settings, height)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(job, RESULTS, find_items([result], RESULTS), out, where, progress, skipped_lines(quiet))
+        show_batch(batch, _COLUMNS, "mean_mm")
+        return
     with job_lock(out), progress_bars(quiet) as progress:
         found = run(result, truth, out, settings, progress)
         progress("drawing")

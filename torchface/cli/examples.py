@@ -33,7 +33,7 @@ def examples(
         pictures: Pictures of one person, or a folder of them.
         out: The .json file to write.
         camera: A camera's number, or a video file in which somebody went through the 16 to the same clock.
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
         paper: Of the rig only the 16 above, made of ARKit's shapes.
         seconds: For each expression before the camera.
         landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from rich.table import Table
 
 from torchface.cli.export_app import export_app
+from torchface.cli.export_enhancement import export_enhancement
 from torchface.cli.progress import Quiet, console, print_path, progress_bars
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def solver(rig: Path, attachment: Path, out: Path, part: str | None = None, quie
     markers.
 
     Args:
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         attachment: Where the markers sit, as JSON.
         out: The .onnx file to write.
         part: Keep this region of the rig only, such as face.
@@ -42,7 +43,7 @@ def hybrid_solver(rig: Path, attachment: Path, out: Path, part: str | None = Non
     `gamma` (B,N), how much that counts (0 to 4; 0 leaves a frame to its markers).
 
     Args:
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         attachment: Where the markers sit, as JSON.
         out: The .onnx file to write.
         part: Keep this region of the rig only, such as face.
@@ -124,7 +125,7 @@ def video_solver(
     settings are those of `torchface track`, and in the file's metadata.
 
     Args:
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; with landmarks annotated.
         camera: The camera's calibration, as `torchface calibrate` writes it.
         out: The .onnx file to write.
         prior: A shape prior: a model's name in the zoo, or a folder.
@@ -234,4 +235,5 @@ EXPORTS: dict[str, Callable[..., None]] = {
     "examples": examples,
     "webcam": webcam,
     "app": export_app,
+    "enhancement": export_enhancement,
 }

@@ -44,7 +44,8 @@ def fit(
             Found by --landmark-model if absent.
         landmark_model: What finds them, or is compared with those that files give.
         model: A head model of the zoo by name, or its folder.
-        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
+        out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
+            vertex order.
         template: The rig whose shapes the head is given, with the model's topology; if absent the one that travels with
             the model, or the embedded performer.
         part: Keep this region of model and template, such as face of ICT-FaceKit's head.

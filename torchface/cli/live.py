@@ -35,7 +35,7 @@ def live(
 
     Args:
         camera: A camera's number, from 0, or a video file that is played in its own time.
-        character: A .glb with morph targets by ARKit's names, or a folder of OBJ files; the embedded performer if
+        character: A .glb or USD file with shapes by ARKit's names, or a folder of OBJ files; the embedded performer if
             absent.
         mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.
         calibrate: Begin with the guided calibration; without the page it is asked for in the terminal.

@@ -31,7 +31,8 @@ def pick(
     checkout.
 
     Args:
-        mesh: A mesh or rig: .glb, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        mesh: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel
+            folder.
         scan: A mesh to find the same places on: click on the head, then on the scan.
         out: The folder to save into.
         mode: What to pick first; the page can change it.
@@ -45,6 +46,7 @@ def pick(
     """
     from torchface.errors import FileFormatError
     from torchface.io import load_mesh, load_rig
+    from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.io.rigs.ict_facekit import region
     from torchface.mesh import Mesh, submesh
     from torchface.rig import BlendshapeRig
@@ -56,7 +58,7 @@ def pick(
     def read() -> Mesh | BlendshapeRig:
         if mesh.is_dir():
             return load_rig(mesh, unit, part)
-        if mesh.suffix.lower() in (".glb", ".gltf"):
+        if mesh.suffix.lower() in SCENE_ENDINGS:
             try:
                 return load_rig(mesh, unit, part)
             except FileFormatError:  # no morph targets: a mesh

@@ -25,7 +25,8 @@ def render(
     """Render a mesh or rig from several sides into one image, by ray casting; no graphics driver is needed.
 
     Args:
-        path: A mesh or rig: .glb, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        path: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel
+            folder.
         out: The .png or .jpg to write.
         weights: Pose of a rig, such as jawOpen=0.5 mouthSmileLeft=1.
         take: Pose of a rig from a weight take instead.

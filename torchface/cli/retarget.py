@@ -25,9 +25,12 @@ def retarget(
 ) -> None:
     """Carry weights over to another rig by what its shapes are called, or by a table.
 
+    A mouthClose that opens the jaw itself, as in rigs for Audio2Face, is told from ARKit's by the chin, and its weight
+    taken from jawOpen's, or back; not where the table drives either.
+
     Args:
         weights: Live Link Face CSV, or frame,time,<shape>,...
-        to: The rig that shall move: .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        to: The rig that shall move: .glb, USD, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         from_: The rig that the weights were solved on; its shapes must all be known to the table or by name. Without
             it the names in WEIGHTS are taken as they are.
         table: Mapping table, TOML: a [shape] of the target rig each, with sum = {source = factor} and/or
@@ -36,7 +39,7 @@ def retarget(
             each of the target's shapes is one of ARKit's, otherwise frame,time,<shape>,... with the target's own names.
         live_link: Also write Live Link Face CSV whatever the target's names are: halves are merged, shapes that ARKit
             does not have are left out.
-        animation: Also write the target rig with this animation as .glb.
+        animation: Also write the target rig with this animation as .glb or USD.
         part: Keep this region of the target rig only, such as face.
         quiet: Show no progress.
     """

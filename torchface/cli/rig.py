@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.progress import Quiet, console, print_path, progress_bars
+
+_COLUMNS = (
+    Column("median", "median_mm", "{:.3f} mm"),
+    Column("95 %", "p95_mm", "{:.2f} mm"),
+    Column("on the scan", "shown", "{:.0%}"),
+    Column("shapes", "shapes", "{}"),
+)
 
 
 def rig(
-    scan: Positional[Path],
+    scan: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN...")],
     template: Path,
     out: Path,
     landmarks: Path | None = None,
@@ -25,6 +33,9 @@ def rig(
     texture_size: int = 2048,
     detail_size: int = 2048,
     names: Literal["arkit"] | None = None,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Make an actor's own rig from raw scans and a template rig, and write it as .glb.
@@ -40,10 +51,17 @@ def rig(
     scan,<shape>,... and a row for each file. Landmark files of the same names (.ljson, .pts, .json) may lie beside the
     scans. DETAIL holds one scan a shape at full strength, named for it, and neutral.obj (or another format).
 
+    Neutral scans of several actors, or a folder of them: OUT is a folder, for NAME.glb of each; --landmarks may be a
+    folder of files named as the scans. {name} in an option's path is the
+    scan's name. One that cannot be worked on is reported and skipped, and the exit status is 1; started again, the
+    command goes on where it was.
+
     Args:
-        scan: The actor at rest: any topology and pose, with holes, hair and collar.
-        template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
+        scan: The actor at rest: any topology and pose, with holes, hair and collar; or several actors' scans, or
+            folders of them.
+        template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
+            vertex order.
         landmarks: The scan's landmarks: .ljson, .pts or .json in the order of the template's annotated landmarks, or
             correspondences saved by `torchface pick`. Without them the face is found by its shape.
         examples: Folder of scans of expressions.
@@ -62,13 +80,24 @@ def rig(
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
         quiet: Show no progress.
     """
+    from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.posed_mesh import pose_weights
+    from torchface.workflows.rig.actor_job import ACTORS, ActorJob
     from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
     from torchface.workflows.rig_names import naming_lines
 
     options = RigOptions(part, unit, pose_weights(pose), detector, model, texture_size, detail_size, names)
+    if cluster is not None or is_batch(scan, ACTORS):
+        check_folder(out)
+        job = ActorJob(template, landmarks, examples, detail, options)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(job, ACTORS, find_items(scan, ACTORS), out, where, progress, skipped_lines(quiet))
+        show_batch(batch, _COLUMNS, "median_mm")
+        return
     with progress_bars(quiet) as progress:
-        report = rig_actor(scan, template, out, landmarks, examples, detail, options, progress)
+        report = rig_actor(scan[0], template, out, landmarks, examples, detail, options, progress)
     for line in [*report.lines(), *naming_lines(report.rig, names)]:
         console.print(line, highlight=False)
     print_path(out)

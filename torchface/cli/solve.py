@@ -7,12 +7,20 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.progress import Quiet, print_lines, print_path, progress_bars
+
+_COLUMNS = (
+    Column("marker RMSE", "rmse_mm", "{:.3f} mm"),
+    Column("95 %", "rmse_p95_mm", "{:.3f} mm"),
+    Column("seen", "seen", "{:.1%}"),
+    Column("frames", "frames", "{}"),
+)
 
 
 def solve(
     rig: Annotated[Positional[Path], arg(metavar="RIG")],
-    take: Annotated[Positional[Path], arg(metavar="TAKE")],
+    take: Annotated[Positional[tuple[Path, ...]], arg(metavar="TAKE...")],
     attachment: Path,
     out: Path = Path("out/weights.csv"),
     live_link: Path | None = None,
@@ -37,20 +45,28 @@ def solve(
     unit: Literal["mm", "cm", "m", "in"] | None = None,
     flip: Literal["x", "y", "z"] | None = None,
     insist: bool = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Solve a marker take for blendshape weights.
 
+    Several takes, or a folder of them: OUT is a folder, for NAME.csv of each take, records/, summary.csv and
+    contact_sheet.png. {name} in an option's path is the take's name, as in --attachment sites/{name}.json --report
+    reports/{name}. A take that cannot be solved is reported and skipped, and the exit status is 1; started again, the
+    command goes on where it was.
+
     Args:
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        take: Markers: .c3d, .trc or .csv.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        take: Markers: .c3d, .trc or .csv; or several, or folders of them.
         attachment: Where the markers sit on the rig, as JSON. Markers match by label; a subject's prefix (Actor:M001)
             and another case do not matter, labels that it does not know are left out.
         out: The weights to write: Live Link Face CSV if each of the rig's shapes is one of ARKit's, otherwise
             frame,time,<shape>,... with the rig's own names.
         live_link: Also write Live Link Face CSV whatever the rig's names are: halves are merged, shapes that ARKit does
             not have are left out.
-        animation: Also write the rig with this animation as .glb.
+        animation: Also write the rig with this animation as .glb or USD.
         neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation, translation, scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.
@@ -80,9 +96,12 @@ def solve(
     """
     from torchface.errors import FileFormatError, ValueRangeError
     from torchface.files.job_lock import file_lock
-    from torchface.workflows.marker_input import MarkerOptions
+    from torchface.workflows.batch.batch_items import check_folder, check_for_each, find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+    from torchface.workflows.marker_input import MARKER_TAKES, MarkerOptions
     from torchface.workflows.solve.head_camera import HeadCamera
     from torchface.workflows.solve.solve_take import SolveSettings, solve_take
+    from torchface.workflows.solve.take_job import TakeJob
 
     if labels is not None and labels.suffix.lower() == ".toml":
         raise FileFormatError(f"{labels}: found TOML, expected a .csv; labels of a video go to --video-labels")
@@ -93,9 +112,35 @@ def solve(
     terms = {name: value for name, value in (("sparsity", sparsity), ("ridge", ridge)) if value is not None}
     settings = SolveSettings(neutral, align, not keep_rest, slip, clean, frame_by_frame, **terms, insist=insist)
     options = MarkerOptions(unit, labels, frames, flip)
+    if cluster is not None or is_batch(take, MARKER_TAKES):
+        if stream is not None:
+            raise ValueRangeError("--stream: found many takes, expected one that is sent")
+        check_folder(out)
+        written = {"--animation": animation, "--report": report, "--live-link": live_link}
+        for option, path in written.items():
+            check_for_each(option, path)
+        job = TakeJob(rig, attachment, settings, options, part, camera, animation, report, live_link)
+        found = find_items(take, MARKER_TAKES)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(job, MARKER_TAKES, found, out, where, progress, skipped_lines(quiet))
+        show_batch(batch, _COLUMNS, "rmse_mm")
+        return
     with file_lock(out), progress_bars(quiet) as progress:
         done = solve_take(
-            rig, take, attachment, out, animation, settings, part, report, stream, camera, progress, options, live_link
+            rig,
+            take[0],
+            attachment,
+            out,
+            animation,
+            settings,
+            part,
+            report,
+            stream,
+            camera,
+            progress,
+            options,
+            live_link,
         )
     print_lines(done.lines())
     print_path(out)

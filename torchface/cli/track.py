@@ -8,12 +8,20 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, show_batch, skipped_lines
 from torchface.cli.picture_size import picture_size
 from torchface.cli.progress import Quiet, console, print_lines, print_path, progress_bars
 
+_COLUMNS = (
+    Column("frames", "frames", "{}"),
+    Column("face found", "seen", "{:.1%}"),
+    Column("landmarks off by", "error_px", "{:.2f} px"),
+    Column("jitter", "jitter_px", "{:.2f} px"),
+)
+
 
 def track(
-    video: Annotated[Positional[Path | None], arg(metavar="VIDEO")] = None,
+    video: Annotated[Positional[tuple[Path, ...]], arg(metavar="VIDEO...")] = (),
     *,
     rig: Path,
     out: Path | None = None,
@@ -33,6 +41,9 @@ def track(
     live: str | None = None,
     stream: str = "udp://127.0.0.1:11111",
     seconds: float | None = None,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    time_limit: TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Track a face in a video and solve it for the weights of the actor's rig; no markers are needed.
@@ -42,11 +53,15 @@ def track(
     landmark_offsets.json, animation.glb, overlay.mp4, summary.json and the report index.html. Killed and started again,
     it goes on where it was; what depends on nothing that has changed is kept.
 
+    Several videos, or a folder of them: OUT is a folder, for a folder NAME of each. {name} in an option's path is the
+    video's name. One that cannot be tracked is reported and skipped, and the exit status is 1.
+
     With --live it does so from a webcam as the face moves, and sends each frame as Live Link Face does.
 
     Args:
-        video: A file: .avi, .mkv, .webm, .mp4, .mov or .gif, of one size; its frame rate may vary.
-        rig: The actor's own rig, with 68 annotated landmarks: .glb, or ICT-FaceKit's FaceXModel folder.
+        video: A file: .avi, .mkv, .webm, .mp4, .mov or .gif, of one size; its frame rate may vary. Or several, or
+            folders of them.
+        rig: The actor's own rig, with 68 annotated landmarks: .glb, USD, or ICT-FaceKit's FaceXModel folder.
         out: Folder for everything; needed but with --live, where curves are kept only if it is given.
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or
             a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then VIDEO may be left out.
@@ -71,11 +86,14 @@ def track(
         quiet: Show no progress.
     """
     from torchface.errors import ValueRangeError
+    from torchface.workflows.batch.batch_items import find_items, is_batch
+    from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.track.track_video import TrackSettings
+    from torchface.workflows.track.video_job import VIDEOS, VideoJob
 
     given = landmarks.lower().endswith(".csv")
-    if (video is None) == (live is None) and not (given and live is None):
-        found = "neither" if video is None else "both"
+    if (not video) == (live is None) and not (given and live is None):
+        found = "neither" if not video else "both"
         raise ValueRangeError(f"track: found {found} of VIDEO and --live, expected one of the two")
     settings = TrackSettings(
         landmarks,
@@ -97,7 +115,14 @@ def track(
         return
     if out is None:
         raise ValueRangeError("track: found no folder for the results, expected one (--out DIR)")
-    _file(video, rig, out, settings, quiet)
+    if cluster is not None or (video and is_batch(video, VIDEOS)):
+        job = VideoJob(rig, settings)
+        with progress_bars(quiet) as progress:
+            where = BatchOptions(jobs, cluster, time_limit)
+            batch = run_batch(job, VIDEOS, find_items(video, VIDEOS), out, where, progress, skipped_lines(quiet))
+        show_batch(batch, _COLUMNS, "error_px")
+        return
+    _file(video[0] if video else None, rig, out, settings, quiet)
 
 
 def _file(video: Path | None, rig: Path, out: Path, settings: object, quiet: bool) -> None:

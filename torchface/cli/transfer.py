@@ -24,9 +24,10 @@ def transfer(
     By deformation transfer: each shape's local stretch and turn is carried over, lids and lips keep touching.
 
     Args:
-        template: A .glb with morph targets, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        template: A .glb or USD file with shapes, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         neutral: The new head: a mesh with the template's topology (.obj, .ply, .off, .glb).
-        out: The .glb to write, or a name without an ending for a folder of OBJ files in the template's vertex order.
+        out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
+            vertex order.
         part: Keep this region of the template only, such as face; the neutral then has this part's topology.
         unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its

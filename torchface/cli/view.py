@@ -24,7 +24,7 @@ def view(
     Needs the extra: pip install '.[viewer]' in a checkout.
 
     Args:
-        rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
+        rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         weights: A weight take to play and edit, such as a Live Link Face CSV.
         out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
         part: Keep this region of the rig only, such as face.

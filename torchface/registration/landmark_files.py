@@ -11,11 +11,12 @@ from torchface.files.documents import read_json
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.picks import load_correspondences
 from torchface.io.length_units import millimetres_per
+from torchface.io.rig_files import GLTF_ENDINGS
+from torchface.io.usd import USD_ENDINGS
 from torchface.mesh import Mesh
 from torchface.registration.scan_preparation import Landmarks
 
 ENDINGS = (".ljson", ".json", ".pts")
-_METRES = (".glb", ".gltf")
 _MAX_FILE = 16 * 2**20
 
 
@@ -38,7 +39,7 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
     Raises:
         FileFormatError: a broken file, or points in an image.
         TopologyError: correspondences of another template.
-        ValueRangeError: points only, and a template without annotated landmarks.
+        ValueRangeError: points only, and a template without annotated landmarks; or beside a USD file, without a unit.
         ShapeError: another number of points than the template has landmarks.
     """
     path = Path(path)
@@ -58,7 +59,10 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
     points = found.ibug() if found.groups and len(ids) == 68 else found.points
     if len(points) != len(ids):
         raise ShapeError(f"{path}: found {len(points)} points, expected the template's {len(ids)} landmarks")
-    per_unit = millimetres_per(unit or ("m" if Path(scan).suffix.lower() in _METRES else "mm"))
+    suffix = Path(scan).suffix.lower()
+    if unit is None and suffix in USD_ENDINGS:
+        raise ValueRangeError(f"{path}: found points beside a USD file, expected their unit (mm, cm or m; --unit)")
+    per_unit = millimetres_per(unit or ("m" if suffix in GLTF_ENDINGS else "mm"))
     return ids, points * torch.tensor(per_unit, dtype=points.dtype)
 
 

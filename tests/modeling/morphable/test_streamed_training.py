@@ -49,6 +49,30 @@ def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch:
     assert [done for done, _ in steps] == list(range(1, steps[-1][1] + 1))
 
 
+def test_passes_give_the_same_as_in_memory_and_go_on_where_they_were(
+    values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
+    monkeypatch.setattr(module, "_GRAM_SAMPLES", 10)
+    whole, ours = MorphableModel.fit(values, 10), fit_sequence(InMemory(values), 10)
+    assert (ours.standard_deviations / whole.standard_deviations - 1).abs().max() < 1e-5
+    assert (ours.components * whole.components).sum((1, 2)).min() > 1 - 1e-3
+    assert torch.allclose(ours.mean, whole.mean)
+    assert float(ours.total_variance) == pytest.approx(float(whole.total_variance), rel=1e-6)
+
+    def stop(step: str, done: int = 0, total: int = 0) -> None:
+        if done == 17:  # in the third pass over seven blocks
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
+    again, from_start = InMemory(values), InMemory(values)
+    continued = fit_sequence(again, 10, tmp_path / "check")
+    assert torch.equal(continued.components, fit_sequence(from_start, 10).components)
+    assert again.read_count == from_start.read_count - 2 * 7
+    assert not (tmp_path / "check").exists()
+
+
 def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
 

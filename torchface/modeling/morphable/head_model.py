@@ -92,6 +92,7 @@ class HeadModel(nn.Module):
         if rig is None:
             self._carry((), None, None, None)
         else:
+            rig = rig.linear("HeadModel")
             self._carry(rig.names, rig.vertices, rig.deltas, rig.neutral.colors)
 
     def _carry(

@@ -17,11 +17,14 @@ from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.morphable.principal_components import check_count, check_rank, gram_spectrum, signs
+from torchface.modeling.morphable.subspace_iteration import SUBSPACE, leading_components
 from torchface.progress import Progress, silent
 
 _BLOCK_BYTES = 2**27
 _WHOLE_SPECTRUM = 1500
 _MAX_COMPONENTS = 200
+_GRAM_SAMPLES = 4000
+"""Above, time and memory of the Gram matrix grow past those of passes over the samples."""
 _METHOD = "gram rows/2"
 
 
@@ -35,14 +38,16 @@ def fit_sequence(
 
     Three passes: the mean; the Gram matrix, block by block of rows, in float64; the components. Memory is taken by the
     Gram matrix (8 M² bytes) and two blocks. Its leading eigenpairs come from Lanczos' iteration, to the precision
-    of float64.
+    of float64. Of more than 4,000 samples, and components fewer than an eighth of them, no Gram matrix is made:
+    subspace iteration takes memory that does not depend on M and time in proportion to it, see
+    :func:`~torchface.modeling.morphable.subspace_iteration.leading_components`.
 
     Args:
         samples: in correspondence, aligned.
         components: how many; if absent as many as the samples differ in, but at most 200 of more than 1,500 samples.
-        checkpoint: a folder for the rows of the Gram matrix that are finished. Killed and started again with the same
-            samples in the same order and the same folder, the fit continues; rows of other samples and damaged ones
-            are computed again. In the end the files are removed.
+        checkpoint: a folder for the rows of the Gram matrix, or the passes, that are finished. Killed and started
+            again with the same samples in the same order and the same folder, the fit continues; rows of other samples
+            and damaged ones are computed again. In the end the files are removed.
         progress: called with each step and how far it is.
 
     Raises:
@@ -58,6 +63,8 @@ def fit_sequence(
     if components is None and count > _WHOLE_SPECTRUM:
         components = _MAX_COMPONENTS
     parts = list(blocks(samples, _BLOCK_BYTES))
+    if components is not None and count > max(_GRAM_SAMPLES, 8 * components):
+        return _by_passes(samples, parts, components, None if checkpoint is None else Path(checkpoint), report)
     work = 2 * len(parts) + len(parts) * (len(parts) + 1) // 2
     steps = iter(range(1, work + 1))
 
@@ -93,6 +100,38 @@ def fit_sequence(
         learned.reshape(len(values), vertices, channels),
         (values / (count - 1)).sqrt(),
         trace / (count - 1),
+        count,
+    )
+
+
+def _by_passes(
+    samples: Samples, parts: list[tuple[int, int]], components: int, checkpoint: Path | None, report: Progress
+) -> MorphableModel:
+    count, vertices, channels = samples.shape
+    mean, floor, contents = _mean(samples, parts, lambda: None, keyed=checkpoint is not None)
+    if checkpoint is not None:
+        make_folder(checkpoint)
+    found = leading_components(
+        lambda begin, end: _centred(samples, begin, end, mean),
+        parts,
+        vertices * channels,
+        components,
+        checkpoint,
+        content_key(_METHOD, samples=contents, parts=parts, components=components),
+        lambda done, total: report("fitting principal components", done, total),
+    )
+    values, vectors = found.values, found.vectors
+    check_rank(count, int((values > max(floor, 1e-12 * float(values.max()))).sum()), components)
+    vectors = vectors * signs(vectors)[:, None]
+    if checkpoint is not None:
+        (checkpoint / SUBSPACE).unlink(missing_ok=True)
+        if not any(checkpoint.iterdir()):
+            checkpoint.rmdir()
+    return MorphableModel(
+        mean.reshape(vertices, channels),
+        vectors.reshape(components, vertices, channels),
+        (values / (count - 1)).sqrt(),
+        found.trace / (count - 1),
         count,
     )
 

@@ -14,8 +14,8 @@ from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
 from torchface.progress import Progress
-from torchface.registration import register_corpus
 from torchface.workflows.animated_meshes import AnimatedMesh
+from torchface.workflows.register.register_scans import register_scans
 
 NEAR = 2.0
 """Millimetres; a vertex that came to lie further from the scan, or on its border, only followed its neighbours."""
@@ -119,7 +119,7 @@ def scan_truth(
         raise TopologyError(
             f"{result.path}: found meshes without a rig, expected the rig whose neutral is laid on the scans (--rig)"
         )
-    report = register_corpus(
+    report = register_scans(
         result.neutral,
         scans,
         out,
@@ -130,22 +130,23 @@ def scan_truth(
     )
     lost = report.skipped
     if lost:
-        raise AlignmentError(f"{lost[0].scan}: could not be registered ({lost[0].error}), expected a scan of the face")
+        raise AlignmentError(
+            f"{lost[0].item.path}: could not be registered ({lost[0].error}), expected a scan of the face"
+        )
     frames, notes = [], []
-    for entry in report.entries:  # a surface of its own each
-        assert entry.result is not None
-        found = load_mesh(entry.result).vertices
-        scan = load_mesh(entry.scan, unit)
+    for outcome in report.outcomes:  # a surface of its own each
+        found = load_mesh(outcome.results[0]).vertices
+        scan = load_mesh(outcome.item.path, unit)
         index = SurfaceIndex(scan.vertices, scan.faces)
         nearest = index.nearest(found)
         shown = (nearest.distance <= NEAR) & ~index.on_border(nearest)
         frames.append(torch.where(shown[:, None], found, torch.nan))
-        known = "" if not entry.reused else ", known from an earlier run"
+        known = "" if not outcome.reused else ", known from an earlier run"
         notes.append(
-            f"{entry.name}: registered by {entry.start}, median {entry.median_distance:.3f} mm from the scan, which "
-            f"shows {float(shown.float().mean()):.0%} of the vertices{known}"
+            f"{outcome.name}: registered by {outcome.figures['start']}, median {outcome.figures['median_mm']:.3f} mm "
+            f"from the scan, which shows {float(shown.float().mean()):.0%} of the vertices{known}"
         )
     stacked = torch.stack(frames)
     name = scans[0] if len(scans) == 1 else out
     animated = AnimatedMesh(Path(name), result.neutral, len(frames), lambda begin, end: stacked[begin:end])
-    return ScanTruth(animated, tuple(entry.scan for entry in report.entries), unit, tuple(notes))
+    return ScanTruth(animated, tuple(outcome.item.path for outcome in report.outcomes), unit, tuple(notes))

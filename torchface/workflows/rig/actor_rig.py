@@ -14,6 +14,7 @@ from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
+from torchface.io.rig_files import check_rig_ending
 from torchface.landmarks.scans.detector_files import load_detector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Mesh
@@ -40,7 +41,8 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.hidden_parts import dressed_as, hidden_parts
-from torchface.workflows.register_scans import in_place_of, load_shape_model
+from torchface.workflows.register.register_scans import load_shape_model
+from torchface.workflows.register.scan_job import in_place_of
 from torchface.workflows.rig.expression_scans import LAYOUT, Expression, expressions_in, neutral_in, weights_row
 from torchface.workflows.rig.expression_side import check_side
 from torchface.workflows.rig.penetration_report import Penetration, penetration
@@ -153,7 +155,7 @@ def rig_actor(
     Args:
         scan: the actor at rest, any topology and pose.
         template: a rig.
-        out: the ``.glb`` or folder to write; see ``save_rig``.
+        out: the file or folder to write; see ``save_rig``.
         landmarks: of the scan; see ``load_scan_landmarks``. Found by shape alone if absent.
         examples: a folder of scans of expressions; see ``expressions_in``. Landmark files named as the scans may lie
             beside them.
@@ -167,7 +169,7 @@ def rig_actor(
         AlignmentError: not one example, or not one scan of details, could be used.
         TorchfaceError: neutral scan, template or an option is of no use.
     """
-    check_out(out)
+    check_out(out, detail is not None)
     with file_lock(out):
         return _rig_actor(scan, template, out, landmarks, examples, detail, options or RigOptions(), progress or silent)
 
@@ -347,12 +349,9 @@ def _detail(maps: dict[str, tuple[tuple[str, ...], NormalMap]]) -> DetailMaps | 
     return detail_maps([shape for shape, _ in named], [baked for _, baked in named], neutral)
 
 
-def check_out(out: Path) -> None:
-    """Refuses what a rig cannot be written to, before any work is done: a ``.glb``, or a folder without an ending."""
-    if out.suffix.lower() not in (".glb", ""):
-        raise FileFormatError(
-            f"{out}: found the ending {out.suffix!r}, expected .glb, or none for a folder of OBJ files"
-        )
+def check_out(out: Path, has_detail: bool = False) -> None:
+    """Refuses what a rig, with wrinkle maps or without, cannot be written to, before any work is done."""
+    check_rig_ending(out, has_detail)
     if out.suffix:
         check_writable(out)
     else:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader
-from torchface.registration.corpus.register_corpus import SCAN_ENDINGS
 from torchface.shape_names import mapping
+from torchface.workflows.batch.batch_items import SCAN_ENDINGS
 
 WEIGHTS = "weights.csv"
 NEUTRAL = "neutral"

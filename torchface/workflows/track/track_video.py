@@ -187,8 +187,7 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         landmarks=see_key,
         models=models.solving,
         neutral=actor.neutral,
-        deltas=actor.deltas,
-        names=actor.names,
+        rig=rig_digest(actor),
         calibration=calibration,
         whole_take=settings.whole_take,
         solver=solver.settings,
@@ -349,7 +348,9 @@ def _times_of(times: Tensor, count: int, fps: float) -> Tensor:
 
 def rig_digest(rig: BlendshapeRig) -> str:
     """Changes when a rig does."""
-    return content_key("rig", neutral=rig.neutral, deltas=rig.deltas, names=rig.names)
+    correctives = rig.correctives
+    more = {} if correctives is None else {"correctives": correctives.deltas, "definitions": correctives.definitions}
+    return content_key("rig", neutral=rig.neutral, deltas=rig.deltas, names=rig.names, **more)
 
 
 def _finder_digest(models: TrackModels) -> str:

@@ -23,12 +23,15 @@ from torchface.io import load_mesh, save_mesh
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
 from torchface.registration import Level, Schedule, Stage, register
-from torchface.registration.corpus.register_corpus import CorpusReport, corpus_tasks, find_scans, register_corpus
-from torchface.registration.corpus.scan_job import CorpusJob
-from torchface.registration.corpus.scan_record import CorpusEntry
 from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
+from torchface.workflows.batch.batch_items import BatchItem, find_items
+from torchface.workflows.batch.outcomes import Outcome
+from torchface.workflows.batch.run_batch import BatchOptions, BatchReport
+from torchface.workflows.register.register_scans import SCANS, register_scans
+from torchface.workflows.register.scan_job import ScanJob
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
 SHORT = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
 COUNT = 5
 
@@ -57,30 +60,30 @@ def scans(
     return folder
 
 
-def run(template: Mesh, scans: Path, out: Path, **more: object) -> CorpusReport:
-    return register_corpus(template, [scans], out, landmarks=scans, schedule=SHORT, texture_size=0, **more)  # type: ignore[arg-type]
+def run(template: Mesh, scans: Path, out: Path, **more: object) -> BatchReport:
+    return register_scans(template, [scans], out, landmarks=scans, schedule=SHORT, texture_size=0, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def done(template: Mesh, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> CorpusReport:
+def done(template: Mesh, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> BatchReport:
     return run(template, scans, tmp_path_factory.mktemp("done"))
 
 
-def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans: Path, done: CorpusReport) -> None:
-    assert [entry.name for entry in done.registered] == [f"s{i}" for i in range(COUNT)]
-    for entry in done.registered[:2]:
-        assert entry.result is not None
-        landmarks = load_scan_landmarks(scans / f"{entry.name}.ljson", template, entry.scan)
-        alone = register(template, load_mesh(entry.scan), landmarks, schedule=SHORT)
-        found = load_mesh(entry.result)
+def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans: Path, done: BatchReport) -> None:
+    assert [entry.name for entry in done.done] == [f"s{i}" for i in range(COUNT)]
+    for entry in done.done[:2]:
+        assert entry.results
+        landmarks = load_scan_landmarks(scans / f"{entry.name}.ljson", template, entry.item.path)
+        alone = register(template, load_mesh(entry.item.path), landmarks, schedule=SHORT)
+        found = load_mesh(entry.results[0])
         torch.testing.assert_close(found.vertices.double(), alone.mesh.vertices, atol=2e-4, rtol=0)
         assert torch.equal(found.faces, template.faces)
         assert found.annotations is not None
         assert torch.equal(found.landmarks, template.landmarks)
-        assert entry.median_distance == pytest.approx(alone.record.median_distance, rel=1e-6)
+        assert entry.figures["median_mm"] == pytest.approx(alone.record.median_distance, rel=1e-6)
 
 
-def test_bad_scans_are_told_and_skipped(scans: Path, done: CorpusReport) -> None:
+def test_bad_scans_are_told_and_skipped(scans: Path, done: BatchReport) -> None:
     assert [entry.name for entry in done.skipped] == ["bad"]
     assert "bad.ply" in done.skipped[0].error
     with done.summary.open() as file:
@@ -88,25 +91,25 @@ def test_bad_scans_are_told_and_skipped(scans: Path, done: CorpusReport) -> None
     assert len(rows) == COUNT + 1
     assert rows["bad"]["status"] == "skipped"
     assert "no PLY header" in rows["bad"]["remarks"]
-    assert float(rows["s0"]["median_mm"]) == pytest.approx(done.registered[0].median_distance, abs=1e-4)
-    record = json.loads((done.out / "s0.json").read_text())
-    assert record["stages"][0]["stiffness"] == 8.0
+    assert float(rows["s0"]["median_mm"]) == pytest.approx(done.done[0].figures["median_mm"], abs=1e-4)
+    record = json.loads((done.out / "records" / "s0.json").read_text())
+    assert record["details"]["stages"][0]["stiffness"] == 8.0
 
 
 def test_only_what_has_changed_is_registered_again(
-    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+    template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
 ) -> None:
     own, out = tmp_path / "scans", tmp_path / "out"
     shutil.copytree(scans, own)
     for i in range(2, COUNT):
         (own / f"s{i}.ply").unlink()
     first = run(template, own, out)
-    assert not any(entry.reused for entry in first.entries)
+    assert not any(entry.reused for entry in first.outcomes)
     told: list[tuple[int, int]] = []
     again = run(template, own, out, progress=lambda _, done, total: told.append((done, total)))
-    assert all(entry.reused for entry in again.entries)
+    assert all(entry.reused for entry in again.outcomes)
     assert told == [(3, 3)]
-    assert [e.median_distance for e in again.registered] == [e.median_distance for e in first.registered]
+    assert [e.figures["median_mm"] for e in again.done] == [e.figures["median_mm"] for e in first.done]
     size = (out / "s0.glb").stat().st_size
     (out / "s0.glb").write_bytes(bytes(size))  # what a disk may leave of a result when the power fails
     state = (own / "s1.ljson").stat()
@@ -116,28 +119,28 @@ def test_only_what_has_changed_is_registered_again(
     os.utime(own / "s1.ljson", ns=(state.st_atime_ns, state.st_mtime_ns))  # neither size nor date tell
     with pytest.warns(UserWarning, match=r"s0\.glb: found other content than was written"):
         after = run(template, own, out)
-    assert {entry.name: entry.reused for entry in after.entries} == {"bad": True, "s0": False, "s1": False}
-    (out / "s0.json").write_text("{")
+    assert {entry.name: entry.reused for entry in after.outcomes} == {"bad": True, "s0": False, "s1": False}
+    (out / "records" / "s0.json").write_text("{")
     shutil.copy(own / "s1.ply", own / "bad.ply")
     mended = run(template, own, out)
-    assert {entry.name: entry.reused for entry in mended.entries} == {"bad": False, "s0": False, "s1": True}
-    assert len(mended.registered) == 3
+    assert {entry.name: entry.reused for entry in mended.outcomes} == {"bad": False, "s0": False, "s1": True}
+    assert len(mended.done) == 3
     other = template.with_vertices(template.vertices * 1.01)
-    assert not any(entry.reused for entry in run(other, own, out).entries)
+    assert not any(entry.reused for entry in run(other, own, out).outcomes)
 
 
 def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
-    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+    template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
 ) -> None:
     # A server that has loaded the library forks each run: a second's work a kill instead of ten.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchface.registration.corpus.register_corpus"])
+    context.set_forkserver_preload(["torchface.workflows.register.register_scans"])
     out, chance = tmp_path / "out", random.Random(0)
     kept: dict[str, int] = {}
     kills = 0
     settings = {"landmarks": scans, "schedule": SHORT, "texture_size": 0}
     for number in range(1, 11):
-        process = context.Process(target=register_corpus, args=(template, [scans], out), kwargs=settings)
+        process = context.Process(target=register_scans, args=(template, [scans], out), kwargs=settings)
         process.start()
         limit = time.monotonic() + 60
         while not (out / ".lock").exists() and process.is_alive() and time.monotonic() < limit:
@@ -148,53 +151,53 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
             os.kill(process.pid, signal.SIGKILL)
             kills += 1
         process.join()
-        for record in out.glob("*.json"):
+        for record in out.glob("records/*.json"):
             told = json.loads(record.read_text())
-            if told["status"] == "registered":
-                assert len(load_mesh(out / told["result"]).vertices) == len(template.vertices)
+            if told["status"] == "done":
+                assert len(load_mesh(out / next(iter(told["results"]))).vertices) == len(template.vertices)
         for result in out.glob("*.glb"):
             load_mesh(result)
         for name, when in kept.items():
             assert (out / name).stat().st_mtime_ns == when  # what was finished is not made again
-        kept = {path.with_suffix(".glb").name: 0 for path in out.glob("s*.json")}
+        kept = {path.with_suffix(".glb").name: 0 for path in out.glob("records/s*.json")}
         kept = {name: (out / name).stat().st_mtime_ns for name in kept}
     assert kills >= 2
     end = run(template, scans, out)
-    assert [entry.name for entry in end.registered] == [entry.name for entry in done.registered]
-    assert sum(entry.reused for entry in end.entries) >= len(kept)
+    assert [entry.name for entry in end.done] == [entry.name for entry in done.done]
+    assert sum(entry.reused for entry in end.outcomes) >= len(kept)
     assert not list(out.glob(".*.part"))
-    for entry, whole in zip(end.registered, done.registered, strict=True):
-        assert entry.result is not None
-        assert whole.result is not None
+    for entry, whole in zip(end.done, done.done, strict=True):
+        assert entry.results
+        assert whole.results
         torch.testing.assert_close(
-            load_mesh(entry.result).vertices, load_mesh(whole.result).vertices, atol=1e-3, rtol=0
+            load_mesh(entry.results[0]).vertices, load_mesh(whole.results[0]).vertices, atol=1e-3, rtol=0
         )
 
 
 def test_processes_give_the_same_and_one_that_dies_takes_only_its_scan(
-    template: Mesh, scans: Path, done: CorpusReport, tmp_path: Path
+    template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
 ) -> None:
     killed: list[int] = []
 
-    def kill_one(entry: CorpusEntry) -> None:
+    def kill_one(entry: Outcome) -> None:
         victims = [child for child in multiprocessing.active_children() if child.pid is not None]
-        if not killed and victims and entry.registered:
+        if not killed and victims and entry.done:
             killed.append(victims[0].pid or 0)
             os.kill(killed[0], signal.SIGKILL)
 
-    first = run(template, scans, tmp_path, jobs=2, finished=kill_one)
+    first = run(template, scans, tmp_path, options=BatchOptions(2), finished=kill_one)
     assert killed
-    assert len(first.entries) == COUNT + 1
+    assert len(first.outcomes) == COUNT + 1
     lost = [entry for entry in first.skipped if entry.name != "bad"]
     assert len(lost) <= 1
     assert all("signal 9" in entry.error for entry in lost)
     end = run(template, scans, tmp_path)  # what died is tried again
     assert [entry.name for entry in end.skipped] == ["bad"]
-    for entry, whole in zip(end.registered, done.registered, strict=True):
-        assert entry.result is not None
-        assert whole.result is not None
+    for entry, whole in zip(end.done, done.done, strict=True):
+        assert entry.results
+        assert whole.results
         torch.testing.assert_close(
-            load_mesh(entry.result).vertices, load_mesh(whole.result).vertices, atol=1e-3, rtol=0
+            load_mesh(entry.results[0]).vertices, load_mesh(whole.results[0]).vertices, atol=1e-3, rtol=0
         )
 
 
@@ -203,11 +206,11 @@ def test_scans_of_one_name_get_results_of_different_names(template: Mesh, scans:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "same.ply").write_bytes(b"junk")
     (tmp_path / "b" / "same.obj").write_bytes(b"junk")
-    report = register_corpus(template, [tmp_path / "a", tmp_path / "b", tmp_path / "missing.ply"], tmp_path / "out")
-    names = [entry.name for entry in report.entries]
+    report = register_scans(template, [tmp_path / "a", tmp_path / "b", tmp_path / "missing.ply"], tmp_path / "out")
+    names = [entry.name for entry in report.outcomes]
     assert len(set(names)) == 4
     assert names[-1] == "missing"
-    assert "no such file" in report.entries[-1].error
+    assert "no such file" in report.outcomes[-1].error
 
 
 def test_landmarks_come_as_points_in_the_templates_order_or_as_correspondences(template: Mesh, tmp_path: Path) -> None:
@@ -238,23 +241,23 @@ def test_mistakes_are_told_before_anything_is_done(
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("x")
     with pytest.raises(FileFormatError, match="found no scan in the folder"):
-        find_scans([tmp_path / "empty"])
+        find_items([tmp_path / "empty"], SCANS)
     with pytest.raises(FileFormatError, match="none named"):
-        register_corpus(template, [], tmp_path / "out")
+        register_scans(template, [], tmp_path / "out")
     with pytest.raises(FileFormatError, match="cannot be made"):
-        register_corpus(template, [scans], tmp_path / "file" / "out")
+        register_scans(template, [scans], tmp_path / "file" / "out")
     with pytest.raises(ValueRangeError, match="which holds scans"):
-        register_corpus(template, [scans], scans)
+        register_scans(template, [scans], scans)
     with pytest.raises(TopologyError, match="template: found 0 triangles"):
-        register_corpus(Mesh(template.vertices, template.faces[:0]), [scans], tmp_path / "out")
+        register_scans(Mesh(template.vertices, template.faces[:0]), [scans], tmp_path / "out")
     with pytest.raises(ValueRangeError, match="jobs: found 0"):
-        register_corpus(template, [scans], tmp_path / "out", jobs=0)
+        register_scans(template, [scans], tmp_path / "out", BatchOptions(0))
     with pytest.raises(FileFormatError, match="landmarks: found no folder"):
-        register_corpus(template, [scans], tmp_path / "out", landmarks=tmp_path / "none")
+        register_scans(template, [scans], tmp_path / "out", landmarks=tmp_path / "none")
     assert not (tmp_path / "out").exists()
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"-m pip install 'ray>=2.40'"):
-        register_corpus(template, [scans], tmp_path / "out", cluster="auto")
+        register_scans(template, [scans], tmp_path / "out", BatchOptions(cluster="auto"))
 
 
 def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,10 +276,10 @@ def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: 
     }
     for path, text in files.items():
         path.write_text(text)
-    job = CorpusJob(template, tmp_path, SHORT, 0, detector=tmp_path / "detector")
+    job = ScanJob(template, SHORT, 0, marks, detector=tmp_path / "detector")
 
-    def key(job: CorpusJob, given: Path | None = marks) -> str:
-        return corpus_tasks(job, [scan], given)[0].key
+    def key(job: ScanJob) -> str:
+        return replace(job).key(BatchItem("a", scan))  # a fresh one: it lists each folder once
 
     shape = LinearShape(template.vertices, torch.zeros(1, count, 3))
     jobs = [
@@ -294,7 +297,7 @@ def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: 
         replace(job, model=replace(shape, modes=shape.modes + 1)),
     ]
     keys = [key(job) for job in jobs]
-    keys.append(key(job, None))
+    keys.append(key(replace(job, landmarks=None)))
     for path, text in files.items():  # none of another size or date
         state = path.stat()
         path.write_text(text[:-2] + "?\n" if text.endswith("\n") else text[:-1] + "?")
@@ -308,8 +311,8 @@ def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: 
     assert len(set(keys)) == len(keys)
 
 
-def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: CorpusReport) -> None:
-    def second(entry: CorpusEntry) -> None:
+def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: BatchReport) -> None:
+    def second(entry: Outcome) -> None:
         with pytest.raises(ValueRangeError, match="another run writing"):
             run(template, scans, done.out)
 

@@ -1,0 +1,67 @@
+"""A job that does what the text of its items says: what the tests of batches are run with, in other processes too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchface.errors import ValueRangeError
+from torchface.files.content_keys import content_key
+from torchface.files.whole_files import write_file
+from torchface.workflows.batch.batch_items import BatchItem, ItemKind
+from torchface.workflows.batch.outcomes import Made
+
+WORDS = ItemKind("word", "spelled", (".txt",))
+
+
+class LastWords(str):
+    """Kills the process that reports it: in the middle of what it says, with whatever it holds for that."""
+
+    def __reduce__(self) -> str:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return ""
+
+
+@dataclass(frozen=True)
+class SpellJob:
+    """Writes a word backwards.
+
+    ``dies`` kills its process, ``dies once`` at the first attempt, ``sleeps`` takes a minute, ``nan`` is refused.
+
+    Args:
+        log: a folder; every attempt at an item leaves a file in it.
+        pause: seconds that each word takes.
+    """
+
+    log: Path
+    pause: float = 0.0
+
+    def key(self, item: BatchItem) -> str:
+        return content_key("spell", text=item.path, pause=self.pause)
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        (self.log / f"{item.name}.{time.time_ns()}").touch()
+        word = item.path.read_text()
+        if word == "dies" or (word == "dies once" and self.attempts(item.name) == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if word == "sleeps":
+            time.sleep(60)
+        if word == "nan":
+            raise ValueRangeError(f"{item.path}: found NaN, expected a word")
+        if word == "odd":
+            warnings.warn("an odd word", stacklevel=1)
+        if word == "last words":
+            return Made((item.path,), headline=LastWords(word))
+        time.sleep(self.pause)
+        result = out / item.name / "word.txt"
+        result.parent.mkdir(exist_ok=True)
+        write_file(result, word[::-1].encode())
+        return Made((result,), {"letters": len(word), "half": len(word) / 2}, f"{len(word)} letters")
+
+    def attempts(self, name: str) -> int:
+        """How often an item was begun."""
+        return len(list(self.log.glob(f"{name}.*")))

@@ -1,0 +1,135 @@
+"""On a Ray cluster of two nodes each item is done once and whole, whatever is killed meanwhile; `make test-cluster`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from slow_items import WORDS, SpellJob
+
+from torchface.errors import ValueRangeError
+from torchface.workflows.batch.batch_items import find_items
+from torchface.workflows.batch.outcomes import Outcome
+from torchface.workflows.batch.run_batch import BatchOptions, BatchReport, run_batch
+
+pytestmark = [pytest.mark.cluster, pytest.mark.slow]
+
+TEXTS = {f"w{i}": f"word {i}" for i in range(8)}
+DRIVER = """
+import sys
+from pathlib import Path
+from slow_items import WORDS, SpellJob
+from torchface.workflows.batch.batch_items import find_items
+from torchface.workflows.batch.run_batch import BatchOptions, run_batch
+
+words, address = Path(sys.argv[1]), sys.argv[2]
+job = SpellJob(words.parent / "log", pause=1.0)
+run_batch(job, WORDS, find_items([words], WORDS), words.parent / "out", BatchOptions(cluster=address))
+"""
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one CPU each, on this machine; the second is ``cluster.second``."""
+    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+    from ray.cluster_utils import Cluster
+
+    small = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
+    made = Cluster(initialize_head=True, head_node_args=small)
+    made.second = made.add_node(num_cpus=1, object_store_memory=80 * 2**20)
+    yield made
+    made.shutdown()
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> Path:
+    (tmp_path / "words").mkdir()
+    (tmp_path / "log").mkdir()
+    for name, text in TEXTS.items():
+        (tmp_path / "words" / f"{name}.txt").write_text(text)
+    return tmp_path / "words"
+
+
+def run(words: Path, options: BatchOptions, pause: float = 0.0, **more: Any) -> BatchReport:
+    job = SpellJob(words.parent / "log", pause)
+    return run_batch(job, WORDS, find_items([words], WORDS), words.parent / "out", options, **more)
+
+
+def check_whole(words: Path, report: BatchReport) -> None:
+    """Each word is there once, whole, with its record, and nothing else."""
+    assert [outcome.name for outcome in report.done] == list(TEXTS)
+    for name, text in TEXTS.items():
+        assert (report.out / name / "word.txt").read_text() == text[::-1]
+        assert json.loads((report.out / "records" / f"{name}.json").read_text())["status"] == "done"
+    assert sorted(path.name for path in report.out.iterdir()) == sorted(
+        [*TEXTS, "records", "summary.csv", "contact_sheet.png"]
+    )
+    assert sorted(path.stem for path in (report.out / "records").iterdir()) == sorted(TEXTS)
+
+
+def test_a_killed_worker_and_a_lost_node_cost_no_item(cluster: Any, words: Path) -> None:
+    job = SpellJob(words.parent / "log")
+    (words / "x.txt").write_text("dies once")
+    (words / "y.txt").write_text("sleeps")
+    (words / "z.txt").write_text("nan")
+    lost: list[str] = []
+
+    def lose_a_node(outcome: Outcome) -> None:
+        if not lost:
+            lost.append(outcome.name)
+            cluster.remove_node(cluster.second, allow_graceful=False)
+
+    options = BatchOptions(cluster=cluster.address, time_limit=8)
+    report = run(words, options, pause=0.3, finished=lose_a_node)
+    assert lost
+    found = {outcome.name: outcome for outcome in report.outcomes}
+    assert all(found[name].done for name in (*TEXTS, "x"))
+    assert job.attempts("x") == 2  # killed in the first
+    assert "time limit of 8 seconds" in found["y"].error
+    assert job.attempts("y") == 1
+    assert "found NaN" in found["z"].error
+    for name, text in TEXTS.items():
+        assert (report.out / name / "word.txt").read_text() == text[::-1]
+        assert job.attempts(name) <= 2  # one that was under way on the lost node is begun again
+
+
+def test_a_driver_that_is_killed_and_started_again_does_each_item_once(cluster: Any, words: Path) -> None:
+    out = words.parent / "out"
+    process = subprocess.Popen([sys.executable, "-c", DRIVER, str(words), cluster.address])
+    limit = time.monotonic() + 90
+    while len(list(out.glob("records/*.json"))) < 2 and time.monotonic() < limit:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    finished = {path.name: path.stat().st_mtime_ns for path in out.glob("records/*.json")}
+    assert 2 <= len(finished) < len(TEXTS)
+    report = run(words, BatchOptions(cluster=cluster.address), pause=1.0)
+    check_whole(words, report)
+    assert sum(outcome.reused for outcome in report.outcomes) >= len(finished)
+    for name, when in finished.items():
+        assert (out / "records" / name).stat().st_mtime_ns == when  # what was finished is not made again
+
+
+def test_what_is_no_cluster_is_told_within_20_seconds(words: Path) -> None:
+    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        addresses = ("nonsense", "127.0.0.1:1", "auto", f"127.0.0.1:{silent.getsockname()[1]}")
+        for address in addresses:
+            begin = time.monotonic()
+            with pytest.raises(ValueRangeError, match=f"found no Ray cluster at '{address}'"):
+                run(words, BatchOptions(cluster=address))
+            assert time.monotonic() - begin < 20
+    assert not (words.parent / "out").exists()

@@ -1,1 +1,0 @@
-"""Many scans registered to one template, in processes or on a cluster, with a record of each."""

@@ -1,0 +1,1 @@
+"""Where markers sit on a rig, found from ranges of motion."""

@@ -1,0 +1,196 @@
+"""From a rig, a range-of-motion take and a first guess on disk to marker sites on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.attachment import Attachment
+from torchface.capture import MarkerSolver, clean_take, fit_attachment
+from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
+from torchface.capture.markers.attachment.attachment_fit import marker_paths
+from torchface.capture.markers.rest_pose import check_not_mirrored
+from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
+from torchface.files.whole_files import all_or_none, check_writable, make_folder
+from torchface.io import load_rig
+from torchface.io.landmarks.picks import load_landmarks
+from torchface.mesh import Mesh
+from torchface.progress import Progress, silent
+from torchface.rendering.compositing import save_rendered_image, sheet
+from torchface.rig import BlendshapeRig
+from torchface.take import Take, Track
+from torchface.viz.figures.site_views import errors_by_iteration, site_views
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, pose_warnings, read_range_of_motion
+
+_SHOWN_NAMES = 8
+# A marker of which more is masked is not cleaned: what is wrong with it is said.
+_MAX_MASKED = 0.5
+_INSIST = "--insist writes the sites all the same"
+
+
+@dataclass(frozen=True, eq=False)
+class AttachReport:
+    """What came of a range of motion.
+
+    Args:
+        fit: the sites and how they were found.
+        moved: how far each marker's site is from the first guess, (M,), millimetres.
+        cleanup: what was wrong with the take.
+        warnings: what the user should know before they use the sites.
+    """
+
+    fit: AttachmentFit
+    moved: Tensor
+    cleanup: Cleanup
+    warnings: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        first, last = self.fit.errors[0], self.fit.errors[-1]
+        labels = self.fit.attachment.labels or ()
+        worst = int(last.argmax())
+        lines = [
+            f"{len(labels)} markers over {len(self.fit.weights)} frames, {len(self.fit.errors)} iterations",
+            f"sites moved by {float(self.moved.mean()):.1f} mm on average, by {float(self.moved.max()):.1f} mm at most",
+            f"marker error: mean {float(first.mean()):.2f} mm at first, {float(last.mean()):.2f} mm in the end; "
+            f"worst {labels[worst]}, {float(last[worst]):.2f} mm",
+        ]
+        if self.fit.standoff:
+            lines.append(f"markers stand {self.fit.standoff:.2f} mm above the skin")
+        if self.fit.motion is not None:
+            slid = float(self.fit.motion.translation.norm(dim=1).max())
+            angle = float(self.fit.motion.degrees().norm(dim=1).max())
+            lines.append(f"helmet: moved by up to {slid:.1f} mm and {angle:.1f} degrees; solved along")
+        if self.cleanup.defects:
+            lines.append(f"cleanup: {self.cleanup.summary()}")
+        return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self._uncertain()]
+
+    def _uncertain(self) -> list[str]:
+        """What the take leaves open."""
+        uncertainty = self.fit.uncertainty
+        shapes = [
+            f"{name} (±{float(uncertainty.levels[uncertainty.names.index(name)]):.2f})" for name in uncertainty.shapes
+        ]
+        sites = [
+            f"{label} (±{float(uncertainty.sites[uncertainty.labels.index(label)]):.1f} mm)"
+            for label in uncertainty.markers
+        ]
+        lines = []
+        if sites:
+            lines.append(f"sites that the take leaves uncertain, kept near the first guess: {_listed(sites)}")
+        if shapes:
+            lines.append(
+                f"shapes whose level the take leaves uncertain: {_listed(shapes)}; play them strongly, each by itself"
+            )
+        if uncertainty.unseen:
+            lines.append(f"shapes that these markers hardly see: {_listed(uncertainty.unseen)}")
+        return lines
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return ", ".join(names[:_SHOWN_NAMES]) + more
+
+
+def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attachment:
+    """A first guess of marker sites: an attachment, or labelled vertices, as ``torchface pick`` writes both.
+
+    Raises:
+        FileFormatError: it is neither.
+        TopologyError: it belongs to another mesh.
+    """
+    try:
+        sites = Attachment.load(path)
+    except FileFormatError as error:
+        try:
+            picked = load_landmarks(path)
+        except FileFormatError:
+            raise error from None
+        picked.check(mesh)
+        return Attachment.from_vertices(mesh, picked.vertices, picked.labels)
+    sites.check(mesh, path, owner)
+    return sites
+
+
+def cleaned_fit(
+    rig: BlendshapeRig, take: Take, start: Attachment, standoff: bool, progress: Progress | None = None
+) -> tuple[AttachmentFit, Cleanup]:
+    """Sites from a range of motion that may have swapped labels, spikes and markers that drift: fitted, and where
+    something is wrong with the take cleaned with these sites and fitted again. What does not fit is not refused.
+
+    Raises:
+        TorchfaceError: take and first guess do not fit each other, or the take shows no motion.
+    """
+    progress = progress or silent
+    fit = fit_attachment(rig, take, start, standoff, progress, insist=True)
+    progress("looking for what is wrong with the take")
+    cleanup = clean_take(MarkerSolver(rig, fit.attachment, fit.alignment), take, slip=fit.motion is not None)
+    if any(defect.kind != "gap" for defect in cleanup.defects):
+        fit = fit_attachment(rig, _usable(cleanup, take), start, standoff, progress, insist=True)
+    return fit, cleanup
+
+
+def _usable(cleanup: Cleanup, take: Take) -> Take:
+    """The cleaned take; markers of which most would be gone as they were."""
+    assert cleanup.take.markers is not None
+    assert take.markers is not None
+    seen = ~torch.isnan(take.markers.values).any(-1)
+    lost = (cleanup.masked & seen).sum(0) > _MAX_MASKED * seen.sum(0)
+    values = torch.where(lost[:, None], take.markers.values, cleanup.take.markers.values)
+    return replace(take, markers=Track(take.markers.names, values, take.markers.confidence))
+
+
+def attach(
+    rig: Path,
+    rom: Path,
+    out: Path,
+    initial: Path | None = None,
+    standoff: bool = False,
+    picture: Path | None = None,
+    part: str | None = None,
+    progress: Progress | None = None,
+    options: MarkerOptions = DEFAULT_OPTIONS,
+    insist: bool = False,
+) -> AttachReport:
+    """Reads, finds the sites, writes them; see ``torchface attach --help`` for the arguments.
+
+    Raises:
+        AlignmentError: the rig does not explain the markers, or they are mirrored, unless ``insist``.
+        ValueRangeError: the take leaves most sites or shapes uncertain, unless ``insist``.
+        TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
+    """
+    progress = progress or silent
+    check_writable(out, picture)
+    progress("reading the rig")
+    loaded = load_rig(rig, part=part)
+    progress("reading the range of motion")
+    start = None if initial is None else load_sites(initial, loaded.neutral, rig)
+    take, start, notes = read_range_of_motion(rom, start, options)
+    if start is None:
+        progress("looking for the pose in which the markers lie on the face")
+        start = sites_by_shape(loaded, take)
+    elif not insist:
+        sites = start.on(loaded.neutral.faces, loaded.vertices)
+        check_not_mirrored(marker_paths(take, start), sites, str(rom))
+    fit, cleanup = cleaned_fit(loaded, take, start, standoff, progress)
+    notes = [*notes, *pose_warnings(fit.alignment)]
+    try:
+        check_attachment(fit, loaded)
+    except (AlignmentError, ValueRangeError) as error:
+        if not insist:
+            raise type(error)(f"{rom}: {error}; {_INSIST}") from None
+        notes = [*notes, str(error)]
+    faces, vertices = loaded.neutral.faces, loaded.vertices
+    before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
+    progress("writing")
+    make_folder(out.parent)
+    with all_or_none():
+        fit.attachment.save(out)
+        if picture is not None:
+            views = [site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)]
+            save_rendered_image(sheet(views, 1), picture)
+    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))

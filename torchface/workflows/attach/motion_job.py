@@ -1,0 +1,72 @@
+"""One range of motion of many, from file to marker sites."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from torchface.files.content_keys import content_key
+from torchface.workflows.attach.attach_markers import attach
+from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.contact_sheet import small_picture
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MARKER_TAKES, MarkerOptions
+
+MOTIONS = replace(MARKER_TAKES, done="attached")
+_METHOD = "attach batch/1"
+
+
+@dataclass(frozen=True)
+class MotionJob:
+    """How the sites of each take are found; ``{name}`` in a path is the take's name.
+
+    Args:
+        rig, initial, standoff, part, options, insist: see :func:`attach`.
+    """
+
+    rig: Path
+    initial: Path | None = None
+    standoff: bool = False
+    part: str | None = None
+    options: MarkerOptions = DEFAULT_OPTIONS
+    insist: bool = False
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that the sites depend on."""
+        return content_key(_METHOD, take=item.path, settings=item.owned(self))
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Finds the sites of a take and writes ``NAME.json`` and a picture of them, ``NAME.png``.
+
+        Raises:
+            TorchfaceError: they cannot be found.
+        """
+        own, sites, picture = item.owned(self), out / f"{item.name}.json", out / f"{item.name}.png"
+        done = attach(
+            own.rig,
+            item.path,
+            sites,
+            own.initial,
+            own.standoff,
+            picture,
+            own.part,
+            options=own.options,
+            insist=own.insist,
+        )
+        last = done.fit.errors[-1]
+        error = float(torch.as_tensor(last).mean())
+        return Made(
+            (sites, picture),
+            {
+                "error_mm": error,
+                "worst_mm": float(last.max()),
+                "markers": len(done.fit.attachment.triangles),
+                "frames": len(done.fit.weights),
+                "iterations": len(done.fit.errors),
+            },
+            f"{error:.2f} mm",
+            done.warnings,
+            small_picture(picture),
+        )

@@ -1,0 +1,189 @@
+"""Which files and folders a command is to work on, one by one, and what each is called."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+S = TypeVar("S", bound="DataclassInstance")
+
+NAME = "{name}"
+"""Stands in an option's path for the item's name."""
+
+SCAN_ENDINGS = (*MESH_ENDINGS, *SCENE_ENDINGS)
+MARKER_ENDINGS = (".c3d", ".trc")
+VIDEO_ENDINGS = (".avi", ".mkv", ".webm", ".mp4", ".mov", ".gif")
+SUMMARY, RECORDS = "summary.csv", "records"
+"""Of a batch: its table, and the folder of its records."""
+_OWN = (SUMMARY, RECORDS)
+_KINDS = (("scan or mesh", SCAN_ENDINGS), ("marker take", MARKER_ENDINGS), ("video", VIDEO_ENDINGS))
+
+
+@dataclass(frozen=True)
+class BatchItem:
+    """One scan, take or video.
+
+    Args:
+        name: of its results and its record, without ending; no two of a batch have the same.
+        path: the file or folder, absolute.
+    """
+
+    name: str
+    path: Path
+
+    @overload
+    def own(self, path: Path) -> Path: ...
+
+    @overload
+    def own(self, path: None) -> None: ...
+
+    @overload
+    def own(self, path: Path | None) -> Path | None: ...
+
+    def own(self, path: Path | None) -> Path | None:
+        """A path of an option for this item: ``{name}`` in it is the item's name."""
+        return None if path is None else Path(str(path).replace(NAME, self.name))
+
+    def owned(self, settings: S) -> S:
+        """Settings for this item: ``{name}`` in each path and text of the dataclass is the item's name."""
+        own: dict[str, Any] = {}
+        for field in fields(settings):
+            value = getattr(settings, field.name)
+            if isinstance(value, Path):
+                own[field.name] = self.own(value)
+            elif isinstance(value, str):
+                own[field.name] = value.replace(NAME, self.name)
+            elif is_dataclass(value) and not isinstance(value, type):
+                own[field.name] = self.owned(value)
+        return replace(settings, **own)
+
+
+@dataclass(frozen=True)
+class ItemKind:
+    """What a command works on.
+
+    Args:
+        noun: what one is called.
+        done: what it is afterwards, such as "registered".
+        endings: of its files.
+        is_item: whether a file with one of the endings, or a folder, is one; every file and no folder if absent.
+    """
+
+    noun: str
+    done: str
+    endings: tuple[str, ...]
+    is_item: Callable[[Path], bool] | None = None
+
+    def holds(self, path: Path) -> bool:
+        """Whether a file or folder is one of this kind."""
+        if path.is_dir():
+            return self.is_item is not None and self.is_item(path)
+        if path.suffix.lower() not in self.endings or not path.is_file():
+            return False
+        try:
+            return self.is_item is None or self.is_item(path)
+        except FileFormatError:  # damaged: it is reported as one that cannot be worked on
+            return True
+
+
+@dataclass(frozen=True)
+class FoundItems:
+    """What is to be worked on, and what was left out of the folders, in words."""
+
+    items: tuple[BatchItem, ...]
+    left_out: tuple[str, ...] = ()
+
+
+def is_batch(inputs: Sequence[Path], kind: ItemKind) -> bool:
+    """Whether inputs are more than one item: several are named, or a folder that is none itself."""
+    return len(inputs) != 1 or (inputs[0].is_dir() and not kind.holds(inputs[0]))
+
+
+def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
+    """Files as named, and for each folder the items in it, sorted by name; absolute, none twice.
+
+    Files of another kind in a folder are left out and told; what may belong to an item (images, landmarks, tables) is
+    left alone.
+
+    Raises:
+        FileFormatError: nothing is named, or a folder holds none.
+    """
+    found: dict[Path, None] = {}
+    left_out = []
+    for one in map(Path, inputs):
+        if not one.is_dir() or kind.holds(one):
+            found[one.resolve()] = None
+            continue
+        shown = [path for path in sorted(one.iterdir()) if path.name[0] != "." and path.name not in _OWN]
+        inside = [path for path in shown if kind.holds(path)]
+        others = _others([path for path in shown if path not in set(inside)], kind)
+        expected = f"expected {kind.noun}s ({', '.join(kind.endings)})"
+        if not inside:
+            found_instead = f" but {others}" if others else ""
+            raise FileFormatError(f"{one}: found no {kind.noun} in the folder{found_instead}, {expected}")
+        if others:
+            left_out.append(f"{one}: left out {others}, {expected}")
+        found |= dict.fromkeys(path.resolve() for path in inside)
+    if not found:
+        raise FileFormatError(f"{kind.noun}s: found none named, expected files or folders")
+    paths = list(found)
+    return FoundItems(tuple(map(BatchItem, _names(paths), paths)), tuple(left_out))
+
+
+def check_for_each(option: str, path: Path | None) -> None:
+    """Raises a ``ValueRangeError`` where items would write over each other: what each writes has its name in it."""
+    if path is not None and NAME not in str(path):
+        example = path.with_name(f"{NAME}{path.suffix}") if path.suffix else path / NAME
+        raise ValueRangeError(
+            f"{option}: found {path}, one place for the results of many; expected {NAME} in it, such as {example}"
+        )
+
+
+def check_folder(out: Path) -> None:
+    """Raises a ``ValueRangeError`` where ``--out`` names a file, and many results need a folder."""
+    if out.suffix and not out.is_dir():
+        raise ValueRangeError(f"--out: found {out}, a file, for the results of many; expected a folder")
+
+
+def _others(paths: Sequence[Path], kind: ItemKind) -> str:
+    """How many files of which other kinds there are, in words."""
+    counts = []
+    for noun, endings in _KINDS:
+        count = sum(path.suffix.lower() in endings and path.suffix.lower() not in kind.endings for path in paths)
+        counts.append((count, noun))
+    odd = sum(path.suffix.lower() in kind.endings and path.is_file() for path in paths)
+    counts.append((odd, f"file that holds no {kind.noun}"))
+    return " and ".join(f"{count} {_plural(noun) if count > 1 else noun}" for count, noun in counts if count)
+
+
+def _plural(noun: str) -> str:
+    return {"scan or mesh": "scans or meshes"}.get(
+        noun, noun.replace("file that holds", "files that hold") if " holds " in noun else f"{noun}s"
+    )
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """A name each, none twice: the file's, with its folder's or its ending's where others have the same."""
+    ways: tuple[Callable[[Path], str], ...] = (
+        lambda path: path.stem,
+        lambda path: f"{path.parent.name}_{path.stem}",
+        lambda path: f"{path.parent.name}_{path.stem}_{path.suffix[1:]}",
+        lambda path: f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}",
+    )
+    names = [ways[0](path) for path in files]
+    for way in ways[1:]:
+        # File systems may not tell upper from lower case.
+        count = Counter(name.lower() for name in names)
+        names = [way(path) if count[name.lower()] > 1 else name for name, path in zip(names, files, strict=True)]
+    return names

@@ -1,0 +1,66 @@
+"""The pictures of all items of a batch on one sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from torchface.mesh import Mesh
+from torchface.rendering.clay_shading import render
+from torchface.rendering.compositing import caption, from_pillow, sheet
+from torchface.viz.figures.face_views import frame_face
+from torchface.workflows.batch.batch_job import picture_path
+from torchface.workflows.batch.outcomes import Outcome
+
+CONTACT_SHEET = "contact_sheet.png"
+MOST_PICTURES = 400
+"""On one sheet: more is not looked at, and a picture of 60 megapixels opens slowly."""
+_TEXT = 11
+_SKIPPED = 0.85
+WIDTH, HEIGHT = 144, 180
+"""Of one view of a face, pixels."""
+
+
+def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
+    """The pictures with their names and headlines, skipped items as blanks; (3,H,W).
+
+    Args:
+        outcomes: of all items; the first :data:`MOST_PICTURES` are shown.
+        out: the folder of results.
+    """
+    shown = outcomes[:MOST_PICTURES]
+    pictures = [_picture(outcome, out) for outcome in shown]
+    size = next((picture.shape[1:] for picture in pictures if picture is not None), torch.Size((HEIGHT, WIDTH)))
+    cells = []
+    for outcome, picture in zip(shown, pictures, strict=True):
+        name = outcome.name if len(outcome.name) <= 20 else f"{outcome.name[:9]}..{outcome.name[-9:]}"
+        view = torch.full((3, *size), _SKIPPED) if picture is None else picture
+        cells.append(caption(caption(view, name, _TEXT), outcome.headline if outcome.done else "skipped", _TEXT))
+    return sheet(cells, min(max(4, round((len(cells) * 1.8) ** 0.5)), len(cells)))
+
+
+def face_picture(mesh: Mesh, colors: Tensor | None = None) -> Tensor:
+    """A face from its front for the contact sheet, (3,H,W); in clay, or with colours (V,3)."""
+    return render(mesh, frame_face(mesh, width=WIDTH, height=HEIGHT), colors, samples=1)
+
+
+def small_picture(file: Path) -> Tensor:
+    """An image file for the contact sheet, (3,H,W), no higher than a face and at most four times as wide."""
+    with Image.open(file) as image:
+        image.thumbnail((4 * WIDTH, HEIGHT))
+        return from_pillow(image)
+
+
+def _picture(outcome: Outcome, out: Path) -> Tensor | None:
+    path = picture_path(out, outcome.item)
+    if not outcome.done or not path.is_file():
+        return None
+    try:
+        with Image.open(path) as image:
+            return from_pillow(image)
+    except OSError:  # somebody has written something else there meanwhile
+        return None

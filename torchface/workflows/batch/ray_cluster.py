@@ -1,0 +1,150 @@
+"""The items of a batch spread over the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchface.errors import ValueRangeError
+from torchface.files.extra_packages import import_extra
+from torchface.files.whole_files import delete_file
+from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.batch_job import BatchJob, attempt
+from torchface.workflows.batch.outcomes import Outcome, record_path, recorded_error, write_record
+from torchface.workflows.batch.processes import lost, too_long
+
+_ATTEMPTS = 4
+_PORT = 6379
+_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN = 4.0, 15.0
+_JOIN = "import logging, sys, ray; ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.ERROR)"
+_GRACE = 10.0  # seconds
+_POLL = 1.0  # seconds between looks at how many CPUs the cluster has
+
+
+def check_cluster(address: str) -> None:
+    """Raises within 20 seconds where no cluster answers at an address.
+
+    Raises:
+        MissingExtraError: ray is not installed.
+        ValueRangeError: nobody answers there, or something that is no Ray cluster.
+    """
+    if _import_ray().is_initialized():
+        return
+    if address != "auto":
+        host, _, port = address.removeprefix("ray://").rpartition(":")
+        host, port = (host, port) if host else (port, str(_PORT))
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()
+        except (OSError, ValueError) as error:
+            raise _none_there(address, str(error)) from error
+    # Ray itself waits for minutes for what does not answer as a cluster does; a process can be ended before.
+    try:
+        words = [sys.executable, "-c", _JOIN, address]
+        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, timeout=_SECONDS_TO_JOIN)
+    except subprocess.TimeoutExpired as error:
+        raise _none_there(address, f"it did not let this process join within {_SECONDS_TO_JOIN:g} seconds") from error
+    if done.returncode:
+        told = done.stderr.decode(errors="replace").strip().splitlines() or [f"status {done.returncode}"]
+        raise _none_there(address, told[-1][:300])
+
+
+def on_cluster(
+    job: BatchJob, items: Sequence[BatchItem], out: Path, address: str, time_limit: float | None = None
+) -> Iterator[Outcome]:
+    """What becomes of each item, as it becomes known.
+
+    Each item takes one CPU, and as many are under way as the cluster has, so that millions do not fill its memory.
+    Where a process or a machine is lost its items are given to others, four attempts in all. At the time limit the
+    item's process ends.
+
+    Args:
+        job: what is done with each; travels once to each machine.
+        items: to be worked on.
+        out: the folder of results, where all machines see it.
+        address: of the cluster.
+        time_limit: seconds that an item may take.
+
+    Raises:
+        MissingExtraError: ray is not installed.
+        ValueRangeError: no cluster answers.
+    """
+    ray = _import_ray()
+    own = not ray.is_initialized()
+    if own:
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+            raise _none_there(address, str(error)) from error
+    try:
+        shared = ray.put(job)  # kept by this process: no lost machine takes it along
+        # What is lost is given out again here, where the time limit is known and each attempt is counted.
+        call = ray.remote(num_cpus=1, max_retries=0)(_run)
+        under_way: dict[Any, BatchItem] = {}
+        waiting, attempts = deque(items), Counter[str]()
+        while waiting or under_way:
+            room = max(1, int(ray.cluster_resources().get("CPU", 1))) - len(under_way)
+            for item in [waiting.popleft() for _ in range(min(room, len(waiting)))]:
+                attempts[item.name] += 1
+                delete_file(record_path(out, item))  # what an earlier run says of it is not of this one
+                under_way[call.remote(shared, item, out, time_limit)] = item
+            for reference in ray.wait(list(under_way), num_returns=1, timeout=_POLL)[0]:
+                item = under_way.pop(reference)
+                try:
+                    yield ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    if time_limit is not None and recorded_error(item, out) == too_long(item, time_limit).error:
+                        yield too_long(item, time_limit)
+                    elif attempts[item.name] < _ATTEMPTS:
+                        waiting.appendleft(item)
+                    else:
+                        first = str(error).strip().partition("\n")[0]
+                        yield lost(item, f"was lost {_ATTEMPTS} times on the cluster: {first}")
+    finally:
+        if own:
+            ray.shutdown()
+
+
+def _run(job: BatchJob, item: BatchItem, out: Path, time_limit: float | None) -> Outcome:
+    torch.set_num_threads(1)
+    if time_limit is None:
+        return attempt(job, item, out)
+    watch = threading.Timer(time_limit, _give_up, (item, out, time_limit))
+    watch.daemon = True
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends a process that does not let the other thread run
+    signal.setitimer(signal.ITIMER_REAL, time_limit + _GRACE)
+    watch.start()
+    try:
+        return attempt(job, item, out)
+    finally:
+        watch.cancel()
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _give_up(item: BatchItem, out: Path, time_limit: float) -> None:
+    """Ends this process; the record tells the driver, to whom the end looks like a lost machine, that it was meant."""
+    try:
+        write_record(too_long(item, time_limit), "", out, {})
+    finally:
+        os._exit(1)
+
+
+def _import_ray() -> Any:
+    return import_extra("ray", "ray", "cluster", "a cluster")
+
+
+def _none_there(address: str, why: str) -> ValueRangeError:
+    return ValueRangeError(
+        f"cluster: found no Ray cluster at {address!r} ({why}); expected the address of one that runs "
+        "(ray start --head starts one), or 'auto' on one of its machines"
+    )

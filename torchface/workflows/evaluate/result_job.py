@@ -1,0 +1,76 @@
+"""One result of many, compared with its truth from file to file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torchface.errors import FileFormatError
+from torchface.files.content_keys import content_key
+from torchface.viz.figures.heat_maps import error_colors
+from torchface.workflows.animated_meshes import is_animation
+from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.contact_sheet import face_picture
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings, evaluate
+from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
+from torchface.workflows.evaluate.evaluation_record import ALL
+
+RESULTS = ItemKind("result", "compared", (".csv", ".safetensors", *SCAN_ENDINGS), is_animation)
+_METHOD = "evaluate batch/1"
+
+
+@dataclass(frozen=True)
+class ResultJob:
+    """How each result is compared; ``{name}`` in a path is the result's name.
+
+    Args:
+        truth: of all results, or a folder that holds one of each result's name.
+        settings: see :func:`evaluate`.
+        height: of each view of a face in the reports, pixels.
+    """
+
+    truth: Path
+    settings: EvaluationSettings = field(default_factory=EvaluationSettings)
+    height: int = 290
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that a comparison depends on."""
+        try:
+            truth: Path | None = self._truth(item)
+        except FileFormatError:
+            truth = None
+        return content_key(_METHOD, result=item.path, truth=truth, own=item.owned(self.settings), height=self.height)
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Compares a result with its truth and writes the folder ``NAME``.
+
+        Raises:
+            TorchfaceError: they cannot be compared.
+        """
+        folder = out / item.name
+        found = evaluate(item.path, [self._truth(item)], folder, item.owned(self.settings))
+        page = write_evaluation_page(found, folder, self.height)
+        whole = found.regions[ALL]
+        return Made(
+            (folder / "summary.json", page),
+            {
+                "mean_mm": whole.mean,
+                "median_mm": whole.median,
+                "p95_mm": whole.percentile_95,
+                "largest_mm": whole.largest,
+                "frames": len(found.frames),
+            },
+            f"{whole.mean:.3f} mm",
+            picture=face_picture(found.mesh, error_colors(found.vertex_mean, found.maximum)),
+        )
+
+    def _truth(self, item: BatchItem) -> Path:
+        truth = item.own(self.truth)
+        if not truth.is_dir() or is_animation(truth) or self.settings.scans:
+            return truth
+        named = sorted(path for path in truth.iterdir() if path.stem == item.path.stem and is_animation(path))
+        if len(named) != 1:
+            found = ", ".join(path.name for path in named) or "none"
+            raise FileFormatError(f"{truth}: found {found} for {item.path.name}, expected one truth of its name")
+        return named[0]

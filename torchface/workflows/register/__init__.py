@@ -1,0 +1,1 @@
+"""Many scans registered to one template."""

@@ -1,0 +1,113 @@
+"""From a template and scans to registered meshes, a record each, a table and a contact sheet on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from torchface import zoo
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.io import load_mesh, load_rig
+from torchface.io.length_units import millimetres_per
+from torchface.io.rigs.ict_facekit import region
+from torchface.mesh import Mesh, submesh
+from torchface.modeling import HeadModel, MorphableModel
+from torchface.progress import Progress
+from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
+from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
+from torchface.registration.scan_preparation import check_template
+from torchface.workflows.batch.batch_items import SCAN_ENDINGS, ItemKind, find_items
+from torchface.workflows.batch.outcomes import Outcome
+from torchface.workflows.batch.run_batch import ONE_BY_ONE, BatchOptions, BatchReport, run_batch
+from torchface.workflows.register.scan_job import ScanJob
+
+SCANS = ItemKind("scan", "registered", SCAN_ENDINGS)
+_KINDS = "HeadModel or MorphableModel"
+_LARGEST_TEXTURE = 16384
+
+
+def load_template(path: Path, part: str | None = None, unit: str | None = None) -> Mesh:
+    """The mesh to bend: a mesh file, or the neutral of a rig (.glb, a folder of OBJ files, ICT-FaceKit's folder)."""
+    if path.is_dir():
+        return load_rig(path, unit, part).neutral
+    mesh = load_mesh(path, unit)
+    return mesh if part is None else submesh(mesh, region(mesh, part)).mesh
+
+
+def register_scans(
+    template: Mesh,
+    scans: Sequence[str | Path],
+    out: str | Path,
+    options: BatchOptions = ONE_BY_ONE,
+    progress: Progress | None = None,
+    *,
+    finished: Callable[[Outcome], None] | None = None,
+    landmarks: str | Path | None = None,
+    unit: str | None = None,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+    texture_size: int = 1024,
+    detector: str | Path | None = None,
+    model: ShapeModel | HasShape | None = None,
+) -> BatchReport:
+    """Registers scans one by one into a folder: ``NAME.glb`` and ``records/NAME.json`` of each, a table and a sheet.
+
+    Args:
+        template: a face, millimetres.
+        scans: files and folders; a folder stands for the scans in it, sorted by name.
+        out: the folder to write into, made where it is missing; not one that holds scans or landmarks.
+        options: how many processes, or which cluster, and how long each scan may take.
+        progress: called with how many scans are done, and of how many; those of an earlier run count at once.
+        finished: called with each scan's outcome, those of an earlier run first.
+        landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
+            is registered without landmarks.
+        unit: of the scans' files; if absent metres for glTF, millimetres for the others.
+        schedule, texture_size: see ``register``.
+        detector: a landmark detector for the scans without landmarks, by name or folder; see ``load_detector``.
+        model: of faces in the template's topology, which each registration starts from; see ``register``.
+
+    Raises:
+        FileFormatError: no scan is named or found, or ``out`` cannot be written to.
+        TopologyError, ValueRangeError: a template that nothing can be registered with.
+        ValueRangeError: settings that make no sense, another run writing into ``out``, or no cluster there.
+        MissingExtraError: a cluster is asked for and ray is not installed.
+    """
+    if unit is not None:
+        millimetres_per(unit)
+    if texture_size < 0 or texture_size > _LARGEST_TEXTURE:
+        raise ValueRangeError(f"texture_size: found {texture_size}, expected 0 to {_LARGEST_TEXTURE}")
+    check_template(template)
+    found = find_items(scans, SCANS)
+    marks = None if landmarks is None else _folder("landmarks", landmarks)
+    if marks == Path(out).resolve():
+        raise ValueRangeError(f"out: found {out}, which holds landmarks; expected another folder")
+    job = ScanJob(
+        template,
+        schedule,
+        texture_size,
+        marks,
+        unit,
+        None if detector is None else _folder("detector", zoo.find(detector)),
+        None if model is None else LinearShape.of(shape_model(model, template)),
+    )
+    return run_batch(job, SCANS, found, out, options, progress, finished)
+
+
+def load_shape_model(name_or_path: str | Path) -> MorphableModel | HeadModel:
+    """A model of heads by name or folder, see ``zoo.get_model``.
+
+    Raises:
+        NameMismatchError: there is none of this name, or it is of another kind.
+    """
+    model = zoo.get_model(name_or_path)
+    if not isinstance(model, MorphableModel | HeadModel):
+        raise NameMismatchError(
+            f"model: found {name_or_path}, a {type(model).__name__}, expected a model of heads ({_KINDS})"
+        )
+    return model
+
+
+def _folder(what: str, path: str | Path) -> Path:
+    folder = Path(path).resolve()
+    if not folder.is_dir():
+        raise FileFormatError(f"{what}: found no folder {path}, expected one")
+    return folder

@@ -1,0 +1,217 @@
+"""One scan of many, registered from file to file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.files.content_keys import content_key
+from torchface.geometry.similarity import similarity_transform
+from torchface.io import load_mesh, save_mesh
+from torchface.io.meshes.named_files import named_files
+from torchface.landmarks.scans.detector_files import load_detector
+from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
+from torchface.mesh import Annotations, Mesh
+from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.registration.model_fit import LinearShape
+from torchface.registration.nonrigid.schedule import Schedule
+from torchface.registration.scan_registration import Registration, register
+from torchface.rendering.clay_shading import render
+from torchface.rendering.compositing import sheet
+from torchface.viz.figures.face_views import frame_face
+from torchface.viz.figures.heat_maps import error_colors
+from torchface.viz.figures.wireframe import lines_on_clay
+from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
+from torchface.workflows.batch.outcomes import Made
+
+_METHOD = "register/3"
+"""What results are made with; another number where the same scan and settings come to give another result."""
+_MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
+
+
+@dataclass(frozen=True, eq=False)
+class ScanJob:
+    """What all scans share.
+
+    Args:
+        template: bent onto each.
+        schedule, texture_size: see ``register``.
+        landmarks: a folder of landmark files named as the scans.
+        unit: of the scans' files; each format's own if absent.
+        detector: the folder of a landmark detector for the scans without landmarks.
+        model: of faces, which each registration starts from.
+    """
+
+    template: Mesh
+    schedule: Schedule
+    texture_size: int
+    landmarks: Path | None = None
+    unit: str | None = None
+    detector: Path | None = None
+    model: LinearShape | None = None
+
+    def key(self, item: BatchItem) -> str:
+        """A key of everything that a scan's result depends on: its files (those beside it of the same name and those
+        it names included), its landmarks, the template with all annotations, the settings, model and version."""
+        points = None if self.landmarks is None else landmark_file(self.landmarks, item.path)
+        own = sorted({item.path, *self._beside(item.path), *named_files(item.path)})
+        return content_key(
+            _METHOD,
+            shared=self._shared_key,
+            scan=str(item.path),
+            files={str(path): path for path in own},
+            landmark_file=None if points is None else points.name,
+            landmarks=points,
+        )
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Registers a scan and writes ``NAME.glb``.
+
+        Raises:
+            TorchfaceError: it cannot be registered.
+        """
+        points = None if self.landmarks is None else landmark_file(self.landmarks, item.path)
+        registration, count = self._registered(item.path, points)
+        found, result = registration.record, out / f"{item.name}.glb"
+        save_mesh(registration.mesh, result)
+        stages = [asdict(stage) for stage in found.stages]
+        for stage in stages:
+            del stage["energies"]
+        return Made(
+            (result,),
+            {
+                "median_mm": found.median_distance,
+                "matched": found.matched,
+                "start": found.start,
+                "start_mm": found.start_distance,
+                "landmarks": count,
+                "p95_mm": found.far_distance,
+                "shown": found.shown,
+                "covered": found.covered,
+                "stretch": found.stretch,
+                "slid_mm": found.slid,
+            },
+            f"{found.median_distance:.2f} mm on {found.shown:.0%}",
+            found.notes,
+            self._picture(registration),
+            {"landmark_file": None if points is None else str(points), "stages": stages},
+        )
+
+    def _registered(self, scan: Path, points: Path | None) -> tuple[Registration, int]:
+        """The registration, and how many landmarks were given."""
+        mesh, landmarks = load_mesh(scan, self.unit), None
+        if points is not None:
+            landmarks = load_scan_landmarks(points, self.template, scan, self.unit)
+        registration = register(
+            self.template,
+            mesh,
+            landmarks,
+            detector=self._detector if landmarks is None else None,
+            model=self.model,
+            schedule=self.schedule,
+            texture_size=self.texture_size,
+        )
+        return registration, 0 if landmarks is None else len(landmarks[0])
+
+    def _picture(self, registration: Registration) -> Tensor:
+        """The face from the template's front, its lines, and its distances to the scan, (3,H,W)."""
+        upright = in_place_of(registration.mesh, self.template)  # a scan may have any orientation
+        camera = frame_face(upright, width=WIDTH, height=HEIGHT)
+        seen = registration.distance.masked_fill(~registration.matched, torch.nan)
+        distances = error_colors(seen.to(upright.vertices), _MAX_DISTANCE, "turbo")
+        views = [render(upright, camera, samples=1), lines_on_clay(upright, camera)]
+        return sheet([*views, render(upright, camera, distances, samples=1)], 1)
+
+    @cached_property
+    def _shared_key(self) -> str:
+        return content_key(
+            _METHOD,
+            template=self.template,
+            schedule=self.schedule,
+            texture_size=self.texture_size,
+            unit=self.unit,
+            detector=self.detector,
+            model=self.model,
+        )
+
+    def _beside(self, scan: Path) -> list[Path]:
+        """The files of the scan's folder with its name and another ending; each folder is listed once."""
+        if scan.parent not in self._listed:
+            self._listed[scan.parent] = _by_name(scan.parent)
+        return self._listed[scan.parent].get(scan.stem, [])
+
+    @cached_property
+    def _listed(self) -> dict[Path, dict[str, list[Path]]]:
+        return {}
+
+    @cached_property
+    def _detector(self) -> AutomaticLandmarks | None:
+        return None if self.detector is None else AutomaticLandmarks(load_detector(self.detector), self.template)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Tensors would travel through shared memory, which containers keep small; arrays are copied.
+        settings = (self.schedule, self.texture_size, self.landmarks, self.unit, self.detector)
+        model = None if self.model is None else (self.model.mean.numpy(), self.model.modes.numpy())
+        return _arrived, (_packed(self.template), model, *settings)
+
+
+def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Mesh:
+    """A mesh rotated and translated, without scaling, to where a template of the same topology is.
+
+    Args:
+        mesh: V vertices.
+        template: V vertices.
+        weights: how much each vertex counts, (V,); equal if absent.
+    """
+    own, other = mesh.vertices.double(), template.vertices.double()
+    pose = similarity_transform(own[None], other[None], None if weights is None else weights[None], scale=False)
+    return mesh.with_vertices(pose.apply(own[None])[0].to(mesh.vertices))
+
+
+def _by_name(folder: Path) -> dict[str, list[Path]]:
+    """The files of a folder by each part of their names that ends before a dot."""
+    found: dict[str, list[Path]] = {}
+    if folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            parts = path.name.split(".")
+            for end in range(1, len(parts)):
+                found.setdefault(".".join(parts[:end]), []).append(path)
+    return found
+
+
+def _packed(mesh: Mesh) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        f.name: value.detach().cpu().numpy() for f in fields(mesh) if isinstance(value := getattr(mesh, f.name), Tensor)
+    }
+    notes = mesh.annotations
+    if notes is not None:
+        arrays["annotations"] = {
+            "regions": {name: mask.cpu().numpy() for name, mask in notes.regions.items()},
+            **{
+                name: value.cpu().numpy()
+                for name in ("landmarks", "mirror", "contacts")
+                if (value := getattr(notes, name)) is not None
+            },
+        }
+    return arrays
+
+
+def _arrived(arrays: dict[str, Any], model: tuple[np.ndarray, np.ndarray] | None, *settings: Any) -> ScanJob:
+    def tensors(found: dict[str, Any]) -> dict[str, Any]:
+        return {
+            name: tensors(value) if isinstance(value, dict) else torch.from_numpy(np.array(value))
+            for name, value in found.items()
+        }
+
+    mesh = tensors(arrays)
+    if "annotations" in mesh:
+        mesh["annotations"] = Annotations(**mesh["annotations"])
+    shape = None if model is None else LinearShape(*(torch.from_numpy(np.array(part)) for part in model))
+    return replace(ScanJob(Mesh(**mesh), *settings), model=shape)

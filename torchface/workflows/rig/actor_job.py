@@ -1,0 +1,71 @@
+"""One actor of many, from a neutral scan to a rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from torchface.files.content_keys import content_key
+from torchface.io.meshes.named_files import named_files
+from torchface.registration.landmark_files import landmark_file
+from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.contact_sheet import small_picture
+from torchface.workflows.batch.model_contents import model_content
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
+
+ACTORS = ItemKind("scan", "rigged", SCAN_ENDINGS)
+_METHOD = "rig batch/1"
+
+
+@dataclass(frozen=True)
+class ActorJob:
+    """How each actor's rig is made; ``{name}`` in a path is the scan's name.
+
+    Args:
+        template, landmarks, examples, detail, options: see :func:`rig_actor`; ``landmarks`` may be a folder of files
+            named as the scans.
+    """
+
+    template: Path
+    landmarks: Path | None = None
+    examples: Path | None = None
+    detail: Path | None = None
+    options: RigOptions = field(default_factory=RigOptions)
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that a rig depends on."""
+        own, options = self._own(item), self.options
+        contents = replace(options, detector=model_content(options.detector), model=model_content(options.model))
+        files = {str(path): path for path in (item.path, *named_files(item.path))}
+        return content_key(_METHOD, files=files, own=replace(own, options=contents))
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Makes a rig and writes ``NAME.glb`` and ``NAME_registration.png``.
+
+        Raises:
+            TorchfaceError: it cannot be made.
+        """
+        own, path = self._own(item), out / f"{item.name}.glb"
+        done = rig_actor(item.path, own.template, path, own.landmarks, own.examples, own.detail, own.options)
+        found = done.neutral.record
+        return Made(
+            (path, done.figure),
+            {
+                "median_mm": found.median_distance,
+                "p95_mm": found.far_distance,
+                "shown": found.shown,
+                "vertices": len(done.rig.vertices),
+                "shapes": len(done.rig.names),
+                "examples": len(done.example_names),
+            },
+            f"{found.median_distance:.2f} mm on {found.shown:.0%}",
+            (*found.notes, *(f"left out: {line}" for line in done.skipped)),
+            small_picture(done.figure),
+        )
+
+    def _own(self, item: BatchItem) -> ActorJob:
+        own = item.owned(self)
+        if own.landmarks is not None and own.landmarks.is_dir():
+            return replace(own, landmarks=landmark_file(own.landmarks, item.path))
+        return own

@@ -1,0 +1,66 @@
+"""One video of many, tracked from file to file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from torchface.files.content_keys import content_key
+from torchface.workflows.batch.batch_items import VIDEO_ENDINGS, BatchItem, ItemKind
+from torchface.workflows.batch.contact_sheet import face_picture
+from torchface.workflows.batch.model_contents import model_content
+from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.track.track_page import write_track_page
+from torchface.workflows.track.track_video import TrackSettings, track_video
+
+VIDEOS = ItemKind("video", "tracked", VIDEO_ENDINGS)
+_METHOD = "track batch/1"
+
+
+@dataclass(frozen=True)
+class VideoJob:
+    """How each video is tracked; ``{name}`` in a path is the video's name.
+
+    Args:
+        rig, settings: see :func:`track_video`.
+    """
+
+    rig: Path
+    settings: TrackSettings = field(default_factory=TrackSettings)
+
+    def key(self, item: BatchItem) -> str:
+        """A key of all that a video's results depend on."""
+        own = item.owned(self)
+        names = ("landmarks", "appearance", "prior", "dynamics")
+        contents = {name: model_content(getattr(own.settings, name)) for name in names}
+        return content_key(_METHOD, video=item.path, rig=own.rig, settings=own.settings, **contents)
+
+    def run(self, item: BatchItem, out: Path) -> Made:
+        """Tracks a video and writes the folder ``NAME``.
+
+        Raises:
+            TorchfaceError: it cannot be tracked.
+        """
+        own, folder = item.owned(self), out / item.name
+        done = track_video(item.path, own.rig, folder, own.settings)
+        page = write_track_page(done, folder, own.settings.texture)
+        errors = torch.where(done.seen, done.solution.errors, torch.nan)
+        shown = done.solution.weights[done.solution.weights.norm(dim=1).argmax()].to(done.rig.deltas)
+        with torch.no_grad():
+            picture = face_picture(done.rig.neutral.with_vertices(done.rig(shown[None])[0]))
+        seen, frames = float(done.seen.float().mean()), len(done.frames)
+        return Made(
+            (*done.products.values(), page),
+            {
+                "frames": frames,
+                "fps": float(done.video.fps),
+                "seen": seen,
+                "error_px": float(errors.nanmedian()),
+                "jitter_px": done.jitter,
+                **{f"{step}_seconds": spent for step, spent in done.seconds.items()},
+            },
+            f"{frames} frames, {seen:.0%} seen",
+            picture=picture,
+        )
