@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -59,16 +59,18 @@ class Capture:
     Args:
         sequences: in order of their names.
         neutral: with landmarks where it came with some.
+        neutral_file: where it came from; None of the performer.
         key: changes when any of the files does.
     """
 
     sequences: tuple[CapturedSequence, ...]
     neutral: Mesh
+    neutral_file: Path | None
     key: str
 
     def part(self, begin: int, end: int) -> Capture:
         """Some of the sequences."""
-        return Capture(self.sequences[begin:end], self.neutral, f"{self.key} {begin} {end}")
+        return Capture(self.sequences[begin:end], self.neutral, self.neutral_file, f"{self.key} {begin} {end}")
 
 
 def read_capture(folder: Path, neutral: Path | None) -> Capture:
@@ -105,7 +107,28 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
                 f"{rest.name}, in their order: all frames must be of one topology"
             )
     read = {str(file.relative_to(folder)): file for file in sorted(folder.rglob("*")) if file.is_file()}
-    return Capture(tuple(sequences), mesh, content_key(_METHOD, files={**read, f"{_NEUTRAL}/{rest.name}": rest}))
+    key = content_key(_METHOD, files={**read, f"{_NEUTRAL}/{rest.name}": rest})
+    return Capture(tuple(sequences), mesh, rest, key)
+
+
+def read_pairs(folder: Path, capture: Capture) -> Capture:
+    """What a coarse animation shows of a capture: the same sequences in another folder, in the capture's order.
+
+    Raises:
+        ValueRangeError: a sequence is missing, or of another number of frames.
+        FileFormatError, TopologyError: as :func:`read_capture`.
+    """
+    found = read_capture(folder, capture.neutral_file)
+    named = {_bare(sequence.name): sequence for sequence in found.sequences}
+    for sequence in capture.sequences:
+        other = named.get(_bare(sequence.name))
+        if other is None or other.count != sequence.count:
+            raise ValueRangeError(
+                f"{folder}: found {'no sequence' if other is None else f'{other.count} frames'} for "
+                f"{sequence.name}, expected its {sequence.count} frames under the same name as the coarse animation "
+                "shows them"
+            )
+    return replace(found, sequences=tuple(named[_bare(sequence.name)] for sequence in capture.sequences))
 
 
 def performed(vertices: int, seed: int, fps: float) -> Capture:
@@ -130,7 +153,7 @@ def performed(vertices: int, seed: int, fps: float) -> Capture:
         for number, name in enumerate(names)
     ]
     key = content_key(_METHOD, performer=vertices, seed=seed, fps=fps)
-    return Capture(tuple(sequences), person.neutral, key)
+    return Capture(tuple(sequences), person.neutral, None, key)
 
 
 def gather(capture: Capture, path: Path, progress: Progress) -> tuple[MeshSequence, Tensor]:
@@ -184,6 +207,11 @@ def _neutral_file(folder: Path, entries: list[Path]) -> Path:
             f"{folder}: found {len(found)} files called {_NEUTRAL}, expected one, such as {_NEUTRAL}.obj, or --neutral"
         )
     return found[0]
+
+
+def _bare(name: str) -> str:
+    """A sequence's name without a file's ending."""
+    return Path(name).stem if name.lower().endswith(_ANIMATIONS) else name
 
 
 def _animated(path: Path) -> CapturedSequence:

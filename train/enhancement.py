@@ -11,15 +11,17 @@ import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from torchface import TorchfaceError, zoo
 from torchface.enhancement import EnhancementModel
 from torchface.enhancement.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.progress import Progress, silent
-from train.captured_sequences import Capture, gather, performed, read_capture
+from train.captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from train.enhancement_figures import draw
-from train.restored_frames import measured
+from train.restored_frames import Shown, measured
 from train.runner import metric_lines, run
 
 
@@ -30,6 +32,9 @@ class Settings:
     Args:
         frames: Folder of sequences: folders of meshes, .glb, .npz or .safetensors files, or meshes named
             sequence_0001.obj; millimetres, or the unit of their file.
+        coarse: Folder of what a coarse animation shows of the same frames, in the model's topology and the same places:
+            sequences of the same names and lengths (`torchface enhance ... --detail 0` writes such meshes). Then what
+            that kind of input lacks or gets wrong is learned, for such inputs; the more it errs the more that gains.
         neutral: The neutral as a mesh; with landmarks (see `torchface annotate`) regions are named and eyes set apart.
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
@@ -46,6 +51,7 @@ class Settings:
     """
 
     frames: Path | None = None
+    coarse: Path | None = None
     neutral: Path | None = None
     performer: int = 0
     out: Path = Path("models/enhancement")
@@ -77,17 +83,23 @@ def train(settings: Settings, progress: Progress | None = None) -> EnhancementMo
         )
     work = settings.out.parent / f".{settings.out.name}.training"
     make_folder(work)
-    known, numbers = gather(capture.part(0, learned), work / "learned.safetensors", progress)
-    test = None
-    if settings.held_out:
-        test, _ = gather(capture.part(learned, len(capture.sequences)), work / "tested.safetensors", progress)
+    pairs = _pairs(settings, capture)
+
+    def gathered(name: str, begin: int, end: int) -> tuple[Shown, Tensor]:
+        known, numbers = gather(capture.part(begin, end), work / f"{name}.safetensors", progress)
+        shown = None if pairs is None else gather(pairs.part(begin, end), work / f"{name}_coarse.safetensors", progress)
+        return Shown(known, None if shown is None else shown[0]), numbers
+
+    known, numbers = gathered("learned", 0, learned)
+    test = gathered("tested", learned, len(capture.sequences))[0] if settings.held_out else None
     progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
     mesh = capture.neutral
     model = EnhancementModel.fit(
-        known,
+        known.truth,
         mesh.faces,
         numbers,
         mesh.vertices,
+        coarse=known.coarse,
         fps=settings.fps,
         wavelength=settings.wavelength,
         patch_size=settings.patch,
@@ -114,6 +126,15 @@ def _capture(settings: Settings) -> Capture:
     return read_capture(settings.frames, settings.neutral)
 
 
+def _pairs(settings: Settings, capture: Capture) -> Capture | None:
+    """What a coarse animation shows of a capture."""
+    if settings.coarse is None:
+        return None
+    if settings.frames is None:
+        raise TorchfaceError("found --coarse with --performer, expected it beside --frames, of the same sequences")
+    return read_pairs(settings.coarse, capture)
+
+
 def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float], frames: int, sequences: int) -> None:
     """Writes the model with its effective settings, what was measured, and its card."""
     effective = {key: value for key, value in asdict(settings).items() if value is not None}
@@ -122,7 +143,10 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
         source = f"--performer {settings.performer} --seed {settings.seed}"
         data = f"{frames} frames of {sequences} expressions of the embedded performer with planted wrinkles; no person."
     else:
-        source, data = f"--frames {settings.frames.name}", f"{frames} captured frames of {sequences} sequences."
+        source = f"--frames {settings.frames.name}"
+        if settings.coarse is not None:
+            source += f" --coarse {settings.coarse.name}"
+        data = f"{frames} captured frames of {sequences} sequences."
     named = ", ".join(model.region_names)
     zoo.save_model(
         model,
@@ -138,9 +162,10 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
             f"Gives coarse animations on {len(model.neutral)} vertices the wrinkles, creases and timing of one actor: "
             "`torchface enhance INPUT --model THIS --out DIR`. Detail is what lies beyond a smooth part "
             f"({model.wavelength:.0f} mm keep half); it is looked up by region ({named}). The figures compare "
-            "restored frames with captured ones, in shares of what the smooth part lacks: of sequences that it has "
+            "restored frames with captured ones, in shares of what the model is shown lacks: of sequences that it has "
             "learned from, and of others. It knows no expression that the actor did not show: regions outside the "
             "database get the nearest detail."
+            + (" Its detail is what one kind of coarse input lacks: it is for that kind." if model.keeps_input else "")
         ),
         settings=effective,
         half=("database_features", "region_weights"),

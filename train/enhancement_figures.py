@@ -14,12 +14,11 @@ from torchface import Mesh
 from torchface.enhancement import EnhancementModel
 from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.progress import Progress
 from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
 from torchface.viz.figures.face_views import face_views
 from torchface.viz.figures.heat_maps import error_views, round_maximum
-from train.restored_frames import Restored, restored
+from train.restored_frames import Restored, Shown, restored
 
 _TRIED = 24  # frames among which the most detailed one is looked for
 _HEIGHT = 420
@@ -29,8 +28,8 @@ _LINE = 110  # characters of a heading
 def draw(
     model: EnhancementModel,
     neutral: Mesh,
-    learned: MeshSequence,
-    test: MeshSequence | None,
+    learned: Shown,
+    test: Shown | None,
     folder: Path,
     progress: Progress,
 ) -> None:
@@ -42,7 +41,7 @@ def draw(
         if frames is not None:
             progress(f"drawing a frame, {name.replace('_', ' ')}")
             shown = _most_detailed(model, frames)
-            save_rendered_image(_frame(neutral, shown), folder / f"{name}.png")
+            save_rendered_image(_frame(neutral, shown, frames.coarse is not None), folder / f"{name}.png")
 
 
 def _regions(model: EnhancementModel, neutral: Mesh) -> Tensor:
@@ -55,10 +54,10 @@ def _regions(model: EnhancementModel, neutral: Mesh) -> Tensor:
     return row
 
 
-def _most_detailed(model: EnhancementModel, frames: MeshSequence) -> Restored:
+def _most_detailed(model: EnhancementModel, frames: Shown) -> Restored:
     """The frame whose normals the smooth part lacks most of: the most wrinkled one."""
     tried = range(0, len(frames), max(1, len(frames) // _TRIED))
-    found = (restored(model, frames.read(number, number + 1)[0]) for number in tried)
+    found = (restored(model, frames, number) for number in tried)
     return max(found, key=lambda one: _bent(one, model.faces))
 
 
@@ -67,9 +66,9 @@ def _bent(frame: Restored, faces: Tensor) -> float:
     return float((own - smooth).square().sum())
 
 
-def _frame(neutral: Mesh, shown: Restored) -> Tensor:
-    views = []
-    for name, vertices in {"smooth part": shown.smooth, "restored": shown.restored, "captured": shown.truth}.items():
+def _frame(neutral: Mesh, shown: Restored, paired: bool) -> Tensor:
+    views, given = [], "coarse" if paired else "smooth part"
+    for name, vertices in {given: shown.smooth, "restored": shown.restored, "captured": shown.truth}.items():
         row = face_views(replace(neutral, vertices=vertices), width=_HEIGHT * 4 // 5, height=_HEIGHT, framed_by=neutral)
         views.append(caption(row, name))
     errors = (shown.restored - shown.truth).norm(dim=-1)

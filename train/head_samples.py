@@ -20,10 +20,11 @@ from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
 from torchface.modeling import color_casts, texture_areas, without_cast
 from torchface.progress import Progress
-from torchface.registration import find_scans
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
+from torchface.workflows.batch.batch_items import find_items
+from torchface.workflows.register.register_scans import SCANS
 
 _METHOD = "gathered heads/2"
 _CAST_VERTICES = 4000
@@ -71,7 +72,7 @@ def registered(folder: Path) -> Source:
     """The meshes of a folder, by name."""
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one of registered meshes")
-    paths = find_scans([folder])
+    paths = [item.path for item in find_items([folder], SCANS).items]
     files = {file.name: file for path in paths for file in (path, *named_files(path))}
     key = content_key(_METHOD, names=[path.name for path in paths], files=files)
     return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number])), key)

@@ -7,6 +7,7 @@ from pathlib import Path
 from torchface import BlendshapeRig, Mesh, load_mesh, load_rig
 from torchface.errors import FileFormatError
 from torchface.io import load_ict_facekit, load_identity_modes
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
@@ -30,7 +31,7 @@ def ict_head_model(folder: Path, part: str | None = None, components: int | None
 
 def load_template(path: Path, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
     """The neutral of a rig, and the rig; or a mesh alone."""
-    if path.is_dir() or path.suffix.lower() in (".glb", ".gltf"):
+    if path.is_dir() or path.suffix.lower() in SCENE_ENDINGS:
         try:
             rig = load_rig(path, part=part)
         except FileFormatError:  # no shapes in it: a mesh

@@ -1,4 +1,4 @@
-"""Captured frames as an enhancement model restores them from their smooth part, beside the truth."""
+"""Captured frames as an enhancement model restores them from what a coarse animation shows, beside the truth."""
 
 from __future__ import annotations
 
@@ -16,13 +16,29 @@ _MOST = 40  # frames that are measured of what was learned
 
 
 @dataclass(frozen=True, eq=False)
+class Shown:
+    """Captured frames, and what a coarse animation shows of each where that is known.
+
+    Args:
+        truth: as captured.
+        coarse: the same frames in the same places, coarse; their own smooth part if None.
+    """
+
+    truth: MeshSequence
+    coarse: MeshSequence | None
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+
+@dataclass(frozen=True, eq=False)
 class Restored:
     """One frame, laid on the neutral.
 
     Args:
         truth: as captured, (V,3), millimetres.
-        smooth: its smooth part, which the model sees.
-        restored: the smooth part with the model's detail.
+        smooth: what the model sees: its smooth part, or the coarse animation.
+        restored: that with the model's detail.
         outside: the share of the regions for which the frame lies outside the database.
     """
 
@@ -33,34 +49,40 @@ class Restored:
 
 
 @torch.no_grad()
-def restored(model: EnhancementModel, frame: Tensor) -> Restored:
-    """A frame (V,3) of the model's mesh, in any place, restored from its smooth part."""
-    smooth = model.low(frame[None])
-    truth = similarity_transform(frame[None], smooth, scale=False).apply(frame[None])
-    found = model.enhance(truth)
+def restored(model: EnhancementModel, frames: Shown, number: int) -> Restored:
+    """A frame of the model's mesh, in any place, restored."""
+    truth = frames.truth.read(number, number + 1)
+    if frames.coarse is None:
+        smooth = model.low(truth)
+        truth = similarity_transform(truth, smooth, scale=False).apply(truth)
+        found = model.enhance(truth)
+    else:
+        smooth = frames.coarse.read(number, number + 1)
+        laid = similarity_transform(smooth, model.neutral[None], scale=False)
+        truth, smooth = laid.apply(truth), laid.apply(smooth)
+        found = model.enhance(smooth)
     return Restored(truth[0], smooth[0], found.vertices[0], float(found.outside.float().mean()))
 
 
-def measured(
-    model: EnhancementModel, learned: MeshSequence, test: MeshSequence | None, progress: Progress
-) -> dict[str, float]:
-    """What goes into the card: the detail that restored frames lack, as a share of what their smooth part lacks."""
+def measured(model: EnhancementModel, learned: Shown, test: Shown | None, progress: Progress) -> dict[str, float]:
+    """What goes into the card: the detail that restored frames lack, as a share of what the model is shown lacks."""
     metrics = {
         "frames learned from": float(len(learned)),
         "vertices": float(len(model.neutral)),
         "detail lost by compression, % of its energy": 100 * model.lost_share,
     }
+    of = "the smooth part's" if learned.coarse is None else "the coarse frames'"
     for name, frames in {"learned": learned, "held out": test}.items():
         if frames is None:
             continue
         missing, given, outside = 0.0, 0.0, []
         numbers = range(0, len(frames), max(1, len(frames) // _MOST))
         for done, number in enumerate(numbers, start=1):  # a frame at a time: they are large
-            one = restored(model, frames.read(number, number + 1)[0])
+            one = restored(model, frames, number)
             missing += float((one.restored - one.truth).square().sum())
             given += float((one.smooth - one.truth).square().sum())
             outside.append(one.outside)
             progress(f"measuring, {name}", done, len(numbers))
-        metrics[f"{name}: missing detail, of the smooth part's"] = (missing / max(given, 1e-30)) ** 0.5
+        metrics[f"{name}: missing detail, of {of}"] = (missing / max(given, 1e-30)) ** 0.5
         metrics[f"{name}: regions outside the database, %"] = 100 * sum(outside) / len(outside)
     return metrics

@@ -81,9 +81,13 @@ class Ruler:
         self.skin = part == part.bincount().argmax()
         """Which vertices are compared, (V,): those of the largest connected part, not eyes or teeth."""
 
+    def smooth(self, displacements: Tensor) -> Tensor:
+        """What the low-pass leaves of displacements (T,V,3)."""
+        return torch.cat([self._low_pass(some) for some in displacements.split(_FRAMES)])
+
     def fine(self, displacements: Tensor) -> Tensor:
         """What the low-pass takes away of displacements (T,V,3)."""
-        return torch.cat([some - self._low_pass(some) for some in displacements.split(_FRAMES)])
+        return displacements - self.smooth(displacements)
 
     def known(self, truth: Tensor) -> Known:
         """What is asked of the truth, consecutive frames (T,V,3), again and again."""

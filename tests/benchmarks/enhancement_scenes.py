@@ -70,7 +70,11 @@ def wrinkled(kind: str, data: Path, vertices: int) -> WrinkledPerformer:
 
 def make_scene(kind: str, data: Path, vertices: int, database: int = 400, window: int = 45) -> Scene:
     """A scene with a database of about so many frames, and windows of so many frames of two other takes."""
-    performer = wrinkled(kind, data, vertices)
+    return scene_of(kind, wrinkled(kind, data, vertices), data, database, window)
+
+
+def scene_of(kind: str, performer: WrinkledPerformer, data: Path, database: int = 400, window: int = 45) -> Scene:
+    """The same of any performer."""
     takes = take_weights(performer.rig, data)
     frames, weights, sequences = [performer.frames(torch.zeros(1, len(performer.names)), FPS)], [], [torch.tensor([0])]
     weights.append(torch.zeros(1, len(performer.names)))

@@ -33,6 +33,8 @@ from enhancement_comparison import (
 from enhancement_pictures import compared
 from enhancement_scenes import FPS
 
+from torchface.enhancement.projection import RegionProjection
+
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 
 
@@ -75,15 +77,18 @@ def test_every_region(bench: Bench, measured: Measured) -> None:
     asked |= {title + "+": name + PAIRS for title, name in asked.items()} | {"input": INPUT}
     titles = "".join(f"{title:>11s}" for title in asked)
     print(f"\n{'fine, share':12s}{'lacks um':>9s}{titles}")
-    worse = []
+    worse, much_worse = [], []
     for region, where in bench.regions.items():
         lacks = bench.ruler.relief(measured.smooth, where)
         row = {name: shares(bench, measured, name, region).fine for name in asked.values()}
         print(f"{region:12s}{lacks:9.1f}" + "".join(f"{value:11.3f}" for value in row.values()))
         if lacks > LEAST_RELIEF:
-            worse += [f"{region}{kind}" for kind in ("", PAIRS)
-                      if not row[LEARNED + kind] < min(row[NEAREST + kind], row[HOLISTIC + kind])]  # fmt: skip
+            for kind in ("", PAIRS):
+                other = min(row[NEAREST + kind], row[HOLISTIC + kind])
+                worse += [region + kind] if row[LEARNED + kind] >= other else []
+                much_worse += [region + kind] if row[LEARNED + kind] > 1.03 * other else []
     print(f"+ from pairs; ours is not below nearest frame and holistic in: {', '.join(worse) or 'none'}")
+    assert not much_worse
 
 
 def test_bars(bench: Bench, measured: Measured) -> None:
@@ -92,8 +97,7 @@ def test_bars(bench: Bench, measured: Measured) -> None:
         own = shares(bench, measured, LEARNED + kind)
         assert own.fine < min(shares(bench, measured, name + kind).fine for name in (NEAREST, HOLISTIC, FOUR))
         assert own.flicker <= 1.2
-    if bench.scene.name == "performer":
-        assert shares(bench, measured, LEARNED + PAIRS).fine <= 0.15
+        assert own.fine <= 0.15
 
 
 def test_pictures(bench: Bench) -> None:
@@ -110,14 +114,32 @@ def test_pictures(bench: Bench) -> None:
         compared(f"{bench.scene.name}, test take {number}", bench.scene.performer.neutral, columns, errors)
 
 
+def test_outside_is_told(bench: Bench) -> None:
+    """Every fourth sequence held out in turn: frames of the same kind are inside, but for a few."""
+    model, told = bench.model, []
+    numbers = model.sequences.unique()[1:]
+    for turn in range(4):
+        out = torch.isin(model.sequences, numbers[turn::4])
+        projection = RegionProjection(model.database_features[~out], model.patch_weights)
+        limits = projection.limits(model.sequences[~out])
+        told.append(projection.project(model.database_features[out]).distances > limits)
+    frames = torch.cat(told)
+    print(f"\n{bench.scene.name}, held-out sequences outside: {float(frames.float().mean()):.1%} of all regions, "
+          f"{float(frames.any(1).float().mean()):.1%} of frames in some region")  # fmt: skip
+    assert float(frames.float().mean()) < 0.05
+
+
 def test_outside_the_range(bench: Bench) -> None:
-    """Weights half as large again, and one take's brows with the other's mouth: no spikes."""
+    """Weights larger by half, doubled, of one side alone, and one take's brows with the other's mouth: no spikes."""
     performer, shown = bench.scene.performer, [weights[::6] for weights in bench.scene.test_weights]
     upper = torch.tensor([name.lower().startswith(("brow", "eye")) for name in performer.names])
     count = len(bench.scene.weights)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:30]
     mixed = torch.where(upper, bench.scene.weights[order], bench.scene.weights[torch.linspace(1, count - 1, 30).long()])
-    asked = {"1.5 x the weights": torch.cat([1.5 * weights for weights in shown]), "unseen combinations": mixed}
+    left = torch.tensor([name.lower().endswith(("left", "_l")) for name in performer.names])
+    once = torch.cat(shown)
+    asked = {"1.5 x the weights": 1.5 * once, "2 x the weights": 2 * once}
+    asked |= {"the right side alone": once.masked_fill(left, 0.0), "unseen combinations": mixed}
     reach = bench.ruler.fine(bench.scene.frames - bench.scene.neutral).norm(dim=2).amax(0)
     limit = float(reach[bench.ruler.skin].max())
     names = (
@@ -140,13 +162,16 @@ def test_outside_the_range(bench: Bench) -> None:
         smooth = bench.ruler.errors(bench.smooth(coarse), known)
         print(f"\n{bench.scene.name}, {what}: {len(weights)} frames\n"
               f"{'':46s}{'fine':>8s}{'normals':>9s}{'largest, of the database':>26s}")  # fmt: skip
+        own = float(bench.ruler.fine(coarse - bench.scene.neutral).norm(dim=2)[:, bench.ruler.skin].max())
+        rows = {}
         for name in names:
             found = bench.methods[name](coarse)
-            row = bench.ruler.shares(bench.ruler.errors(found, known), smooth, known.flicker)
+            row = rows[name] = bench.ruler.shares(bench.ruler.errors(found, known), smooth, known.flicker)
             fine = bench.ruler.fine(found - bench.scene.neutral).norm(dim=2)[:, bench.ruler.skin]
             print(f"{name:46s}{row.fine:8.3f}{row.angle:9.3f}{float(fine.max()) / limit:26.2f}")
             if name in (OURS, LEARNED, LEARNED + PAIRS):
-                assert float(fine.max()) <= 1.5 * limit
+                assert float(fine.max()) <= 1.5 * max(limit, own)
+        assert rows[LEARNED + PAIRS].fine < rows[INPUT].fine
         outside = bench.model.enhance(coarse).outside
         print(f"said to be outside: {float(outside.float().mean()):.0%} of regions and frames")
         frame = int(bench.ruler.fine(truth - coarse).square().sum((1, 2)).argmax())

@@ -50,7 +50,7 @@ def test_spreading_takes_a_part_of_a_frames_time(vertices: int, limit: float, po
     print(f"{vertices} vertices, {points} points: {setting_up:.1f} s, {frame:.3f} s a frame, error {float(error):.3f}")
     assert setting_up < 60
     assert frame < limit
-    assert error < (0.5 if points == 100 else 0.15)
+    assert error < (0.25 if points == 100 else 0.04)
 
 
 def test_the_coarse_level_is_near_the_whole() -> None:

@@ -137,14 +137,14 @@ def test_ten_thousand_from_disk_within_four_gigabytes_killed_once(on_disk: Path,
         for line in child.stdout:
             step = json.loads(line)
             killed_at = step["done"]
-            if killed_at > 0.6 * step["total"]:
+            if killed_at > 0.08 * step["total"]:  # of 30 passes, which are the most that may be needed
                 child.send_signal(signal.SIGKILL)
                 break
-    kept = len(list((tmp_path / "check").glob("gram_*.safetensors")))
+    kept = len(list((tmp_path / "check").glob("*.safetensors")))
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout.splitlines()[-1])
     print(f"\n{SAMPLES} samples x {VERTICES} vertices, {on_disk.stat().st_size / 2**30:.2f} GiB on disk")
-    print(f"killed after {killed_at} blocks, {kept} stripes of the Gram matrix kept; then")
+    print(f"killed after {killed_at} blocks, {kept} basis kept; then")
     print(f"peak {told['gib']:.2f} GiB, {told['wall']:.0f} s, {told['cpu']:.0f} processor seconds")
     assert told["gib"] < 4
     assert kept > 0

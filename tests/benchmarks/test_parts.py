@@ -22,7 +22,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.register_scans import in_place_of
+from torchface.workflows.register.scan_job import in_place_of
 
 HEADS, FRAMES = 20, 100
 SHELLS = 1.2

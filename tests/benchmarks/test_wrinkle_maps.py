@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 def planted() -> ModuleType:
     """The head with wrinkles that the tests of ``modeling.detail`` use."""
-    file = Path(__file__).resolve().parents[1] / "modeling" / "test_detail.py"
+    file = Path(__file__).resolve().parents[1] / "modeling" / "detail" / "test_normal_map_baking.py"
     specification = importlib.util.spec_from_file_location("planted_wrinkles", file)
     assert specification is not None
     assert specification.loader is not None

@@ -81,6 +81,38 @@ def test_damping_holds_on_to_the_frame_before(features, patch_weights):
     assert torch.allclose(first, damped[1:], atol=1e-5)
 
 
+def _sequences(extremes: torch.Tensor) -> torch.Tensor:
+    """Features of five frames each from rest to an extreme (S,4) and back, (5 S,6,9): motions that are not linear."""
+    course = torch.linspace(0, torch.pi, 5).sin()
+    amount = (course[None, :, None] * extremes[:, None]).flatten(0, 1)
+    amount = torch.cat([amount, 0.2 * amount.square()], dim=1)
+    return torch.einsum("km,mpc->kpc", amount, 0.1 * _random(8, 6, 9, seed=5))
+
+
+def test_outside_is_what_the_databases_own_sequences_are_not() -> None:
+    drawn = torch.rand(50, 4, generator=torch.Generator().manual_seed(4))
+    drawn[:, 3] = 0.0  # a motion that the database never shows
+    captured, others = drawn[:30], drawn[30:]
+    projection = RegionProjection(_sequences(captured), torch.tensor([[1.0, 1, 1, 1, 0, 0], [0, 0, 0.5, 1, 1, 1]]))
+    limits = projection.limits(torch.arange(30).repeat_interleave(5))
+
+    def share(extremes: torch.Tensor) -> float:
+        peaks = projection.project(_sequences(extremes)[2::5])
+        return float((peaks.distances > limits).float().mean())
+
+    held_out = projection.project(_sequences(others)).distances > limits
+    assert float(held_out.float().mean()) < 0.03
+    assert share(2 * others) > 0.7
+    assert share(others + torch.tensor([0.0, 0, 0, 0.8])) == 1.0
+    assert share(-0.5 * others) > 0.9
+
+
+def test_sequences_of_an_expression_each_do_not_make_everything_inside(features, patch_weights) -> None:
+    limits = RegionProjection(features, patch_weights).limits(torch.arange(20))
+    assert torch.equal(limits, torch.tensor([0.75, 0.75]).double())
+    assert torch.equal(RegionProjection(features, patch_weights).limits(torch.zeros(20).long()), limits)
+
+
 def test_weights_are_differentiable_in_the_features(features):
     few = features[:6, :2]
     projection = RegionProjection(few, torch.tensor([[0.7, 0.3]]))

@@ -17,11 +17,12 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.video import VideoSolver
+from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
 from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
-from torchface.onnx import export_model, export_video_solver
+from torchface.onnx import export_model, export_video_solver, export_wrinkle_weights
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
 from torchface.workflows.webcam.webcam_export import rendered_frames
@@ -76,6 +77,10 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
     camera = assumed_calibration(640, 480)
     export_video_solver(person, camera, path / "video_solver.onnx")
     (path / "webcam.onnx").write_bytes(webcam_graph())
+    poses = torch.rand(12, 3, generator=torch.Generator().manual_seed(2))
+    regions = torch.ones(1, len(person.vertices))
+    wrinkles = WrinkleWeights.fit(person.vertices, person(poses), poses[:, None], regions, ["face"], components=4)
+    export_wrinkle_weights(RigWrinkles(wrinkles, person), poses, path / "map_weights.onnx")
     film(path)
     marks = synthetic_landmarks(VideoSolver(person, None, camera.intrinsics), 5)[1]
     inputs = {"neutral": people[0], "image": images[0], "markers": markers, "landmarks": marks}
@@ -132,6 +137,7 @@ RESULTS = {
     "Weights from markers": "previous",
     "Weights from landmarks in a video": "weights",
     "From a webcam's picture to weights": "weights",
+    "Wrinkle maps in an engine": "map_weights",
 }
 
 

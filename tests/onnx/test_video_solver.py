@@ -16,6 +16,7 @@ from torchface import __version__
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
 from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.cli import main
+from torchface.correctives import Corrective, Correctives
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io import save_rig
@@ -141,6 +142,25 @@ def test_the_file_is_the_graph(written: VideoReport) -> None:
     assert written.size == written.path.stat().st_size
     assert list(written.path.parent.iterdir()) == [written.path]
     assert "against the exact solve over 100 frames" in str(written)
+
+
+def corrective_rig(rig: BlendshapeRig) -> BlendshapeRig:
+    definitions = (Corrective("open_smile", ("jawOpen", "mouthSmileLeft")), Corrective("open_half", ("jawOpen",), 0.5))
+    deltas = 0.4 * rig.deltas[rig.index(["mouthSmileLeft", "jawOpen"])].roll(1, 2)
+    return BlendshapeRig(rig.neutral, rig.deltas, rig.names, Correctives(deltas, definitions))
+
+
+def test_a_graph_with_correctives_is_the_solve(rig: BlendshapeRig) -> None:
+    solver = VideoSolver(corrective_rig(rig), None, K, settings=VideoSettings(tolerance=1e-8))
+    _, landmarks = synthetic_landmarks(solver, 4)
+    states, _ = solver.states(landmarks)
+    for frame, state in zip(played(VideoGraph(solver), landmarks), states, strict=True):
+        torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
+
+
+@pytest.mark.bench
+def test_a_file_with_correctives_is_the_graph(rig: BlendshapeRig, tmp_path: Path) -> None:
+    assert export_video_solver(corrective_rig(rig), CAMERA, tmp_path / "video_solver.onnx").parity < 1e-5
 
 
 def test_the_metadata_says_what_goes_in_and_out(written: VideoReport, rig: BlendshapeRig) -> None:

@@ -108,6 +108,24 @@ def test_a_run_that_is_killed_goes_on(folder, monkeypatch):
     assert torch.equal(found.database_features, whole.database_features)
 
 
+def test_what_a_coarse_animation_lacks_of_the_same_frames_is_learned(folder, monkeypatch):
+    """Coarse frames whose bumps are too low by a third, which a smooth part could not tell, come back whole."""
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    coarse, rest = folder.parent / "coarse", sheet().vertices
+    coarse.mkdir()
+    shown = [rest + (frames(kind) - rest) * 2 / 3 for kind in range(3)]
+    for name, vertices in zip("abc", shown, strict=True):
+        np.savez(coarse / f"{name}.npz", vertices=vertices.numpy(), faces=sheet().faces.numpy())
+    with pytest.raises(ValueRangeError, match=r"coarse: found no sequence for d.safetensors, expected its 9 frames"):
+        train(settings(folder, coarse=coarse))
+    lower = rest + (0.6 * frames(0) + 0.4 * frames(2) - rest) * 2 / 3
+    np.savez(coarse / "d.npz", vertices=lower.numpy(), faces=sheet().faces.numpy())
+    model = train(settings(folder, coarse=coarse))
+    assert zoo.describe(folder.parent / "model").metrics["learned: missing detail, of the coarse frames'"] < 0.1
+    left = (model(shown[1]) - frames(1)).square().mean().sqrt()
+    assert float(left) < 0.1 * float((shown[1] - frames(1)).square().mean().sqrt())
+
+
 def test_broken_captures_are_told(folder):
     def fails(error: type[TorchfaceError], words: str) -> None:
         with pytest.raises(error, match=words):

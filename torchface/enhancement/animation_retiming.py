@@ -8,59 +8,54 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement.enhancement_model import EnhancementModel
-from torchface.enhancement.retiming import retime_features
+from torchface.enhancement.motion_keyframes import find_keyframes, travelled, without_holds
 from torchface.errors import ShapeError
+from torchface.number_checks import MAX_FPS, MIN_FPS, checked_number
 
 _TOLERANCE = 0.08  # of the animation's range: how far its path may leave the straight way between two keyframes
-_HOLD = 0.01  # of a motion's length: what is shorter at either end is a hold
+_FEWEST = 4  # frames of a motion that has a timing
 
 
-def retime_animation(model: EnhancementModel, coarse: Tensor) -> Tensor:
+def retime_animation(model: EnhancementModel, coarse: Tensor, fps: float) -> Tensor:
     """An animation with the actor's timing between its keyframes, which stay where and what they are.
 
     Args:
         model: of the actor.
         coarse: (T,V,3), millimetres, in the model's mesh.
+        fps: of its frames.
 
     Returns:
         (T,V,3).
 
     Raises:
         TopologyError: another number of vertices, or another order.
+        ValueRangeError: ``fps`` is none.
     """
-    moments = retimed_moments(model, model.features(coarse))
+    checked_number("fps", fps, MIN_FPS, MAX_FPS)
+    moments = retimed_moments(model, model.features(coarse), fps)
     return at_moments(coarse, moments, model.vertex_weights)
 
 
-def retimed_moments(model: EnhancementModel, features: Tensor) -> Tensor:
+def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Tensor:
     """Which moment of an animation each region shows in each frame, (R,T), in frames, never falling.
 
     Args:
         model: of the actor.
         features: of the animation's frames, (T,P,9).
+        fps: of the animation.
     """
     weights = model.patch_weights
     moments = torch.arange(len(features), dtype=torch.float64).expand(len(weights), -1).clone()
     whole = (features.double() * weights.mean(0).sqrt()[:, None]).flatten(1)
-    keys = find_keyframes(whole)
     # Motions are of different length, and few.
-    for first, last in pairwise(keys):
-        lengths = (whole[first + 1 : last + 1] - whole[first:last]).norm(dim=1)
-        travelled = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
-        if not float(travelled[-1]) > 0:
-            continue
-        travelled = travelled / travelled[-1]
-        moving = ((travelled > _HOLD) & (travelled < 1 - _HOLD)).nonzero()[:, 0]
-        if len(moving) < 2:
-            continue
-        begin, end = first + int(moving[0]) - 1, first + int(moving[-1]) + 1
-        own = travelled[begin - first : end - first + 1]
-        own = (own - own[0]) / (own[-1] - own[0])
+    for first, last in pairwise(find_keyframes(whole, _TOLERANCE)):
+        begin, end = (first + frame for frame in without_holds(whole[first : last + 1], fps))
         pair = features[[begin, end]]
-        if torch.equal(pair[0], pair[1]):
+        if end - begin + 1 < _FEWEST or torch.equal(pair[0], pair[1]):
             continue
-        times = retime_features(pair, model.database_features, model.sequences, weights, end - begin + 1)
-        moments[:, begin : end + 1] = begin + _inverse(own, times.double())
+        length = (end - begin) * model.fps / fps
+        times = model.timing.times(pair, end - begin + 1, length)
+        moments[:, begin : end + 1] = begin + _inverse(travelled(whole[begin : end + 1]), times.double())
     return moments
 
 
@@ -92,35 +87,6 @@ def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tenso
     vertices = torch.arange(frames.shape[1])
     share = (place - before).to(frames)[..., None]
     return torch.lerp(frames[before, vertices], frames[after, vertices], share)
-
-
-def find_keyframes(path: Tensor) -> list[int]:
-    """The frames at which a motion (T,D) turns, the first and the last among them, rising.
-
-    The path is simplified as a line: it is cut where it leaves the straight way between two keyframes furthest, until
-    it nowhere leaves it by more than a share of the animation's range.
-
-    Source: Douglas and Peucker 1973.
-    """
-    if len(path) < 3:
-        return list(range(len(path)))
-    limit = _TOLERANCE * float((path.amax(0) - path.amin(0)).norm())
-    keys, open_pieces = [0, len(path) - 1], [(0, len(path) - 1)]
-    # Each cut depends on the one before.
-    while open_pieces:
-        first, last = open_pieces.pop()
-        if last - first < 2:
-            continue
-        way = path[last] - path[first]
-        offset = path[first + 1 : last] - path[first]
-        share = (offset @ way / way.square().sum().clamp(min=1e-30)).clamp(0, 1)
-        distance = (offset - share[:, None] * way).norm(dim=1)
-        worst = int(distance.argmax())
-        if float(distance[worst]) > limit:
-            cut = first + 1 + worst
-            keys.append(cut)
-            open_pieces += [(first, cut), (cut, last)]
-    return sorted(keys)
 
 
 def _inverse(travelled: Tensor, asked: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from torchface.enhancement.actor_timing import ActorTiming
 from torchface.enhancement.aligned_frames import FrameAlignment
 from torchface.enhancement.detail_basis import StreamingBasis, blended
 from torchface.enhancement.displacement_detail import DisplacementDetail
@@ -24,23 +25,25 @@ from torchface.enhancement.model_training import (
     learn_frames,
     warn_without_neutral,
 )
+from torchface.enhancement.own_lids import OwnLids
 from torchface.enhancement.patches import grow_patches
 from torchface.enhancement.projection import RegionProjection
 from torchface.enhancement.regions import Regions, regions_of_motion
-from torchface.enhancement.retiming import retime_features
 from torchface.enhancement.surface_frames import SurfaceFrames
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import triangle_areas
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
 from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress, silent
 
 _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
-_OUTSIDE = 1.0  # of a projection's distance, whose unit is the database's own spread
 _COLOR_RANK = 32
+# Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
+# motion that the smooth part lacks far, for that goes on linearly; with wrinkles alone not so, for they saturate.
+_REACH, _REACH_OF_WRINKLES = 2.0, 0.5
 DetailKind = Literal["displacements", "gradients"]
 Matching = Literal["projection", "learned"]
 _MATCHINGS: tuple[Matching, ...] = ("projection", "learned")
@@ -56,7 +59,8 @@ class Enhancement:
         weights: of the database's frames in each region, (T,R,K), of sum 1.
         distances: of the input from the nearest blend of database frames, by region, (T,R), in units of the
             database's own spread.
-        outside: (T,R) bool, whether the input is so far from the database that its detail is but the nearest.
+        outside: (T,R) bool, whether the input is further from the database than its own sequences are from another,
+            so that its detail is a guess, and far from it but the nearest.
     """
 
     vertices: Tensor
@@ -71,7 +75,7 @@ class EnhancementModel(nn.Module):
     A frame a is laid on the neutral and split, :math:`\ell = d_0 + \mathrm{LowPass}(a - d_0)`. The deformation
     gradients of :math:`\ell`, in the mean over patches, are projected by region onto convex combinations of the
     database's; the same combinations of the database's details, blended over the regions' soft borders, go onto
-    :math:`\ell` in the place of what a itself had beyond it.
+    :math:`\ell` in the place of what a itself had beyond it; lids that a shows itself stay, see ``OwnLids``.
 
     Made by :meth:`fit`. The constructor makes an empty model for a state to be loaded into.
 
@@ -88,6 +92,9 @@ class EnhancementModel(nn.Module):
             for frames beyond it.
         temporal: how much weights hold on to those of the frame before, see ``RegionProjection``.
         keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
+        limits: distances of the R regions from which on a frame is outside of the database, see
+            ``RegionProjection.limits``; 1 of each if absent.
+        scale: how much of what is added to the coarse frames, see :meth:`on_actor`.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
     works on displacements, alignment and averages by patches; detail is of low rank.
@@ -122,6 +129,8 @@ class EnhancementModel(nn.Module):
         keeps_input: bool = False,
         matching: Matching = "learned",
         temporal: float = 0.0,
+        limits: Sequence[float] | None = None,
+        scale: float = 1.0,
     ) -> None:
         super().__init__()
         if detail not in _DETAILS:
@@ -137,7 +146,11 @@ class EnhancementModel(nn.Module):
             raise ValueRangeError(f"matching: found {matching!r:.40}, expected one of {', '.join(_MATCHINGS)}")
         self.matching: Matching = matching
         self.temporal = checked_number("temporal", temporal)
+        self.scale = checked_number("scale", scale)
         regions = len(self.region_names)
+        self.limits = tuple(checked_number("limits", limit, above=True) for limit in limits or [1.0] * regions)
+        if len(self.limits) != regions:
+            raise ValueRangeError(f"limits: found {len(self.limits)}, expected one of each of {regions} regions")
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
         self.register_buffer("patches", torch.zeros(triangles, dtype=torch.int64))
@@ -155,6 +168,8 @@ class EnhancementModel(nn.Module):
         self._vertex_weights: Prepared[Tensor] = Prepared()
         self._projection: Prepared[RegionProjection] = Prepared()
         self._learned: Prepared[LearnedMap] = Prepared()
+        self._timing: Prepared[ActorTiming] = Prepared()
+        self._own_lids: Prepared[OwnLids] = Prepared()
 
     @property
     def config(self) -> dict[str, Any]:
@@ -175,11 +190,19 @@ class EnhancementModel(nn.Module):
             "keeps_input": self.keeps_input,
             "matching": self.matching,
             "temporal": self.temporal,
+            "limits": list(self.limits),
+            "scale": self.scale,
         }
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> EnhancementModel:
-        """A model of zeros for the state to be loaded into."""
+        """A model of zeros for the state to be loaded into.
+
+        Raises:
+            ValueRangeError: the config is of an earlier version, whose detail had other axes.
+        """
+        if "limits" not in config or "scale" not in config:
+            raise ValueRangeError("found a model of an earlier version, expected limits and scale: learn it again")
         return cls(**config)
 
     @classmethod
@@ -254,7 +277,7 @@ class EnhancementModel(nn.Module):
         patches = grow_patches(faces, len(neutral), patch_size, seed)
         encoder = _encoder(neutral, faces, patches, wavelength, detail)
         settings = content_key(
-            "enhancement/1", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
+            "enhancement/2", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
         )
         folder = None if folder is None else Path(folder)
         size = 3 * len(neutral) if detail == "displacements" else 9 * len(faces)
@@ -283,6 +306,8 @@ class EnhancementModel(nn.Module):
         model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
         model.database_features = learned.features
         model.components, model.coefficients = learned.basis.components, learned.basis.coefficients
+        progress("comparing the sequences")
+        model.limits = tuple(model._matching().limits(sequences).tolist())
         if hue is not None and colors is not None:
             model.mean_color = colors.float().mean(0)
             for some in colors.split(32):
@@ -351,12 +376,13 @@ class EnhancementModel(nn.Module):
         offsets = blended(self.color_components, weights @ self.color_coefficients.to(weights), self.vertex_weights)
         return (self.mean_color.to(weights) + offsets.unflatten(1, (3, -1)).transpose(1, 2)).clamp(0, 1)
 
-    def retime(self, keyframes: Tensor, frames: int) -> Tensor:
+    def retime(self, keyframes: Tensor, frames: int, fps: float | None = None) -> Tensor:
         """The actor's timing of a motion between two poses, by region.
 
         Args:
             keyframes: (2,V,3), millimetres, in this mesh and any rigid place.
-            frames: how many the motion lasts at the database's rate, both keyframes counted.
+            frames: how many the motion lasts, both keyframes counted.
+            fps: of these frames; the database's unless given.
 
         Returns:
             How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling; see
@@ -366,31 +392,46 @@ class EnhancementModel(nn.Module):
             TopologyError: another number of vertices, or another order.
             ValueRangeError: the keyframes are equal, fewer than two frames, or NaN.
 
-        Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.
+        Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6. Changed: timing is learned
+        from all motions of a region where it has enough of them.
         """
-        features = self.features(keyframes)
-        return retime_features(features, self.database_features, self.sequences, self.patch_weights, frames)
+        checked_count("frames", frames, 2)
+        fps = self.fps if fps is None else checked_number("fps", fps, MIN_FPS, MAX_FPS)
+        return self.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps)
+
+    @property
+    def timing(self) -> ActorTiming:
+        """How the actor moves between two poses, by region."""
+        return self._timing.get(
+            (self.database_features, self.region_weights, self.neutral, self.sequences),
+            lambda: ActorTiming(self.database_features, self.sequences, self.patch_weights, self.fps),
+        )
 
     def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
-        """This actor's detail for another head of the same mesh.
+        """This actor's detail for another head of the same mesh, as much larger as that head is.
 
         Args:
-            neutral: the other head, (V,3), millimetres.
-            scale: of the detail.
+            neutral: the other head, (V,3), millimetres, in any rigid place.
+            scale: of the difference between enhanced and coarse frames: 0 leaves the coarse ones, whose own lids and
+                lips then move as ever, 2 doubles what is added.
 
         Raises:
             TopologyError: another number of vertices.
         """
-        checked_number("scale", scale)
+        scale = self.scale * checked_number("scale", scale)
         if neutral.shape != self.neutral.shape:
             raise TopologyError(f"neutral: found {tuple(neutral.shape)}, expected {tuple(self.neutral.shape)}")
         if not bool(torch.isfinite(neutral).all()):
             raise ValueRangeError("neutral: found NaN or infinite vertices, expected none")
+        # Features and details have axes: those of this head.
+        pose = similarity_transform(neutral.detach().to(self.neutral)[None], self.neutral[None], scale=False)
+        neutral = pose.apply(neutral.detach().to(self.neutral)[None])[0]
         other = copy.deepcopy(self)
         sizes = [float(vertex_areas(head, self.faces).sum()) ** 0.5 for head in (neutral, self.neutral)]
         other.wavelength = self.wavelength * sizes[0] / sizes[1]
-        other.neutral = neutral.detach().to(self.neutral)
-        other.coefficients = self.coefficients * scale
+        other.coefficients = self.coefficients * (sizes[0] / sizes[1])
+        other.neutral = neutral.to(self.neutral)
+        other.scale = scale
         return other
 
     @property
@@ -421,22 +462,27 @@ class EnhancementModel(nn.Module):
         encoder = self._prepared()
         turned = encoder.frames.turned(smooth)
         features = encoder.gradients.features(smooth, turned)
-        projection = self._matching()
+        projection, limits = self._matching(), torch.tensor(self.limits)
         matched = projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         if self.matching == "learned":
+            reach = limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
             learned = self._learned.get(
-                (self.database_features, self.region_weights, self.neutral, self.coefficients),
-                lambda: LearnedMap(projection, self.coefficients),
+                (self.database_features, self.region_weights, self.neutral, self.coefficients, reach),
+                lambda: LearnedMap(projection, self.coefficients, reach),
             )
             coefficients = coefficients + learned.corrections(features, matched)
         weights = encoder.detail.site_weights(self.vertex_weights)
         details = blended(self.components, coefficients, weights)
-        base = self.neutral.to(smooth) + (displacements if self.keeps_input else smooth)
-        vertices = encoder.detail.compose(base, details, turned)
-        return Enhancement(
-            pose.inverse().apply(vertices), matched.weights, matched.distances, matched.distances > _OUTSIDE
-        )
+        low, own = (self.neutral.to(smooth) + moved for moved in (smooth, displacements))
+        if self.keeps_input:
+            vertices = encoder.detail.compose(own, details, turned)
+        else:
+            vertices = self._lids()(encoder.detail.compose(low, details, turned), low, own)
+        if self.scale != 1.0:
+            vertices = own + self.scale * (vertices - own)
+        outside = matched.distances > limits.to(matched.distances)
+        return Enhancement(pose.inverse().apply(vertices), matched.weights, matched.distances, outside)
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:
         """The smooth part of displacements from the neutral, all of them, and how the frames were laid on it."""
@@ -455,6 +501,13 @@ class EnhancementModel(nn.Module):
             return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
 
         return self._projection.get((self.database_features, self.region_weights, self.neutral, self.temporal), made)
+
+    def _lids(self) -> OwnLids:
+        def made() -> OwnLids:
+            eyes = [number for number, name in enumerate(self.region_names) if name.startswith("eye")]
+            return OwnLids(self.neutral, self.faces, self.region_weights[eyes] == 1)
+
+        return self._own_lids.get((self.neutral, self.faces, self.region_weights), made)
 
     def _check_frames(self, coarse: Tensor) -> None:
         if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:

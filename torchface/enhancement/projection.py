@@ -9,11 +9,14 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.number_checks import checked_number
-from torchface.optim.simplex_qp import simplex_qp
+from torchface.optim.simplex_qp import SimplexQP
 
 RIDGE = 1e-4
 """Of the mean squared norm of the database's features."""
 
+_HELD_OUT = 200  # frames at most that limits are told from
+_QUANTILE, _MARGIN = 0.95, 2.0
+_LEAST_LIMIT, _MOST_LIMIT = 0.1, 0.75  # of the database's spread
 _FAINT = 1e-3  # of a region's largest weight of a patch: fainter patches are left out
 _LOST = 1e-8  # of the features' energy, in coordinates of fewer dimensions
 # Two gradients are as far apart as the sum of squares of all nine entries says: a rotation by an angle moves two
@@ -91,10 +94,12 @@ class RegionProjection:
         self._spaces = [_space(features, weights) for weights in patch_weights]
         energy = torch.stack([space.known.square().sum(1).mean() for space in self._spaces]).clamp(min=1e-24)
         self.spread = energy.sqrt()
-        identity = torch.eye(len(features), dtype=torch.float64)
-        self._unit = energy
+        identity = torch.eye(len(features), dtype=torch.float64, device=features.device)
         ridges = checked_number("ridge", ridge, 0.0) * energy[:, None, None] * identity
-        self._H = torch.stack([space.known @ space.known.T for space in self._spaces]) + ridges
+        H = torch.stack([space.known @ space.known.T for space in self._spaces]) + ridges
+        self._alone = SimplexQP(H)
+        self._pull = self.temporal * energy[:, None]
+        self._held = SimplexQP(H + self._pull[..., None] * identity) if self.temporal > 0 else None
 
     def project(self, features: Tensor, previous: Tensor | None = None) -> Matched:
         """The combinations of the database that look most like frames.
@@ -110,14 +115,42 @@ class RegionProjection:
             raise ShapeError(f"features: found {tuple(features.shape)}, expected (T,{self.patch_count},9)")
         centred = [space.centred(features) for space in self._spaces]
         inside = [(rows @ space.axes.to(rows)).double() for rows, space in zip(centred, self._spaces, strict=True)]
-        linear = torch.stack([-rows @ space.known.T for rows, space in zip(inside, self._spaces, strict=True)], dim=1)
-        weights = self._damped(linear, previous) if self.temporal > 0 else self._each_alone(linear)
-        distances = []
-        for row, (space, rows, all_of_it) in enumerate(zip(self._spaces, inside, centred, strict=True)):
-            beyond = all_of_it.double().square().sum(1) - rows.square().sum(1)
-            left = (weights[:, row] @ space.known - rows).square().sum(1) + beyond
-            distances.append(left.clamp(min=1e-30).sqrt() / self.spread[row])
-        return Matched(weights.to(features), torch.stack(distances, dim=1).to(features))
+        linear = torch.stack([-rows @ space.known.T for rows, space in zip(inside, self._spaces, strict=True)])
+        solved = self._alone(linear) if self._held is None else self._damped(self._held, linear, previous)
+        pairs = zip(centred, inside, strict=True)
+        beyond = [whole.double().square().sum(1) - rows.square().sum(1) for whole, rows in pairs]
+        distances = self._distances(solved, inside, beyond)
+        return Matched(solved.transpose(0, 1).to(features), distances.to(features))
+
+    def limits(self, sequences: Tensor) -> Tensor:
+        """From what distance on a frame is unlike the database, (R,), in units of the database's spread.
+
+        Twice the distance within which 95 % of the database's frames lie from all its sequences but their own, between
+        0.1 and 0.75: sequences that show an expression each say little of one another.
+
+        Args:
+            sequences: the number of each frame's sequence, (K,) int64.
+        """
+        if len(sequences.unique()) < 2:
+            return torch.full((len(self._spaces),), _MOST_LIMIT, dtype=torch.float64)
+        chosen = torch.linspace(0, self.frame_count - 1, min(_HELD_OUT, self.frame_count)).long()
+        rows = [space.known[chosen] for space in self._spaces]
+        linear = torch.stack([-own @ space.known.T for own, space in zip(rows, self._spaces, strict=True)])
+        # Frames of the own sequence cost more than any others could: one matrix serves for all.
+        most = torch.stack([space.known.square().sum(1).amax() for space in self._spaces])
+        own_sequence = sequences[chosen][:, None] == sequences
+        weights = self._alone(linear + 20 * most[:, None, None] * own_sequence)
+        distances = self._distances(weights, rows, [torch.zeros(len(chosen), dtype=torch.float64)] * len(rows))
+        return (_MARGIN * distances.quantile(_QUANTILE, dim=0)).clamp(_LEAST_LIMIT, _MOST_LIMIT)
+
+    def _distances(self, weights: Tensor, inside: list[Tensor], beyond: list[Tensor]) -> Tensor:
+        """Of points from combinations (R,T,K), (T,R): points by their coordinates, and squared distance off these."""
+        parts = zip(self._spaces, weights, inside, beyond, self.spread, strict=True)
+        left = [
+            ((own @ space.known - rows).square().sum(1) + off).clamp(min=1e-30).sqrt() / spread
+            for space, own, rows, off, spread in parts
+        ]
+        return torch.stack(left, dim=1)
 
     @property
     def known(self) -> list[Tensor]:
@@ -131,27 +164,19 @@ class RegionProjection:
             (space.centred(features) @ space.axes.to(features)).double() - own @ space.known for space, own in pairs
         ]
 
-    def _each_alone(self, linear: Tensor) -> Tensor:
-        rows = [simplex_qp(H, f.contiguous()) for H, f in zip(self._H, linear.unbind(1), strict=True)]
-        return torch.stack(rows, dim=1)
-
-    def _damped(self, linear: Tensor, previous: Tensor | None) -> Tensor:
-        pull = self.temporal * self._unit[:, None]
-        H = self._H + torch.diag_embed(pull.expand(-1, self.frame_count))
+    def _damped(self, solve: SimplexQP, linear: Tensor, previous: Tensor | None) -> Tensor:
+        """Weights (R,T,K), each frame from where the one before ends."""
         before = None if previous is None else previous.double()
         found = []
-        for f in linear:  # each frame begins where the one before ends
-            if before is None:
-                before = torch.stack([simplex_qp(A, b[None])[0] for A, b in zip(self._H, f, strict=True)])
-            else:
-                before = simplex_qp(H, f - pull * before, start=before)
+        for f in linear.unbind(1):
+            before = self._alone(f) if before is None else solve(f - self._pull.to(f) * before, start=before)
             found.append(before)
-        return torch.stack(found) if found else linear.new_zeros(linear.shape)
+        return torch.stack(found, dim=1) if found else linear.new_zeros(linear.shape)
 
 
 def _space(features: Tensor, weights: Tensor) -> _Space:
     patches = (weights > _FAINT * weights.max()).nonzero()[:, 0]
-    roots = weights[patches].sqrt()[:, None].float() * features.new_tensor(_UNITS)
+    roots = weights[patches].sqrt()[:, None].to(features) * features.new_tensor(_UNITS)
     rows = (features[:, patches] * roots).flatten(1)
     mean = rows.mean(0)
     rows = rows - mean
@@ -159,7 +184,7 @@ def _space(features: Tensor, weights: Tensor) -> _Space:
     values, vectors = values.clamp(min=0).flip(0), vectors.flip(1)
     left = values.sum() - values.cumsum(0)
     count = max(1, int((left > _LOST * values.sum()).sum()) + 1) if float(values.sum()) > 0 else 1
-    vectors = vectors[:, :count].float()
+    vectors = vectors[:, :count].to(rows)
     # Orthonormal again: rounding in the small values would otherwise bend distances.
     axes = torch.linalg.qr(rows.T @ vectors)[0]
     return _Space(patches, roots, mean, axes, (rows @ axes).double())

@@ -78,58 +78,94 @@ def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
     return SequenceProjection(segments + inside, (alpha - found).norm(dim=1))
 
 
-def retime_features(
-    keyframes: Tensor, database: Tensor, sequences: Tensor, weights: Tensor, frames: int, nearest: int = NEAREST
+def nearest_timing(
+    keyframes: Tensor, owned: Sequence[Tensor], region: Tensor, frames: int, length: float, nearest: int = NEAREST
 ) -> Tensor:
-    """How far the motion between two keyframes has come in each frame, by region.
+    """How far a region's motion between two keyframes has come in each frame, by its nearest captured motions.
 
-    In each region the pair is projected in order onto each sequence of the database; what it meets is extended to the
-    whole of that motion, from where it sets in to where it ends. The timings of the nearest motions, in pose and in
-    length, are averaged, nearer ones weighing more.
+    The pair is projected in order onto each sequence; what it meets is extended to the whole of that motion, from where
+    it sets in to where it ends. The timings of the nearest motions, in pose and in length, are averaged, nearer ones
+    weighing more.
 
     Args:
         keyframes: features of both, (2,P,C).
-        database: features of the captured frames, (K,P,C).
-        sequences: the number of each captured frame's sequence, (K,).
-        weights: of patches in each region, (R,P).
-        frames: how many the motion lasts at the database's rate, both keyframes counted.
-        nearest: how many captured motions are averaged.
+        owned: features of each captured sequence, (n,P,C) each, see :func:`captured_sequences`.
+        region: the share of each patch in the region, (P,).
+        frames: at even distance, both keyframes counted.
+        length: of the motion, in frames of the database.
+        nearest: how many captured motions are averaged; the paper takes one.
 
     Returns:
-        (R,frames), 0 first and 1 last, never falling. A region at rest follows the whole face.
-
-    Raises:
-        ShapeError: the shapes do not fit.
-        ValueRangeError: the keyframes are equal, fewer than two frames, or no sequence has two frames.
+        (frames,), 0 first and 1 last, never falling.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2. Changed: several motions are
     averaged, and extending is the default.
     """
-    checked_count("frames", frames, 2)
     checked_count("nearest", nearest, 1)
-    if keyframes.ndim != 3 or len(keyframes) != 2 or keyframes.shape[1:] != database.shape[1:]:
+    scale = region.clamp(min=0).sqrt().double()[:, None]
+    pair = (keyframes.double() * scale).flatten(1)
+    size = float((pair[1] - pair[0]).norm().clamp(min=1e-12))
+    motions: list[Tensor] = []
+    errors: list[float] = []
+    for sequence in owned:
+        captured = (sequence.double() * scale).flatten(1)
+        times, error = _on_one_motion(pair, captured)
+        motion = _extended(captured, times, pair[1] - pair[0])
+        if len(motion) < 2:
+            continue
+        # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
+        missed = (pair[1] - pair[0] - (motion[-1] - motion[0])).norm()
+        # Quick motions have another course than slow ones.
+        errors.append((error + float(missed)) / size + abs(math.log((len(motion) - 1) / length)))
+        motions.append(motion)
+    if not motions:
+        return torch.linspace(0, 1, frames, dtype=keyframes.dtype)
+    order = torch.tensor(errors, dtype=torch.float64).sort(stable=True)
+    chosen = order.indices[:nearest].tolist()
+    shares = 1 / (order.values[:nearest] + 0.1 * order.values[0] + 1e-6)
+    curves = torch.stack([motion_progress(motions[index], frames) for index in chosen])
+    times = ((shares / shares.sum()) @ curves).clamp(0, 1).to(keyframes.dtype)
+    times[-1] = 1
+    return times
+
+
+def captured_sequences(database: Tensor, sequences: Tensor) -> list[Tensor]:
+    """The captured sequences (n,P,C) of two frames or more, of features (K,P,C) and each frame's number (K,).
+
+    Raises:
+        ShapeError: the shapes do not fit.
+        ValueRangeError: none has two frames.
+    """
+    if database.ndim != 3 or sequences.shape != database.shape[:1]:
         raise ShapeError(
-            f"keyframes: found features {tuple(keyframes.shape)}, expected (2,*) of {tuple(database.shape)}"
+            f"database: found {tuple(database.shape)} and sequences {tuple(sequences.shape)}, expected (K,P,C), (K,)"
         )
-    if not float((keyframes[1] - keyframes[0]).abs().max()) > 1e-7:
-        raise ValueRangeError("keyframes: found two that are equal, expected a motion between them")
     owned = [database[sequences == number] for number in sequences.unique()]
     owned = [sequence for sequence in owned if len(sequence) > 1]
     if not owned:
         raise ValueRangeError(
             "sequences: found none of two frames or more, expected captured motions to take timing from"
         )
-    whole = weights.mean(0)
-    motion = (keyframes[1] - keyframes[0]).square().sum(-1)
-    rows, together = [], None
-    for region in weights:  # each has its own nearest motions
-        moves = float((region * motion).sum()) > _STILL**2 * float(motion.sum()) * float(region.mean())
-        if moves:
-            rows.append(_region_times(keyframes, owned, region, frames, nearest))
-        else:
-            together = _region_times(keyframes, owned, whole, frames, nearest) if together is None else together
-            rows.append(together)
-    return torch.stack(rows)
+    return owned
+
+
+def check_keyframes(keyframes: Tensor, shape: tuple[int, ...]) -> None:
+    """Refuses what is no pair of features of this shape with a motion between them.
+
+    Raises:
+        ShapeError: another shape.
+        ValueRangeError: the two are equal.
+    """
+    if keyframes.ndim != 3 or len(keyframes) != 2 or keyframes.shape[1:] != shape:
+        raise ShapeError(f"keyframes: found features {tuple(keyframes.shape)}, expected (2,*) of {tuple(shape)}")
+    if not float((keyframes[1] - keyframes[0]).abs().max()) > 1e-7:
+        raise ValueRangeError("keyframes: found two that are equal, expected a motion between them")
+
+
+def moving_regions(keyframes: Tensor, weights: Tensor) -> Tensor:
+    """Which regions, of weights (R,P), move between two keyframes, features (2,P,C): (R,) bool."""
+    motion = (keyframes[1] - keyframes[0]).square().sum(-1).to(weights)
+    return weights @ motion > _STILL**2 * motion.sum() * weights.mean(1)
 
 
 def interpolate(keyframes: Tensor, times: Tensor, vertex_weights: Tensor) -> Tensor:
@@ -176,34 +212,6 @@ def motion_progress(motion: Tensor, frames: int) -> Tensor:
     progress = _interpolated(moments, times, asked)
     progress[0], progress[-1] = 0, 1
     return progress
-
-
-def _region_times(keyframes: Tensor, owned: Sequence[Tensor], region: Tensor, frames: int, nearest: int) -> Tensor:
-    scale = region.clamp(min=0).sqrt().double()[:, None]
-    pair = (keyframes.double() * scale).flatten(1)
-    size = float((pair[1] - pair[0]).norm().clamp(min=1e-12))
-    motions: list[Tensor] = []
-    errors: list[float] = []
-    for sequence in owned:
-        captured = (sequence.double() * scale).flatten(1)
-        times, error = _on_one_motion(pair, captured)
-        motion = _extended(captured, times, pair[1] - pair[0])
-        if len(motion) < 2:
-            continue
-        # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
-        missed = (pair[1] - pair[0] - (motion[-1] - motion[0])).norm()
-        # Quick motions have another course than slow ones.
-        errors.append((error + float(missed)) / size + abs(math.log(len(motion) / frames)))
-        motions.append(motion)
-    if not motions:
-        return torch.linspace(0, 1, frames, dtype=keyframes.dtype)
-    order = torch.tensor(errors, dtype=torch.float64).sort(stable=True)
-    chosen = order.indices[:nearest].tolist()
-    shares = 1 / (order.values[:nearest] + 0.1 * order.values[0] + 1e-6)
-    curves = torch.stack([motion_progress(motions[index], frames) for index in chosen])
-    times = ((shares / shares.sum()) @ curves).clamp(0, 1).to(keyframes.dtype)
-    times[-1] = 1
-    return times
 
 
 def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:

@@ -13,7 +13,7 @@ from torchface.enhancement.low_pass import vertex_areas
 from torchface.enhancement.polar_parts import encode_gradients
 from torchface.enhancement.sparse_operator import SparseOperator
 from torchface.geometry.meshes.deformation import gradient_operator
-from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
+from torchface.geometry.meshes.operators import edges, triangle_areas, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class SurfaceFrames:
     def __init__(self, neutral: Tensor, faces: Tensor) -> None:
         rest, faces = neutral.detach().double().cpu(), faces.cpu()
         self._areas = vertex_areas(rest, faces).numpy()
-        self.rest_axes = _rest_axes(vertex_normals(rest, faces))
+        self.rest_axes = _rest_axes(rest, faces)
         around = _mean_over_triangles(rest, faces)
         self._tangents = sparse.csr_array(_tangent_operator(rest, faces, around, self.rest_axes[:2].numpy()))
         self._operator = SparseOperator(self._tangents)
@@ -147,11 +147,24 @@ def _cross(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
-def _rest_axes(normals: Tensor) -> Tensor:
-    """Two tangents and the normal of every vertex, (3,V,3); those of a loose vertex are the axes of space."""
+def _rest_axes(rest: Tensor, faces: Tensor) -> Tensor:
+    """Two tangents and the normal of every vertex, (3,V,3); those of a loose vertex are the axes of space.
+
+    The first tangent goes towards the neighbour of the least number, so heads of one mesh have the same axes, and they
+    turn with the head.
+    """
+    count = len(rest)
+    pairs = edges(faces)
+    towards = torch.full((count,), count).scatter_reduce(0, pairs.flip(1).flatten(), pairs.flatten(), "amin")
+    loose = towards == count
+    way = rest[towards.masked_fill(loose, 0)] - rest
+    normals = vertex_normals(rest, faces)
     normals = torch.where(normals.norm(dim=1, keepdim=True) > 0.5, normals, torch.tensor([0.0, 0.0, 1.0]).to(normals))
+    first = way - (way * normals).sum(1, keepdim=True) * normals
+    bad = loose | (first.norm(dim=1) < 1e-3 * way.norm(dim=1).clamp(min=1e-9))
     aside = torch.zeros_like(normals).scatter_(1, normals.abs().argmin(1, keepdim=True), 1.0)
-    first = torch.nn.functional.normalize(torch.linalg.cross(aside, normals), dim=1)
+    first = torch.where(bad[:, None], torch.linalg.cross(aside, normals), first)
+    first = torch.nn.functional.normalize(first, dim=1, eps=1e-30)
     return torch.stack([first, torch.linalg.cross(normals, first), normals])
 
 

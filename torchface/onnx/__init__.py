@@ -3,6 +3,7 @@
 from torchface.onnx.action_unit_graph import ActionUnitReport, export_action_units
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior
+from torchface.onnx.enhancement_graph import export_wrinkle_weights
 from torchface.onnx.example_graph_export import ExampleReport, export_example_solver
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.model_export import export_model
@@ -27,4 +28,5 @@ __all__ = [
     "export_model",
     "export_solver",
     "export_video_solver",
+    "export_wrinkle_weights",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from itertools import accumulate
 from operator import mul
 
@@ -49,6 +50,7 @@ class GaussNewtonStep(nn.Module):
     freedoms: Tensor
     sizes: Tensor
     series: Tensor
+    corrective_basis: Tensor | None
 
     def __init__(self, solver: VideoSolver) -> None:
         super().__init__()
@@ -75,11 +77,14 @@ class GaussNewtonStep(nn.Module):
             "series": points.rest.new_tensor(list(series)),
         }.items():
             self.register_buffer(name, value)
+        self.activation = copy.deepcopy(points.activation)
+        self.register_buffer("corrective_basis", points.corrective_basis)
 
     @property
     def points(self) -> FacePoints:
         """Of the rig."""
-        return FacePoints(self.rest, self.basis, self.rows, self.valid, self.side)
+        more = self.activation, self.corrective_basis
+        return FacePoints(self.rest, self.basis, self.rows, self.valid, self.side, *more)
 
     def chosen(self, head: HeadState) -> Tensor:
         """Which point each landmark is, (1,68); see ``FacePoints.chosen``."""

@@ -53,6 +53,10 @@ class GraphBuilder:
         """A float32 constant under a name of its own; the same numbers are kept once."""
         return self._once(value.detach().cpu().numpy().astype(np.float32, order="C"))
 
+    def double(self, value: Tensor) -> str:
+        """A float64 constant under a name of its own; the same numbers are kept once."""
+        return self._once(value.detach().cpu().numpy().astype(np.float64, order="C"))
+
     def _once(self, array: np.ndarray) -> str:
         name = f"{array.dtype} {'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
         self._root._constants[name] = numpy_helper.from_array(array, name)

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_model import corrective_model
 from torchface.onnx.solver_graph import STEPS, SolverGraph
 from torchface.onnx.solver_graph_export import choose_rho, random_frames
 from torchface.onnx.solver_model import solver_model
@@ -29,13 +31,18 @@ class LiveMarkerSolver:
 
     def __init__(self, solver: MarkerSolver) -> None:
         solver = solver.cpu().float()
-        graph = SolverGraph(solver, rho=choose_rho(solver, STEPS, random_frames(solver, _TRIAL_FRAMES)))
+        if solver.activation is not None:
+            made = corrective_model(CorrectiveGraph(solver))
+        else:
+            rho = choose_rho(solver, STEPS, random_frames(solver, _TRIAL_FRAMES))
+            made = solver_model(SolverGraph(solver, rho=rho))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         # A thread that spins between frames would take a core from the application.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        model = solver_model(graph).SerializeToString()
-        self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        self._session = onnxruntime.InferenceSession(
+            made.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
         self.names, self.labels = solver.names, solver.labels
         self._weights = np.zeros((1, len(self.names)), np.float32)
         # The first run allocates; better before the first frame than in it.

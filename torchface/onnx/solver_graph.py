@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
-from torchface.errors import ShapeError
+from torchface.errors import ShapeError, ValueRangeError
 from torchface.optim.box_problem import metric
 from torchface.optim.operator_splitting import RELAXATION, RHO, prepare_splitting
 
@@ -69,6 +69,8 @@ class SolverGraph(nn.Module):
         rho: float = RHO,
     ) -> None:
         super().__init__()
+        if solver.activation is not None:
+            raise ValueRangeError("solver graph: found a rig with correctives, expected none; see CorrectiveGraph")
         self.names, self.labels = solver.names, solver.labels
         self.steps, self.steps_with_gaps, self.rho = steps, steps_with_gaps, rho
         self.sparsity, self.ridge = penalty_value(solver.sparsity), penalty_value(solver.ridge)

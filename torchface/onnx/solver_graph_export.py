@@ -20,6 +20,8 @@ from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolve
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
+from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_model import corrective_model
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.solver_graph import STEPS, STEPS_WITH_GAPS, SolverGraph
 from torchface.onnx.solver_model import solver_model
@@ -30,7 +32,7 @@ _PARITY = 1e-5
 # Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
 # that computes something else lies much farther.
 _ROUNDINGS = 10.0
-_TEST_FRAMES = 512
+_TEST_FRAMES, _CORRECTIVE_FRAMES = 512, 48
 _FRAMES_A_POSE = 10
 
 
@@ -119,7 +121,7 @@ def export_solver(
         path: the file to write; it appears only when it is complete and checked.
         alignment: marker space to rig space, baked in.
         sparsity, ridge: as in ``MarkerSolver``.
-        steps, steps_with_gaps: as in ``SolverGraph``.
+        steps, steps_with_gaps: as in ``SolverGraph``; a rig with correctives takes ``CorrectiveGraph``'s.
         markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
 
     Raises:
@@ -146,9 +148,13 @@ def export_marker_solver(
         facts: further metadata, such as licence and data.
     """
     solver = copy.deepcopy(solver).cpu().float()
+    if solver.activation is not None:
+        frames = random_frames(solver, _CORRECTIVE_FRAMES) if markers is None else markers.cpu().float()
+        corrected = CorrectiveGraph(solver)
+        return _export(corrective_model(corrected, facts), corrected, solver, frames, (), path)
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
     graph = SolverGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
-    return _export(graph, solver, frames, (), path, facts)
+    return _export(solver_model(graph, facts), graph, solver, frames, (), path)
 
 
 def export_hybrid_solver(
@@ -177,19 +183,18 @@ def export_hybrid_solver(
     shape = (len(frames), len(solver.names))
     predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
     gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
-    return _export(graph, HybridSolver(solver), frames, (predicted, gamma), path)
+    return _export(solver_model(graph), graph, HybridSolver(solver), frames, (predicted, gamma), path)
 
 
 def _export(
-    graph: SolverGraph,
+    model: onnx.ModelProto,
+    graph: SolverGraph | CorrectiveGraph,
     solver: MarkerSolver | HybridSolver,
     frames: Tensor,
     more: tuple[Tensor, ...],
     path: str | Path,
-    facts: Mapping[str, object] | None = None,
 ) -> SolverReport:
     """Checks and writes a graph; ``more`` are its inputs after the markers and the weights before."""
-    model = solver_model(graph, facts)
     session = _session(model)
     gaps = tuple(_gap(session, graph, solver, frames, more, missing) for missing in (0.0, 0.1, 0.3))
     for gap in gaps:
@@ -222,7 +227,7 @@ def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
     markers = markers.double()
     energy = exact.energy(markers)
     least = energy.value(exact(markers))
-    cold = torch.zeros_like(energy.f)
+    cold = torch.zeros_like(least[:, None]).expand(-1, len(solver.names))
 
     def gap(rho: float) -> float:
         return float((energy.value(SolverGraph(exact, steps, rho=rho)(markers, cold)) / least).quantile(0.98))
@@ -239,7 +244,7 @@ def random_frames(solver: MarkerSolver, count: int, noise: float = 0.3, seed: in
     time_ = torch.arange(count) / _FRAMES_A_POSE
     before, share = time_.long(), time_.frac()[:, None]
     weights = (torch.lerp(keys[before], keys[before + 1], share)).to(solver.basis)
-    points = solver.rest + torch.einsum("mcn,bn->bmc", solver.basis, weights)
+    points = solver.points(weights).to(solver.rest)
     points = points + noise * torch.randn(points.shape, generator=generator)
     return points if solver.alignment is None else solver.alignment.inverse().apply(points)
 
@@ -266,7 +271,7 @@ def _run(session: onnxruntime.InferenceSession, markers: Tensor, previous: Tenso
 
 def _gap(
     session: onnxruntime.InferenceSession,
-    graph: SolverGraph,
+    graph: SolverGraph | CorrectiveGraph,
     solver: MarkerSolver | HybridSolver,
     frames: Tensor,
     more: tuple[Tensor, ...],

@@ -181,8 +181,10 @@ def test_hits_too_far_or_from_inside_leave_the_map_flat(face: Mesh, forehead: Me
 
 def test_offset_tells_on_which_side_the_scan_lies(face: Mesh) -> None:
     outside = face.with_vertices(face.vertices + 1.5 * vertex_normals(face.vertices, face.faces))
-    statistics = bake_normal_map(face, outside, 256, alignment=still()).statistics
-    assert statistics.median_offset == pytest.approx(1.5, abs=0.02)
+    baked = bake_normal_map(face, outside, 256, alignment=still())
+    assert baked.statistics.median_offset == pytest.approx(1.5, abs=0.02)
+    assert (baked.heights[baked.hit] - 1.5).abs().max() < 0.2
+    assert (baked.heights[baked.hit] - 1.5).abs().mean() < 0.02
     inside = face.with_vertices(face.vertices - 1.5 * vertex_normals(face.vertices, face.faces))
     assert bake_normal_map(face, inside, 256, alignment=still()).statistics.median_offset == pytest.approx(
         -1.5, abs=0.02

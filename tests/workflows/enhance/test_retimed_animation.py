@@ -28,9 +28,18 @@ def test_pieces_are_those_of_the_whole(actor: Actor, tmp_path: Path, monkeypatch
     given = read_coarse(path, actor.mesh, InputSettings(), tmp_path, silent)
     found = retimed_animation.retimed_animation(given, model, silent)
     with torch.no_grad():
-        whole = retime_animation(model, frames)
+        whole = retime_animation(model, frames, given.fps)
     pieces = torch.cat([found.read(0, 4), found.read(4, len(frames))])
     torch.testing.assert_close(pieces, whole, atol=2e-3, rtol=0)
     torch.testing.assert_close(pieces[[0, -1]], frames[[0, -1]], atol=2e-3, rtol=0)
     assert float((pieces - frames).abs().max()) > 0.01
     assert "retimed" in found.notes[-1]
+
+
+def test_the_report_says_which_region_moved_in_time_and_how_far() -> None:
+    shifts = torch.tensor([[0.0, 0.1, 0.0, 0.0], [0.0, 0.3, 0.2, 0.0]])
+    note = retimed_animation.shift_note(shifts, ("brow", "mouth"))
+    assert "50% of the frames" in note
+    assert "0.20 s away in the mean" in note
+    assert "0.30 s (mouth)" in note
+    assert "no motion" in retimed_animation.shift_note(torch.zeros(2, 4), ("brow", "mouth"))

@@ -50,12 +50,14 @@ class NormalMap:
     Args:
         normals: unit vectors in tangent space (see ``torchface.geometry.meshes.tangent_space``), (3,H,W).
         hit: the texels that the scan covers, (H,W) bool; the others are flat.
+        heights: by which the scan stands out of the mesh along the normal, millimetres, (H,W); 0 where not hit.
         alignment: how the scan was laid on the mesh; none where it was given.
         statistics: what the rays found.
     """
 
     normals: Tensor
     hit: Tensor
+    heights: Tensor
     alignment: ScanAlignment | None
     statistics: BakeStatistics
 
@@ -95,7 +97,7 @@ def bake_normal_map(
         padding: texels by which charts are dilated, so that seams do not show when the map is filtered.
 
     Returns:
-        ``NormalMap(normals (3,H,W), hit (H,W), alignment, statistics)``.
+        ``NormalMap(normals (3,H,W), hit (H,W), heights (H,W), alignment, statistics)``.
 
     Raises:
         ShapeError: fewer than three correspondences.
@@ -135,8 +137,14 @@ def bake_normal_map(
     image.view(3, -1)[:, texels.texels] = normals.T
     hit = torch.zeros(height * width, dtype=torch.bool)
     hit[texels.texels] = seen
+    heights = torch.zeros(1, height, width)
+    heights.view(-1)[texels.texels] = torch.where(seen, offset, 0.0)
     return NormalMap(
-        dilate(image, texels.mask(), padding), hit.view(height, width), found, _statistics(offset[seen], len(offset))
+        dilate(image, texels.mask(), padding),
+        hit.view(height, width),
+        dilate(heights, texels.mask(), padding)[0],
+        found,
+        _statistics(offset[seen], len(offset)),
     )
 
 
@@ -164,7 +172,7 @@ def detail_maps(names: Sequence[str], baked: Sequence[NormalMap], neutral: Norma
 
 
 def dilate(image: Tensor, covered: Tensor, distance: int) -> Tensor:
-    """The image (3,H,W) whose texels outside the charts take the value of the nearest inside, up to a distance."""
+    """The image (C,H,W) whose texels outside the charts take the value of the nearest inside, up to a distance."""
     if distance == 0 or bool(covered.all()):
         return image
     # Only texels near a chart matter; the transform over all others would be thrown away.

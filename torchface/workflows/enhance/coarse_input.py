@@ -74,7 +74,7 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     for name, value in (("--attachment", settings.attachment), ("--neutral", settings.neutral)):
         if value is not None:
             raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
-    animated = load_animated(_tracked(path), settings.rig, settings.part)
+    animated = load_animated(tracked_animation(path), settings.rig, settings.part)
     if has_topology_of(animated.neutral, model):
         return same_topology(animated, model, settings.fps)
     found = find_correspondence(animated.neutral, model, settings.pairs, path, state / CORRESPONDENCE, progress)
@@ -96,8 +96,8 @@ def has_topology_of(mesh: Mesh, model: Mesh) -> bool:
     return same and bool((mesh.faces.cpu() == model.faces.cpu()).all())
 
 
-def _tracked(path: Path) -> Path:
-    """Of the folder of a tracked video its animation, which brings the rig along."""
+def tracked_animation(path: Path) -> Path:
+    """Of the folder of a tracked video its animation, which brings the rig along; any other path as it is."""
     if path.is_dir() and (path / SUMMARY).is_file() and (path / ANIMATION).is_file():
         return path / ANIMATION
     return path

@@ -92,7 +92,7 @@ class Enhanced:
             f"{count} frames of {self.animation.kind} on {vertices} vertices, {self.animation.fps:g} a second; model "
             f"{self.model_name}, {len(self.model.sequences)} frames, {len(self.model.regions.names)} regions",
             f"{self.outside_share:.0%} of the frames are outside of what the model has seen in some region"
-            + (" (there the smooth input keeps the nearest detail)" if self.outside_share else ""),
+            + (" (there detail is a guess, and far away but the nearest)" if self.outside_share else ""),
         ]
         if self.frames.enhanced:
             rate = self.frames.enhanced / max(self.frames.seconds, 1e-9)

@@ -53,8 +53,8 @@ def write_enhance_page(done: Enhanced, out: Path, height: int = _HEIGHT) -> Path
         Section(
             "How near the database comes",
             "Distance of each frame from the model's frames, by region, relative to how these differ among one "
-            f"another. {done.outside_share:.0%} of the frames are outside in some region: there the nearest detail is "
-            "used.",
+            f"another. {done.outside_share:.0%} of the frames are outside in some region, further away than twice what "
+            "the model's own sequences are from each other: there detail is a guess, and far away but the nearest.",
             [_regions(done)],
             [("distances.png", distance_curves(done))],
         ),
@@ -84,11 +84,12 @@ def _regions(done: Enhanced) -> Table:
             name,
             f"{float(distances[:, i].median()):.3f}",
             f"{float(distances[:, i].quantile(0.95)):.3f}",
+            f"{done.model.limits[i]:.3f}",
             f"{float(outside[i]):.1%}",
         )
         for i, name in enumerate(done.model.regions.names)
     ]
-    return Table(("region", "median distance", "95 %", "frames outside"), rows)
+    return Table(("region", "median distance", "95 %", "outside from", "frames outside"), rows)
 
 
 def _player(done: Enhanced) -> str:

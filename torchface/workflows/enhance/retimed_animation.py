@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -27,7 +28,7 @@ def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progr
         with torch.no_grad():
             features.append(model.features(animation.read(begin, min(begin + step, animation.count))))
     progress("timing the motions between keyframes")
-    moments = retimed_moments(model, torch.cat(features))
+    moments = retimed_moments(model, torch.cat(features), animation.fps)
     shares = model.vertex_weights
 
     def read(begin: int, end: int) -> Tensor:
@@ -36,6 +37,18 @@ def retimed_animation(animation: CoarseAnimation, model: EnhancementModel, progr
         last = min(math.ceil(float(asked.max())) + 1, animation.count)
         return at_moments(animation.read(first, last), asked - first, shares)
 
-    furthest = float((moments - torch.arange(animation.count)).abs().max()) / animation.fps
-    note = f"retimed: motions between keyframes take the actor's timing, at most {furthest:.2f} s from the input's"
+    note = shift_note((moments - torch.arange(animation.count)).abs() / animation.fps, model.region_names)
     return replace(animation, read=read, notes=(*animation.notes, note))
+
+
+def shift_note(shifts: Tensor, names: Sequence[str]) -> str:
+    """How far regions' frames (R,T) were moved in time, seconds, in words."""
+    if not float(shifts.max()) > 0:
+        return "retimed: no motion between keyframes was found; the timing is the input's"
+    furthest = shifts.amax(1)
+    region, moved = int(furthest.argmax()), shifts > 0
+    return (
+        f"retimed: motions between keyframes take the actor's timing; {float(moved.any(0).float().mean()):.0%} of the "
+        f"frames show another moment, {float(shifts[moved].mean()):.2f} s away in the mean and at most "
+        f"{float(furthest[region]):.2f} s ({names[region]})"
+    )

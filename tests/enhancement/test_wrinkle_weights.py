@@ -1,0 +1,171 @@
+"""Maps of wrinkles that weights of regions mix, and the weights of a rig's pose."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.enhancement.conftest import Database
+from torchface.correctives import Corrective, Correctives
+from torchface.enhancement import EnhancementModel
+from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
+from torchface.enhancement.low_pass import vertex_areas
+from torchface.enhancement.wrinkle_basis import WrinkleBasis, learn_wrinkle_basis
+from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights, nearest_rotation
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.rig import BlendshapeRig
+from torchface.synthetic.head.performer import performer
+
+SHAPES = ("browInnerUp", "mouthSmileLeft", "mouthSmileRight", "mouthPucker", "noseSneerLeft", "jawOpen")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def as_basis(rows: Tensor, rank: int) -> LearnedBasis:
+    """Rows (K,n) as their components and coefficients."""
+    found = StreamingBasis(rows.shape[1], rank)
+    found.add(rows.clone())
+    return found.finished()
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    return performer(texture=False).select(SHAPES)
+
+
+@pytest.fixture(scope="module")
+def shares(model: EnhancementModel) -> Tensor:
+    return model.vertex_weights
+
+
+@pytest.fixture(scope="module")
+def poses() -> Tensor:
+    return torch.rand(60, len(SHAPES), generator=seeded())
+
+
+@pytest.fixture(scope="module")
+def planted(poses: Tensor, model: EnhancementModel) -> Tensor:
+    """Weights (60,R,2): what saturates with one shape, and a product of two, in every region."""
+    pair = torch.stack([1 - (-3 * poses[:, 0]).exp(), poses[:, 1] * poses[:, 2]], dim=1)
+    return (pair / pair.amax(0))[:, None].repeat(1, len(model.region_names), 1)
+
+
+@pytest.fixture(scope="module")
+def learned(rig: BlendshapeRig, poses: Tensor, planted: Tensor, shares: Tensor) -> WrinkleWeights:
+    return WrinkleWeights.fit(rig.vertices, rig(poses), planted, shares, [f"region {i}" for i in range(len(shares))])
+
+
+def test_the_weights_of_planted_maps_are_found(database: Database, shares: Tensor, model: EnhancementModel) -> None:
+    count = len(database.neutral)
+    maps = torch.randn(1, 3, count, generator=seeded())
+    weights = torch.rand(40, len(shares), 1, generator=seeded(1))
+    weights = weights / weights.amax(0)
+    areas = vertex_areas(database.neutral, database.faces)
+    details = as_basis(WrinkleBasis(maps, shares, areas).details(weights), 40)
+    found = learn_wrinkle_basis(details, shares, areas, 1)
+    # Where regions share a border one may have a little of the other's: it shows in no vertex.
+    assert (found.weights(details) - weights).abs().mean() < 0.02
+    assert (found.maps - maps).square().mean().sqrt() < 0.03
+    assert found.missed_share(found.weights(details), details) < 0.01
+
+
+def test_more_maps_show_more_and_the_share_missed_is_what_it_is(
+    database: Database, shares: Tensor, model: EnhancementModel
+) -> None:
+    areas = vertex_areas(database.neutral, database.faces).float()
+    rows = (database.frames - database.smooth).transpose(1, 2).flatten(1).contiguous()
+    details = as_basis(rows, 36)
+    missed = []
+    for count in (1, 3):
+        basis = learn_wrinkle_basis(details, shares, areas, count)
+        weights = basis.weights(details)
+        assert float(weights.min()) >= 0
+        assert float(weights.max()) <= 1
+        left = (basis.details(weights) - rows).square() * areas.repeat(3)
+        assert basis.missed_share(weights, details) == pytest.approx(
+            float((left.sum() / (rows.square() * areas.repeat(3)).sum()).sqrt()), abs=2e-3
+        )
+        missed.append(basis.missed_share(weights, details))
+    assert missed[1] < 0.5 * missed[0]
+    assert missed[1] < 0.05
+
+
+def test_poses_that_were_not_learned_get_the_planted_weights(
+    rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor
+) -> None:
+    largest = 1 - (-3 * poses[:, 0].max()).exp()
+    poses = 0.1 + 0.8 * torch.rand(30, len(SHAPES), generator=seeded(2))
+    expected = 1 - (-3 * poses[:, 0]).exp()
+    brow = int(
+        learned.moments(rig.deltas[:1, learned.sites])[0, 3:].view(len(learned.region_names), -1).norm(dim=1).argmax()
+    )
+    found = learned.predict(rig(poses))[:, brow, 0]
+    assert (found - expected / largest).abs().mean() < 0.05
+    assert torch.corrcoef(torch.stack([found, expected]))[0, 1] > 0.99
+
+
+def test_a_head_that_turns_keeps_its_weights_and_the_neutral_has_none(
+    rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor
+) -> None:
+    vertices = rig(poses[:5])
+    turned = vertices @ rotation_matrix(torch.tensor([0.4, -1.9, 0.7])).T + torch.tensor([300.0, -50.0, 900.0])
+    torch.testing.assert_close(learned(turned), learned(vertices), atol=2e-3, rtol=0)
+    assert float(learned(rig.vertices[None]).abs().max()) == 0
+
+
+def test_blendshape_weights_give_what_the_vertices_give(
+    rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor
+) -> None:
+    torch.testing.assert_close(RigWrinkles(learned, rig)(poses), learned(rig(poses)), atol=5e-4, rtol=0)
+    both = Correctives(2 * torch.roll(rig.deltas[:1], 1, dims=2), (Corrective("smiles", (SHAPES[1], SHAPES[2])),))
+    corrected = BlendshapeRig(rig.neutral, rig.deltas, rig.names, both)
+    torch.testing.assert_close(RigWrinkles(learned, corrected)(poses), learned(corrected(poses)), atol=5e-4, rtol=0)
+    assert not torch.allclose(learned(corrected(poses)), learned(rig(poses)), atol=1e-2)
+
+
+def test_far_poses_stay_within_bounds(rig: BlendshapeRig, learned: WrinkleWeights) -> None:
+    found = learned(rig(5 * torch.rand(10, len(SHAPES), generator=seeded(3))))
+    assert float(found.min()) >= 0
+    assert float(found.max()) <= 1
+
+
+def test_the_state_brings_the_module_back(rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor) -> None:
+    again = WrinkleWeights.from_config(learned.config)
+    again.load_state_dict(learned.state_dict())
+    assert torch.equal(again(rig(poses)), learned(rig(poses)))
+
+
+def test_the_nearest_rotation_is_the_polar_one() -> None:
+    strain = torch.eye(3) + 0.2 * torch.randn(20, 3, 3, generator=seeded())
+    u, _, vh = torch.linalg.svd(strain)
+    torch.testing.assert_close(nearest_rotation(10 * strain), u @ vh, atol=1e-4, rtol=0)
+
+
+def test_what_does_not_fit_is_refused(
+    rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor, shares: Tensor
+) -> None:
+    vertices = rig(poses[:2])
+    with pytest.raises(TopologyError, match=f"{len(rig.vertices)},3"):
+        learned.predict(vertices[:, :-1])
+    vertices[1, 7] = torch.nan
+    with pytest.raises(ValueRangeError, match="frame 1"):
+        learned.predict(vertices)
+    moved = BlendshapeRig(rig.neutral.with_vertices(1.1 * rig.vertices), rig.deltas, rig.names)
+    with pytest.raises(TopologyError, match="mm from the one"):
+        RigWrinkles(learned, moved)
+    with pytest.raises(ValueRangeError, match="NaN"):
+        WrinkleWeights.fit(rig.vertices, vertices, torch.zeros(2, len(shares), 1), shares, learned.region_names)
+    with pytest.raises(ShapeError, match="regions"):
+        WrinkleWeights.fit(rig.vertices, rig(poses), torch.zeros(60, 2, 1), shares, learned.region_names)
+    flat = LearnedBasis(torch.zeros(1, 3 * len(rig.vertices)).half(), torch.zeros(4, 1), 0.0)
+    areas = torch.ones(len(rig.vertices))
+    with pytest.raises(ValueRangeError, match="without detail"):
+        learn_wrinkle_basis(flat, shares, areas, 2)
+    with pytest.raises(ValueRangeError, match="at most as many"):
+        learn_wrinkle_basis(flat, shares, areas, 5)
+    with pytest.raises(ShapeError, match="region weights"):
+        learn_wrinkle_basis(flat, shares[:, 1:], areas, 2)

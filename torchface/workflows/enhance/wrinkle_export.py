@@ -1,0 +1,289 @@
+"""Wrinkles for a game engine: an actor's model and a rig become maps, their weights' graphs and a ``.glb``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchface.enhancement import EnhancementModel
+from torchface.enhancement.detail_basis import LearnedBasis
+from torchface.enhancement.low_pass import vertex_areas
+from torchface.enhancement.wrinkle_basis import MAPS, WrinkleBasis, learn_wrinkle_basis
+from torchface.enhancement.wrinkle_teaching import captured_poses, taught_details, teaching_poses
+from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
+from torchface.errors import FileFormatError, TopologyError, ValueRangeError
+from torchface.files.documents import write_json
+from torchface.files.job_lock import within_job
+from torchface.files.whole_files import make_folder
+from torchface.geometry.meshes.region_maps import RegionMaps
+from torchface.io import load_rig, load_take, save_animation, save_image16, save_normal_map, save_rig
+from torchface.io.tables.csv_table import write_table
+from torchface.mesh import Mesh
+from torchface.number_checks import checked_count
+from torchface.onnx import ExportReport, export_wrinkle_weights
+from torchface.progress import Progress, silent
+from torchface.rig import BlendshapeRig
+from torchface.take import Take
+from torchface.workflows.enhance.coarse_animation import OTHER_ACTOR_MM
+from torchface.workflows.enhance.enhance_animation import STATE, SUMMARY, load_model
+from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
+from torchface.workflows.enhance.rig_on_model import RigOnModel, lay_rig
+from torchface.workflows.enhance.wrinkle_baking import bake_region_maps
+
+GLB, BY_WEIGHTS, BY_VERTICES = "wrinkles.glb", "map_weights.onnx", "map_weights_of_vertices.onnx"
+TRACK, PICTURES = "map_weights.csv", "maps"
+_CORRESPONDENCE = "correspondence.safetensors"
+_FORMAT = "torchface.wrinkle-maps/1"
+_LEFT_OUT = 5  # of so many poses one is not learned from, to measure on
+_CHECKED = 20  # poses that the graphs are checked with
+_POORLY_SHOWN = 0.5
+MOST_MAPS = 12
+SIZES = (64, 8192)
+BEYOND_SHAPES = 20
+
+
+@dataclass(frozen=True)
+class WrinkleSettings:
+    """What is made.
+
+    Args:
+        maps: how many.
+        size: of each, texels a side.
+        poses: that weights are learned from.
+        pairs: vertices of the rig and where they lie on the model; registration tells if absent.
+        part: keep this annotated region of the rig only.
+        animation: weights that the ``.glb`` plays, with the maps' weights beside it.
+    """
+
+    maps: int = MAPS
+    size: int = 1024
+    poses: int = 300
+    pairs: Path | None = None
+    part: str | None = None
+    animation: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedWrinkles:
+    """What was made, and how much of the actor's detail it shows.
+
+    Args:
+        maps: the maps.
+        wrinkles: what gives their weights.
+        missed_by_maps: of the model's detail on poses whose weights were not learned, with the best weights, root mean
+            square, as a share.
+        missed: the same with the weights that are found for them.
+        graphs: how the graphs were checked.
+        products: files by what they are.
+        notes: lines for people to read; warnings begin with ``warning: ``.
+    """
+
+    maps: RegionMaps
+    wrinkles: WrinkleWeights
+    missed_by_maps: float
+    missed: float
+    graphs: tuple[ExportReport, ...]
+    products: dict[str, Path]
+    notes: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """For people to read."""
+        size = "x".join(map(str, self.maps.neutral.shape[1:]))
+        return [
+            f"{len(self.maps.normals)} maps of {size} texels, {len(self.maps.regions)} regions: "
+            f"{len(self.maps.regions) * len(self.maps.normals)} weights a frame",
+            f"of the model's detail the maps lack {self.missed_by_maps:.0%} with the best weights, {self.missed:.0%} "
+            "with those found for poses that were not learned (root mean square)",
+            *(line for graph in self.graphs for line in str(graph).splitlines()),
+            *self.notes,
+        ]
+
+
+def export_wrinkles(
+    model_name: str,
+    rig_path: Path,
+    out: Path,
+    settings: WrinkleSettings = WrinkleSettings(),
+    progress: Progress | None = None,
+) -> ExportedWrinkles:
+    """Learns, bakes and writes; see ``torchface export enhancement --help`` for the arguments.
+
+    Raises:
+        TopologyError: the rig has no texture coordinates.
+        AlignmentError: the rig does not lie on the model.
+        TorchfaceError: a file is broken or does not fit the others, or the disk is full.
+    """
+    progress = silent if progress is None else progress
+    checked_count("--maps", settings.maps, 1, MOST_MAPS)
+    checked_count("--size", settings.size, *SIZES)
+    with within_job(out):
+        return _export(model_name, rig_path, out, settings, progress)
+
+
+def _export(
+    model_name: str, rig_path: Path, out: Path, settings: WrinkleSettings, progress: Progress
+) -> ExportedWrinkles:
+    progress("reading model and rig")
+    model = load_model(model_name)
+    rig = load_rig(rig_path, part=settings.part)
+    if rig.neutral.uvs is None or rig.neutral.uv_faces is None:
+        raise TopologyError(f"{rig_path}: found a rig without texture coordinates, expected some to bake maps into")
+    if not rig.names:
+        raise TopologyError(f"{rig_path}: found a mesh without shapes, expected a rig to move")
+    checked_count("--poses", settings.poses, len(rig.names) + BEYOND_SHAPES)
+    take = None if settings.animation is None else _take(settings.animation)
+    played = None if take is None or take.weights is None else rig.weights_from(take.weights).float()
+    state = make_folder(out / STATE)
+    surface = Mesh(model.neutral, model.faces)
+    laid = lay_rig(rig, rig_path, surface, settings.pairs, state / _CORRESPONDENCE, progress)
+    if laid.found.how == "its topology" and laid.found.residual > OTHER_ACTOR_MM:
+        model, laid, surface = _on_actor(model, laid)
+    shares = laid.carried(model.vertex_weights, surface)
+    poses, details = _taught(model, laid, shares, settings.poses, progress)
+    progress("learning maps")
+    basis = learn_wrinkle_basis(
+        details, model.vertex_weights, vertex_areas(model.neutral, model.faces).float(), settings.maps
+    )
+    wrinkles, missed_by_maps, missed = _learned(basis, details, laid, poses, shares, model.region_names, progress)
+    maps = bake_region_maps(
+        laid.laid, surface, basis.maps, shares, model.region_names, laid.scale, settings.size, progress
+    )
+    progress("writing")
+    products, graphs = _write(out, maps, wrinkles, rig, poses, take, played)
+    notes = list(laid.notes)
+    if missed > _POORLY_SHOWN:
+        notes.append(
+            f"warning: the maps lack {missed:.0%} of the model's detail in poses that were not learned; more poses "
+            "(--poses) or maps (--maps) would show more"
+        )
+    done = ExportedWrinkles(maps, wrinkles, missed_by_maps, missed, graphs, products, tuple(notes))
+    write_json(out / SUMMARY, _summary(done, model_name, rig_path, len(poses)))
+    return done
+
+
+def _take(path: Path) -> Take:
+    take = load_take(path)
+    if take.weights is None or not len(take.weights):
+        raise FileFormatError(f"{path}: found no weights, expected an animation of the rig's shapes")
+    if not bool(torch.isfinite(take.weights.values).all()):
+        raise ValueRangeError(f"{path}: found NaN or infinite weights, expected numbers")
+    return take
+
+
+def _on_actor(model: EnhancementModel, laid: RigOnModel) -> tuple[EnhancementModel, RigOnModel, Mesh]:
+    """The model's detail for the rig's own head."""
+    head = laid.dense(laid.rig.vertices[None])[0]
+    found = laid.found
+    own = HeadCorrespondence(found.pose, head, found.known, found.residual, found.how)
+    model = model.on_actor(head)
+    return model, RigOnModel(laid.rig, own, laid.dense, laid.notes), Mesh(head, model.faces)
+
+
+def _taught(
+    model: EnhancementModel, laid: RigOnModel, shares: Tensor, count: int, progress: Progress
+) -> tuple[Tensor, LearnedBasis]:
+    """Poses of the rig (K,N), and what the model adds to them."""
+    rig = laid.rig
+
+    def dense(weights: Tensor) -> Tensor:
+        with torch.no_grad():
+            return laid.dense(rig(weights))
+
+    shapes = []
+    for number, one in enumerate(torch.eye(len(rig.names)).split(1)):  # a shape at a time bounds the memory
+        shapes.append(model.features(dense(one)))
+        progress("posing the rig as the actor", number + 1, len(rig.names))
+    captured = captured_poses(model, torch.cat(shapes))
+    moved = shares @ rig.deltas.square().sum(-1).T
+    poses = teaching_poses(captured, moved, count)
+    return poses, taught_details(model, lambda begin, end: dense(poses[begin:end]), len(poses), progress)
+
+
+def _learned(
+    basis: WrinkleBasis,
+    details: LearnedBasis,
+    laid: RigOnModel,
+    poses: Tensor,
+    shares: Tensor,
+    regions: tuple[str, ...],
+    progress: Progress,
+) -> tuple[WrinkleWeights, float, float]:
+    """Weights of the rig's vertices; what the maps lack, and what they lack with such weights."""
+    progress("learning their weights")
+    weights, sites = basis.weights(details), laid.sites()
+    with torch.no_grad():
+        posed = torch.cat([laid.rig(some)[:, sites] for some in poses.split(16)])
+        # What a shape does that was never seen alone cannot be known: of the poses after these some are left out.
+        row = torch.arange(len(poses)) - len(laid.rig.names)
+        left_out = (row >= 0) & (row % _LEFT_OUT == _LEFT_OUT - 1)
+        neutral, near = laid.rig.vertices[sites], shares[:, sites]
+        measured = WrinkleWeights.fit(neutral, posed[~left_out], weights[~left_out], near, regions)
+        rows = LearnedBasis(details.components, details.coefficients[left_out], details.lost_share)
+        missed = basis.missed_share(measured(posed[left_out]), rows)
+        wrinkles = WrinkleWeights.fit(neutral, posed, weights, near, regions)
+    return wrinkles.of_whole(sites, len(laid.rig.vertices)), basis.missed_share(weights[left_out], rows), missed
+
+
+def _write(
+    out: Path,
+    maps: RegionMaps,
+    wrinkles: WrinkleWeights,
+    rig: BlendshapeRig,
+    poses: Tensor,
+    take: Take | None,
+    played: Tensor | None,
+) -> tuple[dict[str, Path], tuple[ExportReport, ...]]:
+    products = {"rig with maps": out / GLB, "map weights of blendshape weights": out / BY_WEIGHTS}
+    products |= {"map weights of the rig's vertices": out / BY_VERTICES, "maps": out / PICTURES}
+    by_rig = RigWrinkles(wrinkles, rig)
+    facts = {"maps": [f"wrinkle_{i}" for i in range(len(maps.normals))]}
+    some = poses[torch.linspace(0, len(poses) - 1, _CHECKED).round().long()]
+    with torch.no_grad():
+        graphs = (
+            export_wrinkle_weights(by_rig, some, out / BY_WEIGHTS, facts),
+            export_wrinkle_weights(wrinkles, rig(some), out / BY_VERTICES, facts),
+        )
+    _write_pictures(maps, make_folder(out / PICTURES))
+    if take is None or played is None:
+        save_rig(rig, out / GLB, maps)
+        return products, graphs
+    save_animation(rig, take, out / GLB, maps)
+    with torch.no_grad():
+        values = by_rig(played).flatten(1)
+    header = [f"{region}.{name}" for region in maps.regions for name in facts["maps"]]
+    rows = ([f"{t / take.fps:.6g}", *(f"{value:.5g}" for value in row)] for t, row in enumerate(values.tolist()))
+    write_table(out / TRACK, ["seconds", *header], rows)
+    return products | {"map weights of the animation": out / TRACK}, graphs
+
+
+def _write_pictures(maps: RegionMaps, folder: Path) -> None:
+    """The maps as PNG of 16 bits, for engines that take no ``.glb``."""
+    save_normal_map(maps.neutral, folder / "neutral_normals.png")
+    low, high = float(maps.heights.min()), float(maps.heights.max())
+    for number, (normals, heights) in enumerate(zip(maps.normals, maps.heights, strict=True)):
+        save_normal_map(normals, folder / f"wrinkle_{number}_normals.png")
+        grey = (heights - low) / max(high - low, 1e-6)
+        save_image16(grey.expand(3, -1, -1), folder / f"wrinkle_{number}_heights.png")
+    for name, mask in zip(maps.regions, maps.masks, strict=True):
+        save_image16(mask.expand(3, -1, -1), folder / f"mask_{name}.png")
+
+
+def _summary(done: ExportedWrinkles, model_name: str, rig: Path, poses: int) -> dict[str, Any]:
+    return {
+        "format": _FORMAT,
+        "model": model_name,
+        "rig": rig.name,
+        "regions": list(done.maps.regions),
+        "maps": len(done.maps.normals),
+        "size": list(done.maps.neutral.shape[1:]),
+        "height_range_mm": [float(done.maps.heights.min()), float(done.maps.heights.max())],
+        "poses": poses,
+        "missed_share_with_best_weights": done.missed_by_maps,
+        "missed_share_with_found_weights": done.missed,
+        "notes": list(done.notes),
+        "files": {what: path.name for what, path in done.products.items()},
+    }
