@@ -5,7 +5,7 @@ RUN := $(VENV)/bin/python
 export OMP_WAIT_POLICY ?= PASSIVE
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test bench fuzz lint app clean
+.PHONY: demo test test-blender test-cluster bench fuzz lint app clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes"
@@ -21,6 +21,22 @@ $(VENV)/.installed-%: $(STAMP)
 # Two processes of one thread each, the longest files first; what is costly to make once (a synthetic video, a browser) stays in one.
 test: $(VENV)/.installed-test
 	OMP_NUM_THREADS=1 $(RUN) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+# Blender's package has a Python of its own: it wants 3.11 and numpy below 2.
+BLENDER_PYTHON ?= python3.11
+BLENDER := .venv-blender
+$(BLENDER)/.installed: constraints.txt
+	@echo "installing Blender into $(BLENDER), 400 MB"
+	$(BLENDER_PYTHON) -m venv $(BLENDER)
+	$(BLENDER)/bin/python -m pip install --quiet --constraint constraints.txt bpy
+	touch $@
+
+test-blender: $(VENV)/.installed-test $(BLENDER)/.installed
+	TORCHFACE_BLENDER=$(BLENDER)/bin/python $(RUN) -m pytest -m blender tests/io/blender
+
+# Ray starts clusters of two nodes on this machine; should it hang, the time limit ends it.
+test-cluster: $(VENV)/.installed-cluster
+	RAY_USAGE_STATS_ENABLED=0 OMP_NUM_THREADS=1 timeout 600 $(RUN) -m pytest -m cluster tests/workflows/batch
 
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s
@@ -45,4 +61,4 @@ app:
 	cd export/web && npm ci --ignore-scripts --no-audit --no-fund && npx vite build --emptyOutDir --outDir ../../torchface/_app/dist
 
 clean:
-	rm -rf $(VENV) out torchface/_app
+	rm -rf $(VENV) $(BLENDER) out torchface/_app

@@ -46,23 +46,27 @@ LONGEST = (
 """Where the longest tests lie, which go first: then the processes of a run end together."""
 
 
-BROWSERS = ("export/web_app/test_app_in_chromium", "viz/browser", "viz/reports/test_player")
-"""The tests of Chromium, all for one process: two browsers beside each other would take the time from one another."""
+TOGETHER = {
+    "browsers": ("export/web_app/test_app_in_chromium", "viz/browser", "viz/reports/test_player"),
+    "action units": ("capture/action_units",),
+}
+"""Files for one process: two browsers take the time from one another, and a filmed session is costly to make twice."""
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Distributes files as ``--dist loadfile`` does, those of Chromium together as one."""
+    """Distributes files as ``--dist loadfile`` does, those that belong together as one."""
     if config.getoption("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
 
-    class BrowsersTogether(LoadFileScheduling):
+    class FilesTogether(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = super()._split_scope(nodeid)
-            return "browsers" if file.removeprefix("tests/").startswith(BROWSERS) else file
+            path = file.removeprefix("tests/")
+            return next((name for name, files in TOGETHER.items() if path.startswith(files)), file)
 
-    return BrowsersTogether(config, log)
+    return FilesTogether(config, log)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -126,7 +130,12 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
 def coarse_figures() -> Iterator[None]:
     """Figures of reports with one ray a pixel and no shadow in creases, for tests that do not look at them."""
     figures = ("face_views", "marker_maps", "registration_views", "wireframe", "site_views")
-    pages = ("workflows.solve.solve_page", "workflows.register_scans", "workflows.enhance.enhance_views")
+    pages = (
+        "workflows.solve.solve_page",
+        "workflows.register.scan_job",
+        "workflows.batch.contact_sheet",
+        "workflows.enhance.enhance_views",
+    )
 
     def coarse(mesh: Mesh, camera: Camera, *rest: Any, **more: Any) -> torch.Tensor:
         given = inspect.signature(render).bind(mesh, camera, *rest, **more)

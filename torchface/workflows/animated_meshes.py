@@ -10,16 +10,19 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
-from torchface.io import MeshSequence, load_mesh, load_rig, load_take
-from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
+from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
+from torchface.io.tables.csv_table import TableReader
+from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.weights.live_link_csv import is_live_link
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Track
 
-_GLTF = (".glb", ".gltf")
-_FORMS = "weights as .csv, an animated .glb, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
+_FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,7 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
     """Reads meshes over time.
 
     Args:
-        path: weights as ``.csv`` (of which the rig makes meshes); a ``.glb`` or ``.gltf`` with an animation of its
+        path: weights as ``.csv`` (of which the rig makes meshes); a glTF or USD file with an animation of its
             shapes, or without, which is one frame; a mesh sequence as ``.safetensors``
             (:class:`torchface.io.MeshSequence`); a mesh; or a folder of meshes, a frame each, in the order of their
             names.
@@ -83,13 +86,24 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
         found = _of_weights(path, loaded)
     elif ending == ".safetensors":
         found = _of_sequence(path, loaded)
-    elif ending in _GLTF:
-        found = _of_gltf(path, loaded)
+    elif ending in SCENE_ENDINGS:
+        found = _of_scene(path, loaded)
     elif ending in MESH_ENDINGS:
         found = _of_meshes(path, [path], loaded)
     else:
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
     return found if part is None else _kept(found, region(found.neutral, part))
+
+
+def is_animation(path: Path) -> bool:
+    """Whether :func:`load_animated` reads a file or folder, by ending, header, and what the folder holds."""
+    if path.is_dir():
+        return any(file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS) for file in path.iterdir())
+    ending = path.suffix.lower()
+    if ending == ".csv":
+        header = TableReader(path).header
+        return is_live_link(header) or (is_numbered(header) and not is_marker_header(header))
+    return ending in (".safetensors", *MESH_ENDINGS, *SCENE_ENDINGS)
 
 
 def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
@@ -115,8 +129,8 @@ def _moved(path: Path, rig: BlendshapeRig, track: Track, fps: float) -> Animated
     return AnimatedMesh(path, rig.neutral, len(weights), read, fps, own, rig)
 
 
-def _of_gltf(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
-    take = read_gltf_weights(path)
+def _of_scene(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+    take = load_animation(path)
     if take is None or take.weights is None:
         return _of_meshes(path, [path], rig)
     return _moved(path, load_rig(path), take.weights, take.fps)
@@ -132,7 +146,7 @@ def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
 
 
 def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *_GLTF))
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
     return _of_meshes(folder, files, rig)

@@ -13,9 +13,9 @@ from torchface.capture.webcam import ExampleShapes, ExampleSolver, landmark_obse
 from torchface.capture.webcam.examples.example_shapes import is_examples
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
-from torchface.io import load_mesh, load_rig, load_take
-from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.io import load_animation, load_mesh, load_rig, load_take
 from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -38,7 +38,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         FileFormatError: nothing that torchface reads.
     """
     suffix = path.suffix.lower()
-    if path.is_dir() or suffix in {".glb", ".gltf"}:
+    if path.is_dir() or suffix in SCENE_ENDINGS:
         try:
             rig = load_rig(path, part=part)
         except FileFormatError:
@@ -67,7 +67,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
     if suffix == ".onnx":
         return _graph_rows(path)
     raise FileFormatError(
-        f"{path}: found the ending {suffix!r}, expected .glb .obj .ply .stl .off .c3d .trc .csv .json .onnx"
+        f"{path}: found the ending {suffix!r}, expected .glb .usdc .obj .ply .stl .off .c3d .trc .csv .json .onnx"
     )
 
 
@@ -104,12 +104,16 @@ def _mesh_rows(mesh: Mesh) -> Rows:
 def _rig_rows(rig: BlendshapeRig) -> Rows:
     reach = rig.deltas.norm(dim=-1).amax(1)
     shapes = ", ".join(f"{name} {float(r):.1f}" for name, r in zip(rig.names, reach, strict=True))
-    return [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("largest motion, mm", shapes)]
+    rows = [*_mesh_rows(rig.neutral), ("shapes", str(len(rig.names))), ("largest motion, mm", shapes)]
+    if rig.correctives is not None:
+        between = sum(definition.is_in_between for definition in rig.correctives.definitions)
+        rows.append(("correctives", f"{len(rig.correctives.names)}, {between} of them in-betweens"))
+    return rows
 
 
 def _animation_rows(path: Path) -> Rows:
-    """What moves a glTF file's shapes, and how far."""
-    take = None if path.is_dir() else read_gltf_weights(path)
+    """What moves a file's shapes, and how far."""
+    take = None if path.is_dir() else load_animation(path)
     if take is None or take.weights is None:
         return []
     peaks = take.weights.values[..., 0].amax(0)

@@ -17,7 +17,10 @@ from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity
 from torchface.io import load_take
 from torchface.io.markers.label_maps import load_label_map
+from torchface.io.markers.marker_csv import is_marker_header
+from torchface.io.tables.csv_table import TableReader
 from torchface.take import Take, Track
+from torchface.workflows.batch.batch_items import MARKER_ENDINGS, ItemKind
 
 _SHOWN = 6
 _AXES = "xyz"
@@ -43,6 +46,16 @@ class MarkerOptions:
 
 DEFAULT_OPTIONS = MarkerOptions()
 """In the file's own unit, by its own labels, all frames."""
+
+
+def is_marker_take(path: Path) -> bool:
+    """Whether a file holds markers, by its ending and header."""
+    ending = path.suffix.lower()
+    return ending in MARKER_ENDINGS or (ending == ".csv" and is_marker_header(TableReader(path).header))
+
+
+MARKER_TAKES = ItemKind("take", "solved", (*MARKER_ENDINGS, ".csv"), is_marker_take)
+"""What commands that work on markers look for in folders."""
 
 
 def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOptions) -> tuple[Take, list[str]]:

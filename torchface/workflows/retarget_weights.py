@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from torchface.capture.mouth_close import (
+    CLOSE,
+    JAW,
+    jaw_into_mouth_close,
+    jaw_out_of_mouth_close,
+    mouth_close_of,
+)
 from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_take, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.io import load_rig, load_take, save_animation
+from torchface.io.animation_files import check_animation_ending
 from torchface.progress import Progress, silent
+from torchface.rig import BlendshapeRig
+from torchface.shape_names import arkit_sources
 from torchface.take import Take, Track
 from torchface.workflows.weight_files import check_live_link, write_weights
 
@@ -49,12 +61,15 @@ def retarget_weights(
     """
     progress = progress or silent
     check_writable(out, live_link, animation)
+    if animation is not None:
+        check_animation_ending(animation)
     progress("reading")
     played = load_take(weights)
     if played.weights is None:
         raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
     target = load_rig(to, part=part)
     check_live_link(target.names, live_link)
+    rig = None
     if source is not None:
         rig = load_rig(source)
         # By the rig's own spelling, which is what a table names.
@@ -65,10 +80,38 @@ def retarget_weights(
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:
         raise NameMismatchError(f"{table or weights}: {error}") from error
-    moved = retarget_take(played, shapes)
+    moved, told = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
     progress("writing")
-    written = write_weights(moved, out, live_link)
+    written = [*told, *write_weights(moved, out, live_link)]
     if animation is not None:
         make_folder(animation.parent)
         save_animation(target, moved, animation)
     return Retargeted(moved, shapes, tuple(written))
+
+
+def _mouth_closed(
+    take: Take, source: BlendshapeRig | None, target: BlendshapeRig, ruled: Collection[str]
+) -> tuple[Take, list[str]]:
+    """The take in the convention of the target's ``mouthClose``, and what the user is told.
+
+    Args:
+        take: weights by the target's names.
+        source: that the weights are of; ARKit's if absent.
+        target: that moves.
+        ruled: shapes that a table drives: what it says of either is left alone.
+    """
+    assert take.weights is not None
+    try:
+        wanted, found = mouth_close_of(target), None if source is None else mouth_close_of(source)
+    except ValueRangeError as error:
+        return take, [f"{CLOSE} is taken as it is: {error}"]
+    opens = found is not None and found.opens_jaw
+    given = arkit_sources(list(ruled))
+    if wanted is None or wanted.opens_jaw is opens or JAW in given or CLOSE in given:
+        return take, []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        moved = jaw_into_mouth_close(take.weights) if wanted.opens_jaw else jaw_out_of_mouth_close(take.weights)
+    how = "opens the jaw itself: its weight is taken from" if wanted.opens_jaw else "leaves it to"
+    said = f"the target's {CLOSE} {how} {JAW}{'' if wanted.opens_jaw else ', which takes its weight on'}"
+    return replace(take, weights=moved), [said, *(str(one.message) for one in caught)]

@@ -186,6 +186,9 @@ def _marker_centres(rig: BlendshapeRig, attachment: Attachment, weights: Tensor,
     row[ring] = torch.arange(int(ring.sum()))
     here = Attachment(row[attachment.triangles], attachment.barycentric, attachment.labels)
     vertices = rig.vertices[used] + torch.einsum("tn,nvc->tvc", weights, rig.deltas[:, used])
+    if rig.activation is not None and rig.corrective_deltas is not None:
+        more = rig.corrective_deltas[:, used]
+        vertices = vertices + torch.einsum("tn,nvc->tvc", rig.activation(weights), more)
     points = here.on(local, vertices)
     if standoff == 0:
         return points

@@ -85,4 +85,4 @@ def _save_annotated(mesh: Mesh, rig: BlendshapeRig | None, path: Path) -> None:
     if rig is None:
         save_mesh(mesh, path)
     else:
-        save_rig(BlendshapeRig(mesh, rig.deltas.cpu(), rig.names), path)
+        save_rig(BlendshapeRig(mesh, rig.deltas.cpu(), rig.names, rig.correctives), path)

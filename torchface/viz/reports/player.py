@@ -154,6 +154,7 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
 
 def _rig(rig: BlendshapeRig) -> dict[str, Any]:
     """Rest and moves; of a shape only the vertices that it moves."""
+    rig = rig.linear("player")
     deltas = rig.deltas.detach().cpu().float()
     scale = max(float(deltas.abs().max()), 1e-6) / 32767
     moved = deltas.norm(dim=-1) > _MIN_MOVE

@@ -87,7 +87,7 @@ def export_app(
     check_writable(folder=out)
     _check_folder(out)
     progress("reading the character")
-    rig = performer() if character is None else load_rig(character)
+    rig = performer() if character is None else load_rig(character).linear("app")
     driven, still = _shapes(rig, character)
     graph = webcam_graph(progress) if webcam is None else read_file(webcam)
     check_webcam_graph(graph, webcam or "the webcam's graph")

@@ -24,12 +24,17 @@ def performer_face(identity: Tensor | None = None) -> BlendshapeRig:
         identity: see ``performer``.
     """
     head = performer(identity, texture=False)
+    face = head.part(captured_skin(head))
+    return BlendshapeRig(face.neutral.with_vertices(_smooth_rim(face.neutral)), face.deltas, face.names)
+
+
+def captured_skin(head: BlendshapeRig) -> Tensor:
+    """Which vertices of a performer are of that part, (V,) bool."""
     assert head.neutral.annotations is not None
     places, regions = head.neutral.vertices, head.neutral.annotations.regions
     hidden = torch.stack([regions[name] for name in _NOT_SKIN]).any(0)
     front = places[:, 2] > _BACK + 0.6 * (places[:, 1] - _CROWN).clamp(min=0)
-    face = head.part(~hidden & front & (places[:, 1] > _NECK))
-    return BlendshapeRig(face.neutral.with_vertices(_smooth_rim(face.neutral)), face.deltas, face.names)
+    return ~hidden & front & (places[:, 1] > _NECK)
 
 
 def _smooth_rim(cut: Mesh) -> Tensor:
