@@ -76,7 +76,7 @@ def test_an_expression_that_the_database_never_shows_is_told(model, database):
 
 def test_a_model_of_an_earlier_version_is_refused(model):
     config = {name: value for name, value in model.config.items() if name != "limits"}
-    with pytest.raises(ValueRangeError, match="earlier version, expected limits and scale: learn it again"):
+    with pytest.raises(ValueRangeError, match="earlier version, without limits: learn it again"):
         EnhancementModel.from_config(config)
     with pytest.raises(ValueRangeError, match=r"limits: found 1, expected one of each of"):
         EnhancementModel.from_config({**model.config, "limits": [0.5]})

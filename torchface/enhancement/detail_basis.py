@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
+_SAMPLED_SITES = 20_000
 _CHUNK = 2**15  # numbers of a component that are worked on at a time
 _NUMBERS = 2**28  # that a basis has at most while it is learned, where twice its rank would be more
 _NEGLIGIBLE = 1e-12  # of a block's energy
@@ -138,3 +139,16 @@ def blended(components: Tensor, coefficients: Tensor, weights: Tensor) -> Tensor
         rows = (flat @ some).view(frames, regions, channels, -1)
         pieces.append((rows * own[None, :, None]).sum(1))
     return torch.cat(pieces, dim=2).flatten(1)
+
+
+def region_products(components: Tensor, weights: Tensor) -> Tensor:
+    """Inner products of components over each region, (R,k,k), float64, of every so many sites.
+
+    Args:
+        components: (k,n), see :func:`blended`.
+        weights: of the regions at every site, (R,S).
+    """
+    sites = weights.shape[1]
+    some = slice(None, None, max(1, sites // _SAMPLED_SITES))
+    planes = components.view(len(components), -1, sites)[..., some].double()
+    return torch.stack([(planes * own).flatten(1) @ planes.flatten(1).T for own in weights[:, some].double()])

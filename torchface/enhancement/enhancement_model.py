@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from torchface.enhancement.actor_timing import ActorTiming
 from torchface.enhancement.aligned_frames import FrameAlignment
-from torchface.enhancement.detail_basis import StreamingBasis, blended
+from torchface.enhancement.detail_basis import StreamingBasis, blended, region_products
 from torchface.enhancement.displacement_detail import DisplacementDetail
 from torchface.enhancement.gradient_detail import GradientDetail
-from torchface.enhancement.learned_map import LearnedMap
+from torchface.enhancement.learned_map import LearnedMap, map_shares
 from torchface.enhancement.low_pass import WAVELENGTH, LowPass, vertex_areas
 from torchface.enhancement.model_training import (
     Encoder,
@@ -95,6 +95,7 @@ class EnhancementModel(nn.Module):
         limits: distances of the R regions from which on a frame is outside of the database, see
             ``RegionProjection.limits``; 1 of each if absent.
         scale: how much of what is added to the coarse frames, see :meth:`on_actor`.
+        map_shares: how much of the learned map counts in each region, see ``learned_map.map_shares``; 1 if absent.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
     works on displacements, alignment and averages by patches; detail is of low rank.
@@ -131,6 +132,7 @@ class EnhancementModel(nn.Module):
         temporal: float = 0.0,
         limits: Sequence[float] | None = None,
         scale: float = 1.0,
+        map_shares: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         if detail not in _DETAILS:
@@ -149,8 +151,12 @@ class EnhancementModel(nn.Module):
         self.scale = checked_number("scale", scale)
         regions = len(self.region_names)
         self.limits = tuple(checked_number("limits", limit, above=True) for limit in limits or [1.0] * regions)
-        if len(self.limits) != regions:
-            raise ValueRangeError(f"limits: found {len(self.limits)}, expected one of each of {regions} regions")
+        self.map_shares = tuple(
+            checked_number("map_shares", share, 0.0, 1.0) for share in map_shares or [1.0] * regions
+        )
+        for name, given in (("limits", self.limits), ("map_shares", self.map_shares)):
+            if len(given) != regions:
+                raise ValueRangeError(f"{name}: found {len(given)}, expected one of each of {regions} regions")
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
         self.register_buffer("patches", torch.zeros(triangles, dtype=torch.int64))
@@ -192,6 +198,7 @@ class EnhancementModel(nn.Module):
             "temporal": self.temporal,
             "limits": list(self.limits),
             "scale": self.scale,
+            "map_shares": list(self.map_shares),
         }
 
     @classmethod
@@ -201,8 +208,9 @@ class EnhancementModel(nn.Module):
         Raises:
             ValueRangeError: the config is of an earlier version, whose detail had other axes.
         """
-        if "limits" not in config or "scale" not in config:
-            raise ValueRangeError("found a model of an earlier version, expected limits and scale: learn it again")
+        lacking = [name for name in ("limits", "scale", "map_shares") if name not in config]
+        if lacking:
+            raise ValueRangeError(f"found a model of an earlier version, without {', '.join(lacking)}: learn it again")
         return cls(**config)
 
     @classmethod
@@ -307,7 +315,12 @@ class EnhancementModel(nn.Module):
         model.database_features = learned.features
         model.components, model.coefficients = learned.basis.components, learned.basis.coefficients
         progress("comparing the sequences")
-        model.limits = tuple(model._matching().limits(sequences).tolist())
+        projection = model._matching()
+        model.limits = tuple(projection.limits(sequences).tolist())
+        if model.keeps_input:  # what the smooth part lacks is mostly motion, of which the map always counts whole
+            products = region_products(model.components, encoder.detail.site_weights(model.vertex_weights))
+            shares = map_shares(projection, model.coefficients, model._reach(), products, sequences)
+            model.map_shares = tuple(shares.tolist())
         if hue is not None and colors is not None:
             model.mean_color = colors.float().mean(0)
             for some in colors.split(32):
@@ -466,10 +479,10 @@ class EnhancementModel(nn.Module):
         matched = projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         if self.matching == "learned":
-            reach = limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
+            reach, shares = self._reach(), torch.tensor(self.map_shares)
             learned = self._learned.get(
-                (self.database_features, self.region_weights, self.neutral, self.coefficients, reach),
-                lambda: LearnedMap(projection, self.coefficients, reach),
+                (self.database_features, self.region_weights, self.neutral, self.coefficients, reach, shares),
+                lambda: LearnedMap(projection, self.coefficients, reach, shares),
             )
             coefficients = coefficients + learned.corrections(features, matched)
         weights = encoder.detail.site_weights(self.vertex_weights)
@@ -501,6 +514,10 @@ class EnhancementModel(nn.Module):
             return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
 
         return self._projection.get((self.database_features, self.region_weights, self.neutral, self.temporal), made)
+
+    def _reach(self) -> Tensor:
+        """Of each region, up to what distance the learned map is trusted, (R,)."""
+        return torch.tensor(self.limits) * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
 
     def _lids(self) -> OwnLids:
         def made() -> OwnLids:

@@ -134,14 +134,23 @@ class RegionProjection:
         if len(sequences.unique()) < 2:
             return torch.full((len(self._spaces),), _MOST_LIMIT, dtype=torch.float64)
         chosen = torch.linspace(0, self.frame_count - 1, min(_HELD_OUT, self.frame_count)).long()
+        distances = self.project_without(chosen, sequences[chosen][:, None] == sequences).distances
+        return (_MARGIN * distances.quantile(_QUANTILE, dim=0)).clamp(_LEAST_LIMIT, _MOST_LIMIT)
+
+    def project_without(self, chosen: Tensor, left_out: Tensor) -> Matched:
+        """The combinations that look most like some of the database's own frames, without others of its frames.
+
+        Args:
+            chosen: numbers of the frames, (T,) int64.
+            left_out: which frames take no part in each, (T,K) bool.
+        """
         rows = [space.known[chosen] for space in self._spaces]
         linear = torch.stack([-own @ space.known.T for own, space in zip(rows, self._spaces, strict=True)])
-        # Frames of the own sequence cost more than any others could: one matrix serves for all.
+        # Frames that are left out cost more than any others could: one matrix serves for all.
         most = torch.stack([space.known.square().sum(1).amax() for space in self._spaces])
-        own_sequence = sequences[chosen][:, None] == sequences
-        weights = self._alone(linear + 20 * most[:, None, None] * own_sequence)
+        weights = self._alone(linear + 20 * most[:, None, None] * left_out)
         distances = self._distances(weights, rows, [torch.zeros(len(chosen), dtype=torch.float64)] * len(rows))
-        return (_MARGIN * distances.quantile(_QUANTILE, dim=0)).clamp(_LEAST_LIMIT, _MOST_LIMIT)
+        return Matched(weights.transpose(0, 1), distances)
 
     def _distances(self, weights: Tensor, inside: list[Tensor], beyond: list[Tensor]) -> Tensor:
         """Of points from combinations (R,T,K), (T,R): points by their coordinates, and squared distance off these."""
