@@ -195,7 +195,9 @@ def test_all_frames_at_once(frames: Frames, print_machine: Callable[..., None]) 
     assert rows[0].residual <= 1e-5
     assert rows[1].gap <= 1e-12
     assert rows[1].residual <= 1e-10
-    assert found["ADMM on torch, 100 iterations"].milliseconds >= 1.4 * rows[0].milliseconds
+    fixed = found["ADMM on torch, 100 iterations"]  # 1.0 to 1.5 times ours, by how wide the processor's vectors are
+    assert fixed.milliseconds >= 0.8 * rows[0].milliseconds
+    assert fixed.residual >= 30 * rows[0].residual
     for name in ("PIQP", "OSQP 1e-5", "quadprog", "ProxQP 1e-8"):
         if f"{name}, one by one" in found:
             assert found[f"{name}, one by one"].milliseconds >= 5 * rows[0].milliseconds
