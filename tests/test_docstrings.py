@@ -1,12 +1,14 @@
-"""The examples in docstrings run as they are written."""
+"""The examples in docstrings run as they are written, in either float format."""
 
 from __future__ import annotations
 
 import doctest
 import importlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 import torchface
 
@@ -19,9 +21,21 @@ MODULES = sorted(
 )
 
 
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
+    """What numbers become tensors of: examples show facts, which hold in both."""
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(request.param)
+    yield request.param
+    torch.set_default_dtype(usual)
+
+
 @pytest.mark.parametrize("name", MODULES)
-def test_examples_give_what_they_say(name: str) -> None:
+def test_examples_give_what_they_say(
+    name: str, float_format: torch.dtype, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # some write files
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-    results = doctest.testmod(importlib.import_module(name), optionflags=flags)
+    results = doctest.testmod(importlib.import_module(name), extraglobs={"torch": torch}, optionflags=flags)
     assert results.attempted > 0
     assert results.failed == 0

@@ -30,6 +30,13 @@ class Attachment:
 
     Raises:
         ShapeError, NameMismatchError, ValueRangeError: the parts do not fit each other.
+
+    Example:
+        >>> from torchface import Mesh
+        >>> face = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        >>> middle = Attachment(torch.tensor([0]), torch.full((1, 3), 1 / 3), ("cheek",))
+        >>> middle.on(face.faces, 3 * face.vertices).round(decimals=3).tolist()
+        [[1.0, 1.0, 1.0]]
     """
 
     triangles: Tensor
@@ -60,6 +67,13 @@ class Attachment:
 
         Raises:
             TopologyError: an id is outside the mesh, or its vertex belongs to no triangle.
+
+        Example:
+            >>> from torchface.synthetic import neutral_head
+            >>> face = neutral_head(texture=False)
+            >>> sites = Attachment.from_vertices(face, face.landmarks[[30, 8]], ["nose", "chin"])
+            >>> torch.allclose(sites.on(face.faces, face.vertices), face.vertices[face.landmarks[[30, 8]]])
+            True
         """
         ids = torch.as_tensor(ids, dtype=torch.int64)
         if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= len(mesh.vertices)):

@@ -95,6 +95,14 @@ class Correctives:
         NameMismatchError: a name twice, two that act at the same combination or peak, or a corrective that is driven by
             another or, in a cycle, by itself.
         ValueRangeError: a delta is NaN or infinite.
+
+    Example:
+        >>> from torchface import BlendshapeRig
+        >>> face, still = (torch.eye(3), torch.tensor([[0, 1, 2]])), torch.zeros(2, 3, 3)
+        >>> both = Correctives(torch.ones(1, 3, 3), (Corrective("ab", ("a", "b")),))
+        >>> rig = BlendshapeRig.from_tensors(*face, still, ["a", "b"], both)
+        >>> rig(torch.tensor([[1.0, 0.5]]))[0, 0].tolist()
+        [1.5, 0.5, 0.5]
     """
 
     deltas: Tensor

@@ -24,6 +24,11 @@ class WeightError:
         mean: mean absolute error over frames, a shape, (N,).
         largest: largest absolute error over frames, a shape, (N,).
         correlation: Pearson's, a shape, (N,); NaN for a shape that is constant in either.
+
+    Example:
+        >>> error = weight_error(torch.tensor([[0.25], [0.5]]), torch.tensor([[0.25], [1.0]]))
+        >>> error.mean.item(), error.largest.item()
+        (0.25, 0.5)
     """
 
     mean: Tensor
@@ -32,7 +37,13 @@ class WeightError:
 
 
 def weight_error(solved: Tensor, true: Tensor) -> WeightError:
-    """Compares weights (T,N) with weights (T,N)."""
+    """Compares weights (T,N) with weights (T,N).
+
+    Example:
+        >>> true = torch.tensor([[0.0], [0.5], [1.0]])
+        >>> weight_error(0.5 * true, true).correlation.round(decimals=4).tolist()
+        [1.0]
+    """
     if solved.shape != true.shape or solved.ndim != 2:
         raise ShapeError(f"weight_error: found {tuple(solved.shape)} and {tuple(true.shape)}, expected (T,N) twice")
     difference = (solved - true).abs()
@@ -46,6 +57,13 @@ def weight_jitter(weights: Tensor) -> float:
     """How much weights (T,N) tremble: the root mean square of their second differences, over that of white noise.
 
     White noise of deviation 0.01 has a jitter of 0.01; NaN for fewer than three frames.
+
+    Example:
+        >>> ramp = torch.linspace(0, 1, 65)[:, None]
+        >>> weight_jitter(ramp)
+        0.0
+        >>> 0.009 < weight_jitter(0.01 * torch.randn(9999, 1, generator=torch.Generator().manual_seed(0))) < 0.011
+        True
     """
     if len(weights) < 3:
         return float("nan")
@@ -61,6 +79,12 @@ class ShapeErrors:
         error: of each.
         missing: shapes of the truth that the result lacks.
         frames: how many were compared.
+
+    Example:
+        >>> curves = torch.linspace(0, 1, 5)[:, None]
+        >>> compared = shape_errors(curves, ["jawOpen"], curves.repeat(1, 2), ["jawOpen", "tongueOut"])
+        >>> compared.names, compared.missing, compared.frames
+        (('jawOpen',), ('tongueOut',), 5)
     """
 
     names: tuple[str, ...]
@@ -80,10 +104,15 @@ def shape_errors(found: Tensor, found_names: Sequence[str], true: Tensor, true_n
         ShapeError: the frames differ in number.
         NameMismatchError: no name of the one means a shape of the other.
         ValueRangeError: there is no frame without NaN.
+
+    Example:
+        >>> curves = torch.linspace(0, 1, 5)[:, None]
+        >>> shape_errors(curves, ["eyeBlink_L"], curves, ["eyeBlinkLeft"]).error.mean.tolist()
+        [0.0]
     """
     if len(found) != len(true):
         raise ShapeError(f"shape_errors: found {len(found)} and {len(true)} frames, expected as many")
-    matrix = mapping(found_names, true_names)
+    matrix = mapping(found_names, true_names).float()
     compared = matrix.any(1)
     if not compared.any():
         raise NameMismatchError(
@@ -104,6 +133,14 @@ def marker_rmse(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, mar
     """Root mean square distance between seen markers (T,M,3) and the solved face, a frame, (T,), millimetres.
 
     NaN markers are left out; a frame without any is NaN. Source: thesis, figure 58.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> nose = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[[30]])
+        >>> seen = nose.on(rig.neutral.faces, rig.vertices) + torch.tensor([0.0, 2.0, 0.0])
+        >>> marker_rmse(rig, nose, torch.zeros(1, len(rig.names)), seen[None]).round(decimals=3).tolist()
+        [2.0]
     """
     faces = rig.neutral.faces
     basis = attachment.on(faces, rig.deltas)
@@ -115,7 +152,13 @@ def marker_rmse(rig: BlendshapeRig, attachment: Attachment, weights: Tensor, mar
 
 
 def moved_vertices(rig: BlendshapeRig, weights: Tensor, keep: Tensor) -> Tensor:
-    """Some vertices of a rig, ids or a mask, at weights (B,N): (B,K,3)."""
+    """Some vertices of a rig, ids or a mask, at weights (B,N): (B,K,3).
+
+    Example:
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3))
+        >>> moved_vertices(rig, torch.tensor([[0.5]]), torch.tensor([2])).tolist()
+        [[[0.5, 0.5, 1.5]]]
+    """
     moved = weights @ rig.deltas[:, keep].flatten(1)
     if rig.activation is not None and rig.corrective_deltas is not None:
         moved = moved + rig.activation(weights) @ rig.corrective_deltas[:, keep].flatten(1)
@@ -131,6 +174,12 @@ class MeshError:
         vertex_largest: over frames, a vertex, (V,).
         frame_mean: over vertices, a frame, (T,).
         motion_mean: how far the true face is from its neutral, mean over all; what the error is to be compared with.
+
+    Example:
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3))
+        >>> error = mesh_error(rig, torch.tensor([[0.75]]), rig, torch.tensor([[1.0]]))
+        >>> round(error.relative, 4)
+        0.25
     """
 
     vertex_mean: Tensor
@@ -164,6 +213,11 @@ def mesh_error(
         true_rig, true: what was.
         vertices: ids or a mask of the vertices that count; all if absent.
         chunk: frames at a time, so that memory stays bounded.
+
+    Example:
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), 3.0 * torch.eye(3)[None])
+        >>> round(mesh_error(rig, torch.tensor([[0.5]]), rig, torch.tensor([[1.0]])).mean, 4)
+        1.5
     """
     if len(solved) != len(true) or solved_rig.vertices.shape != true_rig.vertices.shape:
         raise ShapeError(
@@ -194,6 +248,10 @@ def vertex_errors(found: Tensor, true: Tensor) -> Tensor:
         ShapeError: the shapes differ.
 
     Source: thesis 4.2.13.
+
+    Example:
+        >>> vertex_errors(torch.zeros(1, 2, 3), torch.tensor([[[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]]])).tolist()
+        [[5.0, 0.0]]
     """
     if found.shape != true.shape or found.ndim != 3 or found.shape[2] != 3:
         raise ShapeError(f"vertex_errors: found {tuple(found.shape)} and {tuple(true.shape)}, expected (T,V,3) twice")
@@ -207,6 +265,12 @@ class RigidAlignment:
     Args:
         vertices: the moved frames, (T,V,3).
         motion: what moved them, without a change of size, T of them.
+
+    Example:
+        >>> scan = torch.tensor([[[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]]])
+        >>> quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        >>> rigidly_aligned(scan @ quarter.T, scan).degrees.round(decimals=2).tolist()
+        [90.0]
     """
 
     vertices: Tensor
@@ -227,6 +291,12 @@ def rigidly_aligned(found: Tensor, true: Tensor) -> RigidAlignment:
 
     Raises:
         ShapeError: the shapes differ, or a frame has fewer than three vertices.
+
+    Example:
+        >>> scan = torch.tensor([[[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]]])
+        >>> laid = rigidly_aligned(scan + 40.0, scan)
+        >>> bool(vertex_errors(laid.vertices, scan).max() < 1e-4)
+        True
     """
     motion = similarity_transform(found, true.to(found), scale=False)
     return RigidAlignment(motion.apply(found), motion)
@@ -241,6 +311,11 @@ class ErrorFigures:
         total: sum over the vertices of a frame, mean over the frames; for a single frame what the thesis calls the
             total error.
         vertices: how many were compared in any frame.
+
+    Example:
+        >>> figures = error_figures(torch.tensor([[1.0, 2.0, 6.0]]))
+        >>> figures.mean, figures.median, figures.largest, figures.total
+        (3.0, 2.0, 6.0, 9.0)
     """
 
     mean: float
@@ -258,6 +333,10 @@ def error_figures(errors: Tensor) -> ErrorFigures:
         ValueRangeError: nothing was compared.
 
     Source: thesis 4.2.13.
+
+    Example:
+        >>> error_figures(torch.tensor([[1.0, torch.nan, 3.0]])).mean
+        2.0
     """
     present = torch.isfinite(errors)
     if not present.any():
@@ -280,6 +359,12 @@ def region_figures(errors: Tensor, regions: Mapping[str, Tensor]) -> dict[str, E
 
     Raises:
         ShapeError: a mask is not (V,).
+
+    Example:
+        >>> chin, lips = torch.tensor([True, False, False]), torch.tensor([False, True, True])
+        >>> figures = region_figures(torch.tensor([[1.0, 2.0, 4.0]]), {"chin": chin, "lips": lips})
+        >>> {name: one.mean for name, one in figures.items()}
+        {'chin': 1.0, 'lips': 3.0}
     """
     for name, mask in regions.items():
         if mask.shape != errors.shape[1:] or mask.dtype != torch.bool:

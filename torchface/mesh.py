@@ -28,6 +28,14 @@ class Annotations:
         regions: boolean vertex masks by name, each (V,).
         mirror: the vertex on the other side of the face, (V,) int64; a midline vertex names itself.
         contacts: pairs of vertex ids that touch when lids or lips close, (K,2) int64.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> notes = neutral_head(texture=False).annotations
+        >>> len(notes.landmarks), sorted(notes.regions)[:3]
+        (68, ['brow_left', 'brow_right', 'cheek_left'])
+        >>> bool((notes.mirror[notes.mirror] == torch.arange(len(notes.mirror))).all())
+        True
     """
 
     landmarks: Tensor | None = None
@@ -64,6 +72,13 @@ class Mesh:
         TopologyError: there is no vertex, an index points outside, or ``faces`` is not the fan triangulation of
             ``polygons``.
         ValueRangeError: a position is NaN or infinite.
+
+    Example:
+        >>> triangle = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        >>> triangle
+        Mesh(3 vertices, 1 triangles)
+        >>> triangle.with_vertices(2 * triangle.vertices).fingerprint() == triangle.fingerprint()
+        True
     """
 
     vertices: Tensor
@@ -107,7 +122,13 @@ class Mesh:
         uv_polygons: Tensor | None = None,
         **rest: Tensor | Annotations | None,
     ) -> Mesh:
-        """A mesh of polygons (P,K), padded with -1; ``uv_polygons`` (P,K) is laid out alike."""
+        """A mesh of polygons (P,K), padded with -1; ``uv_polygons`` (P,K) is laid out alike.
+
+        Example:
+            >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+            >>> Mesh.from_polygons(square, torch.tensor([[0, 1, 2, 3]])).faces.tolist()
+            [[0, 1, 2], [0, 2, 3]]
+        """
         uv_faces = None if uv_polygons is None else fan_triangulation(uv_polygons)
         return Mesh(vertices, fan_triangulation(polygons), uvs, uv_faces, polygons=polygons, **rest)  # type: ignore[arg-type]
 
@@ -216,6 +237,12 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
     Raises:
         ShapeError: the mask is not (V,).
         ValueRangeError: nothing is kept.
+
+    Example:
+        >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        >>> piece = submesh(Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]])), torch.tensor([0, 2, 3]))
+        >>> piece.vertex_ids.tolist(), piece.mesh.faces.tolist()
+        ([0, 2, 3], [[0, 1, 2]])
     """
     count, device = len(mesh.vertices), mesh.vertices.device
     if keep.dtype == torch.bool:

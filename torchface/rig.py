@@ -35,6 +35,12 @@ class BlendshapeRig(nn.Module):
         ValueRangeError: a delta is NaN or infinite.
 
     Source: thesis 3.2.1, equation 1.
+
+    Example:
+        >>> face = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        >>> rig = BlendshapeRig(face, torch.ones(2, 3, 3), ("jawOpen", "mouthPucker"))
+        >>> rig(torch.tensor([[0.5, 0.0]]))[0, 0].tolist()
+        [1.5, 0.5, 0.5]
     """
 
     vertices: Tensor

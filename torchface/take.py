@@ -27,6 +27,11 @@ class Track:
     Raises:
         ShapeError: ``values`` is not (T,C,D) with one channel a name.
         NameMismatchError: a name stands twice.
+
+    Example:
+        >>> track = Track(("jawOpen", "mouthPucker"), torch.tensor([[[0.1], [0.0]], [[0.5], [0.2]]]))
+        >>> track.select(["mouthPucker"]).values.flatten().tolist() == track.values[:, 1, 0].tolist()
+        True
     """
 
     names: tuple[str, ...]
@@ -83,6 +88,12 @@ class Take:
     Raises:
         ShapeError: the tracks differ in length, or a track's values are not of its kind's width.
         ValueRangeError: ``fps`` is no rate of a camera, 0.01 to 10,000.
+
+    Example:
+        >>> weights = Track(("jawOpen",), torch.linspace(0, 1, 60)[:, None, None])
+        >>> take = Take(fps=30.0, weights=weights)
+        >>> len(take.frames(slice(0, 15)).weights.values) / take.fps
+        0.5
     """
 
     fps: float
@@ -171,7 +182,14 @@ def _cut_extras(extras: dict[str, Any], rows: slice, count: int) -> dict[str, An
 
 
 def empty_frames(take: Take) -> Tensor:
-    """The frames in which no marker was seen, (K,) int64, rising."""
+    """The frames in which no marker was seen, (K,) int64, rising.
+
+    Example:
+        >>> markers = torch.zeros(3, 1, 3)
+        >>> markers[1] = torch.nan
+        >>> empty_frames(Take(fps=60.0, markers=Track(("chin",), markers))).tolist()
+        [1]
+    """
     if take.markers is None:
         raise ValueRangeError("take: found no markers, expected some")
     return take.markers.values.isnan().any(2).all(1).nonzero()[:, 0]

@@ -75,6 +75,11 @@ class ModelDescription(ModelRecord):
         name: of the model.
         folder: that it lies in.
         shadowed: folders of other models of the same name, which this one goes before.
+
+    Example:
+        >>> described = describe("marker_solver")
+        >>> described.licence, described.folder.name, described.shadowed
+        ('MIT', 'marker_solver', ())
     """
 
     name: str = ""
@@ -83,7 +88,12 @@ class ModelDescription(ModelRecord):
 
 
 def list_models() -> list[str]:
-    """Names of the models that can be loaded, sorted; damaged ones are left out with a warning that says why."""
+    """Names of the models that can be loaded, sorted; damaged ones are left out with a warning that says why.
+
+    Example:
+        >>> {"head", "landmark_network", "marker_solver"} <= set(list_models())
+        True
+    """
     damaged = damaged_models()
     for name, fault in damaged.items():
         _warn_once(f"model {name!r} is left out: {fault}")
@@ -91,7 +101,12 @@ def list_models() -> list[str]:
 
 
 def damaged_models() -> dict[str, str]:
-    """Models that cannot be loaded, by name, and why: as far as description, kind and the state's size tell."""
+    """Models that cannot be loaded, by name, and why: as far as description, kind and the state's size tell.
+
+    Example:
+        >>> damaged_models()
+        {}
+    """
     faults = {name: model_fault(_named(name)[0], KINDS) for name in sorted(_all_names())}
     return {name: fault for name, fault in faults.items() if fault is not None}
 
@@ -102,6 +117,10 @@ def describe(name_or_path: str | Path) -> ModelDescription:
     Raises:
         NameMismatchError: there is no model of this name.
         FileFormatError: its ``model.toml`` cannot be read.
+
+    Example:
+        >>> describe("face_landmarks").kind
+        'landmark_trees'
     """
     folder = find(name_or_path)
     found = dict(vars(read_record(folder)))
@@ -123,6 +142,12 @@ def get_model(name_or_path: str | Path) -> Any:
     Raises:
         NameMismatchError: there is no model of this name.
         FileFormatError: a file is missing, damaged, of a newer format, or does not have the hash it should have.
+
+    Example:
+        >>> prior = get_model("shape_prior")
+        >>> rest = torch.zeros(1, len(prior.names), dtype=torch.float64)
+        >>> bool(prior.log_density(rest) > prior.log_density(rest + 1))
+        True
     """
     return read_model(find(name_or_path), KINDS)
 
@@ -161,6 +186,12 @@ def save_model(
         NameMismatchError: the model's class has no kind, or the folder's name is none for a model.
         FileFormatError: the folder cannot be written to.
         ValueRangeError: the state or a metric is not finite.
+
+    Example:
+        >>> prior = get_model("shape_prior")
+        >>> record = save_model(prior, "my_prior", licence="MIT", data="none", metrics={}, recipe="a copy")
+        >>> get_model("./my_prior").names == prior.names
+        True
     """
     kinds = [kind for kind, known in KINDS.items() if type(model) is known]
     if not kinds:
@@ -174,7 +205,12 @@ def save_model(
 
 
 def find(name_or_path: str | Path) -> Path:
-    """The folder of a model; see :func:`get_model`. A name that several folders have is told with a warning, once."""
+    """The folder of a model; see :func:`get_model`. A name that several folders have is told with a warning, once.
+
+    Example:
+        >>> sorted(path.name for path in find("head").iterdir())
+        ['CARD.md', 'model.toml', 'state.safetensors']
+    """
     given = str(name_or_path)
     if _is_path(name_or_path):
         folder = Path(given)

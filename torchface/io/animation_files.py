@@ -36,6 +36,13 @@ def save_animation(
         ValueRangeError: the take has no weights or no frame, or a weight is NaN.
         FileFormatError: another ending, or the folder cannot be written to.
         MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface import BlendshapeRig, Take, Track
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> take = Take(30.0, weights=Track(("JawOpen", "tongueOut"), torch.rand(4, 2, 1)))
+        >>> save_animation(rig, take, "take.glb")
+        ShapeMatch(driven=('jawOpen',), missing=(), unused=('tongueOut',))
     """
     check_animation_ending(path)
     keys, match = weight_keys(rig, take)
@@ -68,6 +75,14 @@ def load_animation(path: str | Path) -> Take | None:
         FileFormatError: another kind of file, broken, or keys that are no frames: out of order, or with gaps of ten
             frames.
         MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface import BlendshapeRig, Take, Track
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> take = Take(30.0, weights=Track(("jawOpen",), torch.linspace(0, 1, 5)[:, None, None]))
+        >>> _ = save_animation(rig, take, "take.glb")
+        >>> load_animation("take.glb").weights.values.flatten().tolist()
+        [0.0, 0.25, 0.5, 0.75, 1.0]
     """
     if Path(path).suffix.lower() in USD_ENDINGS:
         return read_usd_weights(path)

@@ -21,6 +21,12 @@ def save_calibration(calibration: CameraCalibration, path: str | Path) -> None:
 
     Raises:
         FileFormatError: the folder is missing or cannot be written to.
+
+    Example:
+        >>> K = torch.tensor([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]])
+        >>> save_calibration(CameraCalibration(K, torch.zeros(5), 640, 480, error=0.2), "camera.toml")
+        >>> load_calibration("camera.toml").error
+        0.2
     """
     K = calibration.intrinsics.tolist()
     document: dict[str, object] = {
@@ -41,6 +47,12 @@ def load_calibration(path: str | Path) -> CameraCalibration:
 
     Raises:
         FileFormatError: the file is missing, too large, no TOML, or a field is missing, of another kind, or absurd.
+
+    Example:
+        >>> K = torch.tensor([[900.0, 0, 319.5], [0, 900, 239.5], [0, 0, 1]], dtype=torch.float64)
+        >>> save_calibration(CameraCalibration(K, torch.zeros(5, dtype=torch.float64), 640, 480), "camera.toml")
+        >>> load_calibration("camera.toml").intrinsics[0].tolist()
+        [900.0, 0.0, 319.5]
     """
     document = read_toml(path, _FORMAT, _MAX_BYTES)
     width, height = (document[side].whole(1, _MAX_SIDE, f"1 to {_MAX_SIDE} pixels") for side in ("width", "height"))

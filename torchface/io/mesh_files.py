@@ -39,6 +39,14 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         TopologyError: a face names a vertex that is not there.
         ValueRangeError: another unit.
         MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> save_mesh(neutral_head(texture=False), "head.obj")
+        >>> len(load_mesh("head.obj").polygons)
+        6380
+        >>> torch.allclose(load_mesh("head.obj", unit="cm").vertices, 10 * load_mesh("head.obj").vertices)
+        True
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -60,6 +68,13 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
 
     Raises:
         FileFormatError: another suffix, or the folder cannot be written to.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> save_mesh(head, "head.glb")
+        >>> torch.equal(load_mesh("head.glb").landmarks, head.landmarks)
+        True
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -45,6 +45,12 @@ def load_rig(
         NameMismatchError: a shape or part that is not there.
         TopologyError: shapes of different vertex counts or faces.
         MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> save_rig(performer(texture=False), "actor.glb")
+        >>> load_rig("actor.glb", shapes=["jawOpen", "mouthClose"])
+        BlendshapeRig(Mesh(6419 vertices, 12760 triangles, 6380 polygons), 2 shapes)
     """
     path = Path(path)
     if path.is_dir():
@@ -78,6 +84,12 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
         TopologyError: for a file the mesh has no triangle, or wrinkle maps and no texture coordinates.
         NameMismatchError: a wrinkle map belongs to no shape of the rig, or a shape's name is no file's name.
         MissingExtraError: USD, and usd-core is not installed.
+
+    Example:
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> save_rig(rig, "actor")
+        >>> sorted(path.name for path in Path("actor").iterdir())
+        ['jawOpen.obj', 'neutral.obj', 'rig.json']
     """
     write_rig(rig, path, detail, None)
 

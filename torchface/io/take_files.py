@@ -19,7 +19,7 @@ _SUFFIXES = "'.c3d', '.trc' or '.csv'"
 
 
 def load_take(path: str | Path, unit: str | None = None) -> Take:
-    """Reads a performance; the kind of a ``.csv`` follows from its header.
+    r"""Reads a performance; the kind of a ``.csv`` follows from its header.
 
     ==================================== =====================================================
     ``.c3d``                             markers, :func:`torchface.io.markers.c3d.load_c3d`
@@ -39,6 +39,13 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     Raises:
         FileFormatError: the file is none of these, or is damaged.
         ValueRangeError: ``unit`` is unknown.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("take.csv").write_text("frame,time,jawOpen,mouthPucker\n0,0.0,0.25,0\n1,0.04,0.5,0\n")
+        >>> take = load_take("take.csv")
+        >>> take.fps, take.weights.names, take.weights.values[1].flatten().tolist()
+        (25.0, ('jawOpen', 'mouthPucker'), [0.5, 0.0])
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -80,6 +87,13 @@ def save_take(take: Take, path: str | Path) -> None:
         ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
             numbers.
         NameMismatchError: a name would not come back as it is.
+
+    Example:
+        >>> from torchface.take import Track
+        >>> markers = Track(("chin", "nose"), torch.tensor([[[0.0, -60.0, 90.0], [0.0, 0.0, 110.0]]] * 2))
+        >>> save_take(Take(120.0, markers=markers), "take.trc")
+        >>> load_take("take.trc").markers.names
+        ('chin', 'nose')
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -25,6 +25,10 @@ class AdaptiveSettings:
             than eyes forgive, and a little calmer is hardly less exact.
         memory: frames after which a forecast counts 1/e.
         longest_gap: frames without measurements that are bridged; then the filter waits and starts anew.
+
+    Example:
+        >>> len(AdaptiveSettings(measurement=(0.5, 1.0), jerk=(0.01, 0.1, 1.0)).combinations())
+        6
     """
 
     measurement: tuple[float, ...] = (0.2, 0.6, 1.5, 4.0)
@@ -67,6 +71,13 @@ class AdaptiveFilter:
         settings: noises and motions.
 
     Source: Magill 1965; thesis 4.2.5.
+
+    Example:
+        >>> smooth = AdaptiveFilter(points=1, dimensions=2)
+        >>> for frame in range(20):
+        ...     place = smooth.step(torch.tensor([[5.0, 7.0]]))
+        >>> place.round(decimals=2).tolist()
+        [[5.0, 7.0]]
     """
 
     def __init__(self, points: int, dimensions: int, settings: AdaptiveSettings | None = None) -> None:
@@ -126,6 +137,12 @@ def adaptive_filter(
     """Points (T,P,D), NaN for not seen, each frame from itself and those before; see :class:`AdaptiveFilter`.
 
     ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> noisy = torch.randn(200, 1, 2, generator=generator)
+        >>> bool(adaptive_filter(noisy)[50:].std() < 0.5 * noisy[50:].std())
+        True
     """
     _check(values)
     running = AdaptiveFilter(values.shape[1], values.shape[2], settings)
@@ -143,6 +160,12 @@ def adaptive_smoother(
     ``intervals`` are T, each from the frame before, in frames of the usual length; 1 if absent.
 
     Source: Rauch, Tung, Striebel 1965.
+
+    Example:
+        >>> path = torch.linspace(0, 10, 40)[:, None, None].repeat(1, 1, 2)
+        >>> path[20:23] = torch.nan
+        >>> round(adaptive_smoother(path)[21, 0, 0].item(), 1)
+        5.4
     """
     _check(values)
     chosen = settings or AdaptiveSettings()

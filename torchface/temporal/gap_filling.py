@@ -21,6 +21,10 @@ def bridged(values: Tensor, rows: Tensor, frames: int) -> Tensor:
 
     Raises:
         ShapeError: there are no rows, or not as many as values.
+
+    Example:
+        >>> bridged(torch.tensor([0.0, 1.0]), torch.tensor([1, 3]), frames=5).tolist()
+        [0.0, 0.0, 0.5, 1.0, 1.0]
     """
     if not len(rows) or len(rows) != len(values):
         raise ShapeError(f"bridged: found {len(values)} values of {len(rows)} frames, expected as many, at least one")
@@ -32,7 +36,12 @@ def bridged(values: Tensor, rows: Tensor, frames: int) -> Tensor:
 
 
 def nearest_rows(rows: Tensor, frames: int) -> Tensor:
-    """Which of some frames (K,), rising, is nearest to each of all frames: indices into ``rows``, (T,) int64."""
+    """Which of some frames (K,), rising, is nearest to each of all frames: indices into ``rows``, (T,) int64.
+
+    Example:
+        >>> nearest_rows(torch.tensor([0, 6]), frames=8).tolist()
+        [0, 0, 0, 0, 1, 1, 1, 1]
+    """
     every = torch.arange(frames, device=rows.device)
     before, after = _beside(rows, every)
     return torch.where((every - rows[before]).abs() <= (rows[after] - every).abs(), before, after)

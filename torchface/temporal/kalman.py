@@ -28,6 +28,13 @@ class KalmanSettings:
             next one and starts anew.
         damping: what is left of an acceleration after a frame; 1 is constant acceleration. What swings to and fro is
             predicted better with a little less, and does not run away in gaps.
+
+    Example:
+        >>> step = torch.cat([torch.zeros(20, 1), torch.ones(5, 1)])
+        >>> calm = kalman_filter(step, KalmanSettings(measurement=1.0, jerk=0.001))
+        >>> quick = kalman_filter(step, KalmanSettings(measurement=1.0, jerk=1.0))
+        >>> bool(calm[20] < quick[20])
+        True
     """
 
     measurement: float
@@ -62,6 +69,12 @@ class KalmanFilter:
         ValueRangeError: settings of different damping.
 
     Source: Kalman 1960; Singer 1970 for damping; thesis 4.2.5.
+
+    Example:
+        >>> smooth = KalmanFilter(channels=1, settings=KalmanSettings(measurement=0.5, jerk=0.01))
+        >>> places = [smooth.step(torch.tensor([float(frame)])).item() for frame in range(30)]
+        >>> round(smooth.step(torch.tensor([torch.nan])).item(), 1)
+        30.0
     """
 
     def __init__(self, channels: int, settings: KalmanSettings | Sequence[KalmanSettings]) -> None:
@@ -157,6 +170,12 @@ def kalman_filter(values: Tensor, settings: KalmanSettings | Sequence[KalmanSett
     Returns:
         Filtered values of the same shape and dtype. Gaps up to ``longest_gap`` are bridged; NaN before a channel was
         first seen, and in longer gaps after that.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> noisy = torch.randn(200, 1, generator=generator)
+        >>> bool(kalman_filter(noisy, KalmanSettings(measurement=1.0, jerk=0.001))[50:].std() < 0.5)
+        True
     """
     curves = _checked(values)
     running = KalmanFilter(curves.shape[1], settings)
@@ -180,6 +199,12 @@ def kalman_smoother(
         measurement.
 
     Source: Rauch, Tung, Striebel 1965.
+
+    Example:
+        >>> path = torch.linspace(0, 10, 11)[:, None]
+        >>> path[4:7] = torch.nan
+        >>> kalman_smoother(path, KalmanSettings(measurement=0.1, jerk=0.01))[4:7, 0].round(decimals=2).tolist()
+        [4.0, 5.0, 6.0]
     """
     curves = _checked(values)
     frames = len(curves)
@@ -223,6 +248,12 @@ def estimate_settings(values: Tensor, longest_gap: int = 10, calm: float = 0.7) 
         ValueRangeError: fewer than eight frames, channels that do not move at all, or ``calm`` is not positive.
 
     Source: maximum likelihood by prediction-error decomposition, Schweppe 1965.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> slow = torch.sin(torch.linspace(0, 6, 300))[:, None] + 0.2 * torch.randn(300, 1, generator=generator)
+        >>> round(estimate_settings(slow).measurement, 1)
+        0.2
     """
     curves = _checked(values)
     if not 0 < calm < float("inf"):

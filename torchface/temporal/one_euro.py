@@ -20,6 +20,13 @@ class OneEuroSettings:
         cutoff: of the low-pass at rest, Hz; less is calmer and later.
         speed: what the cutoff gains for each unit a second, Hz; more is quicker and rougher.
         speed_cutoff: of the low-pass on the speed itself, Hz.
+
+    Example:
+        >>> jump = torch.cat([torch.zeros(10), torch.ones(10)])
+        >>> calm = one_euro_filter(jump, 60.0, OneEuroSettings(cutoff=0.5, speed=0.0))
+        >>> quick = one_euro_filter(jump, 60.0, OneEuroSettings(cutoff=0.5, speed=10.0))
+        >>> bool(calm[-1] < quick[-1])
+        True
     """
 
     cutoff: float = 0.7
@@ -49,6 +56,12 @@ class OneEuroFilter:
         ValueRangeError: ``fps`` is no rate of a camera.
 
     Source: Casiez, Roussel, Vogel 2012.
+
+    Example:
+        >>> smooth = OneEuroFilter(fps=60.0)
+        >>> _ = smooth.step(torch.tensor([0.0]))
+        >>> 0 < smooth.step(torch.tensor([1.0])).item() < 1
+        True
     """
 
     def __init__(self, fps: float, settings: OneEuroSettings = OneEuroSettings()) -> None:
@@ -87,7 +100,13 @@ class OneEuroFilter:
 
 
 def one_euro_filter(values: Tensor, fps: float, settings: OneEuroSettings = OneEuroSettings()) -> Tensor:
-    """Each frame of (T,...) from itself and those before it."""
+    """Each frame of (T,...) from itself and those before it.
+
+    Example:
+        >>> still = torch.full((5, 2), 0.25)
+        >>> torch.equal(one_euro_filter(still, fps=60.0), still)
+        True
+    """
     running = OneEuroFilter(fps, settings)
     # A frame needs the one before.
     return torch.stack([running.step(frame) for frame in values])

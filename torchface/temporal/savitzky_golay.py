@@ -29,6 +29,11 @@ def savitzky_golay(values: Tensor, window: int, order: int = 2) -> Tensor:
         ValueRangeError: a window that is not positive, or an order that it cannot hold.
 
     Source: Savitzky and Golay 1964; thesis 4.1.8 and 4.1.12.
+
+    Example:
+        >>> squares = torch.arange(7.0) ** 2
+        >>> torch.allclose(savitzky_golay(squares, window=5), squares, atol=1e-4)
+        True
     """
     frames = len(values)
     if values.ndim == 0 or frames == 0:

@@ -21,11 +21,11 @@ def laid_out(values: Tensor, texels: TexelMap, rings: int = _RINGS) -> Tensor:
         rings: how many texels wide the margin is.
     """
     channels = values.shape[1]
-    image = torch.zeros(channels, texels.height * texels.width)
+    image = torch.zeros(channels, texels.height * texels.width, dtype=torch.float32)
     image[:, texels.texels] = values.T.float()
     image = image.reshape(1, channels, texels.height, texels.width)
     filled = texels.mask()[None, None].float()
-    background = values.float().mean(0) if len(values) else torch.zeros(channels)
+    background = values.float().mean(0) if len(values) else torch.zeros(channels, dtype=torch.float32)
     for _ in range(rings):  # a ring of texels at a time
         count = torch.nn.functional.avg_pool2d(filled, 3, 1, 1, count_include_pad=True)
         mean = torch.nn.functional.avg_pool2d(image * filled, 3, 1, 1) / count.clamp(min=1e-6)

@@ -55,6 +55,13 @@ def load_region_maps(path: str | Path) -> RegionMaps | None:
 
     Raises:
         FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
+
+    Example:
+        >>> from torchface.io import save_mesh
+        >>> from torchface.synthetic import neutral_head
+        >>> save_mesh(neutral_head(texture=False), "smooth.glb")
+        >>> load_region_maps("smooth.glb") is None
+        True
     """
     document = read_document(path)
     found = list_of_first_mesh(document, _KEY)

@@ -79,6 +79,13 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
 
     Raises:
         FileFormatError: not glTF 2, a broken list, images of different sizes, or more of them than the file can hold.
+
+    Example:
+        >>> from torchface.io import save_mesh
+        >>> from torchface.synthetic import neutral_head
+        >>> save_mesh(neutral_head(texture=False), "smooth.glb")
+        >>> load_detail_maps("smooth.glb") is None
+        True
     """
     document = read_document(path)
     listed, mesh = _listed(document)

@@ -24,17 +24,36 @@ def load_image(path: str | Path) -> Tensor:
     Raises:
         FileFormatError: the file is missing, no image, of a kind that is not read, or unpacks to far more pixels than
             its size lets expect.
+
+    Example:
+        >>> save_image(torch.rand(3, 4, 6), "photo.png")
+        >>> load_image("photo.png").shape
+        torch.Size([3, 4, 6])
     """
     return decode_image(read_file(path), str(path))
 
 
 def save_image(image: Tensor, path: str | Path) -> None:
-    """Writes (3,H,W) in [0,1] as PNG."""
+    """Writes (3,H,W) in [0,1] as PNG.
+
+    Example:
+        >>> grey = torch.full((3, 2, 2), 0.5)
+        >>> save_image(grey, "grey.png")
+        >>> bool((load_image("grey.png") - 0.5).abs().max() < 1 / 255)
+        True
+    """
     write_file(path, encode_png(image))
 
 
 def save_image16(image: Tensor, path: str | Path) -> None:
-    """Writes (3,H,W) in [0,1] as PNG of 16 bits a channel."""
+    """Writes (3,H,W) in [0,1] as PNG of 16 bits a channel.
+
+    Example:
+        >>> grey = torch.full((3, 2, 2), 0.5)
+        >>> save_image16(grey, "grey.png")
+        >>> bool((load_image("grey.png") - 0.5).abs().max() < 1 / 65535)
+        True
+    """
     write_file(path, encode_png16(image))
 
 

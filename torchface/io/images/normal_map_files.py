@@ -17,6 +17,12 @@ def save_normal_map(normals: Tensor, path: str | Path) -> None:
     Raises:
         FileFormatError: the folder cannot be written to.
         ShapeError: not (3,H,W).
+
+    Example:
+        >>> tilted = torch.tensor([0.6, 0.0, 0.8])[:, None, None].repeat(1, 4, 4)
+        >>> save_normal_map(tilted, "normals.png")
+        >>> bool((load_normal_map("normals.png") - tilted).abs().max() < 1e-4)
+        True
     """
     save_image16(encode_normals(normals), path)
 
@@ -26,6 +32,12 @@ def load_normal_map(path: str | Path) -> Tensor:
 
     Raises:
         FileFormatError: no image, or one whose directions point into the surface, as no normal map's do.
+
+    Example:
+        >>> up = torch.tensor([0.0, 0.0, 1.0])[:, None, None].repeat(1, 4, 4)
+        >>> save_normal_map(up, "normals.png")
+        >>> load_normal_map("normals.png")[2].min().item()
+        1.0
     """
     normals = decode_normals(load_image(path))
     inward = float((normals[2] < 0).double().mean())

@@ -85,7 +85,7 @@ class LandmarkPoints:
 
 
 def load_landmark_points(path: str | Path) -> LandmarkPoints:
-    """Reads landmarks by the file's ending: ``.ljson``, ``.pts``, or ``.json`` (correspondences, or LJSON).
+    r"""Reads landmarks by the file's ending: ``.ljson``, ``.pts``, or ``.json`` (correspondences, or LJSON).
 
     Args:
         path: the file. PTS counts pixels from 1, LJSON gives two-dimensional points as (y, x): both come as (x, y)
@@ -93,6 +93,12 @@ def load_landmark_points(path: str | Path) -> LandmarkPoints:
 
     Raises:
         FileFormatError: another ending, or other content than the ending means.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("face.pts").write_text("version: 1\nn_points: 1\n{\n11 21\n}\n")
+        >>> load_landmark_points("face.pts").points.tolist()
+        [[10.0, 20.0]]
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -117,6 +123,11 @@ def save_pts(points: Tensor, path: str | Path) -> None:
         ShapeError: not (L,2).
         ValueRangeError: a position is NaN or infinite; PTS has no way to say so.
         FileFormatError: the file cannot be written.
+
+    Example:
+        >>> save_pts(torch.tensor([[10.0, 20.0]]), "face.pts")
+        >>> load_landmark_points("face.pts").points.tolist()
+        [[10.0, 20.0]]
     """
     if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
         raise ShapeError(f"points: found {tuple(points.shape)}, expected (L,2)")

@@ -28,6 +28,12 @@ class LandmarkVertices:
 
     Raises:
         ShapeError, NameMismatchError: the parts do not fit each other.
+
+    Example:
+        >>> LandmarkVertices(torch.tensor([0, 2]), ("nose",))
+        Traceback (most recent call last):
+            ...
+        torchface.errors.NameMismatchError: labels: found 1 distinct ones for 2 vertices
     """
 
     vertices: Tensor
@@ -54,6 +60,13 @@ class Correspondences:
 
     Raises:
         ShapeError, NameMismatchError: the parts do not fit each other.
+
+    Example:
+        >>> pairs = Correspondences(torch.tensor([0, 2]), torch.tensor([[1.0, 0, 0], [0, 0, 1]]), ("nose", "chin"))
+        >>> pairs.check(Mesh(torch.eye(3)[:2], torch.zeros(0, 3, dtype=torch.int64)))
+        Traceback (most recent call last):
+            ...
+        torchface.errors.TopologyError: picks: found vertex ids 0 to 2, expected 0 to 1
     """
 
     vertices: Tensor
@@ -72,7 +85,15 @@ class Correspondences:
 
 
 def save_landmarks(landmarks: LandmarkVertices, path: str | Path) -> None:
-    """Writes landmark vertices as JSON; the file appears only when it is complete."""
+    """Writes landmark vertices as JSON; the file appears only when it is complete.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> ears = LandmarkVertices(head.landmarks[[0, 16]], ("right", "left"), head.fingerprint())
+        >>> save_landmarks(ears, "landmarks.json")
+        >>> load_landmarks("landmarks.json").check(head)
+    """
     _write(path, _LANDMARKS, landmarks, {})
 
 
@@ -81,12 +102,24 @@ def load_landmarks(path: str | Path) -> LandmarkVertices:
 
     Raises:
         FileFormatError: the file is missing, too large, not JSON, or a field is missing or of another kind.
+
+    Example:
+        >>> save_landmarks(LandmarkVertices(torch.tensor([17, 4]), ("nose", "chin")), "landmarks.json")
+        >>> load_landmarks("landmarks.json").vertices.tolist()
+        [17, 4]
     """
     return LandmarkVertices(*_picks(read_json(path, _LANDMARKS, _MAX_BYTES)))
 
 
 def save_correspondences(pairs: Correspondences, path: str | Path) -> None:
-    """Writes pairs as JSON; the file appears only when it is complete."""
+    """Writes pairs as JSON; the file appears only when it is complete.
+
+    Example:
+        >>> pairs = Correspondences(torch.tensor([4]), torch.tensor([[0.0, 5.0, 9.0]]), ("nose",))
+        >>> save_correspondences(pairs, "pairs.json")
+        >>> load_correspondences("pairs.json").labels
+        ('nose',)
+    """
     _write(path, _CORRESPONDENCES, pairs, {"points": pairs.points.tolist()})
 
 
@@ -95,6 +128,12 @@ def load_correspondences(path: str | Path) -> Correspondences:
 
     Raises:
         FileFormatError: the file is missing, too large, not JSON, or a field is missing or of another kind.
+
+    Example:
+        >>> pairs = Correspondences(torch.tensor([4]), torch.tensor([[0.0, 5.0, 9.0]]), ("nose",))
+        >>> save_correspondences(pairs, "pairs.json")
+        >>> load_correspondences("pairs.json").points.tolist()
+        [[0.0, 5.0, 9.0]]
     """
     document = read_json(path, _CORRESPONDENCES, _MAX_BYTES)
     vertices, labels, fingerprint = _picks(document)

@@ -36,6 +36,13 @@ class MeshSequence:
 
     Raises:
         FileFormatError: the file is missing, cut off, or holds something else.
+
+    Example:
+        >>> with MeshSequenceWriter("take.safetensors", count=2, vertices=3, faces=torch.tensor([[0, 1, 2]])) as writer:
+        ...     writer.append(torch.eye(3).repeat(2, 1, 1))
+        >>> frames = MeshSequence("take.safetensors")
+        >>> frames.read(1, 2).tolist() == [torch.eye(3).tolist()], frames.is_whole()
+        (True, True)
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -118,6 +125,12 @@ class MeshSequenceWriter:
 
     Raises:
         FileFormatError: the file cannot be written.
+
+    Example:
+        >>> writer = MeshSequenceWriter("take.safetensors", count=2, vertices=3, faces=torch.tensor([[0, 1, 2]]))
+        >>> writer.append(torch.eye(3))
+        >>> writer.done
+        1
     """
 
     def __init__(

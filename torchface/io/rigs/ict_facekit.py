@@ -59,6 +59,12 @@ class IdentityModes:
         neutral: the mean head.
         deltas: the modes :math:`M_k`, (K,V,3), millimetres at one standard deviation.
         names: one a mode.
+
+    Example:
+        >>> mean = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        >>> modes = IdentityModes(mean, torch.ones(2, 3, 3), ("wide", "tall"))
+        >>> modes.head(torch.tensor([1.0, 0.5])).vertices[0].tolist()
+        [2.5, 1.5, 1.5]
     """
 
     neutral: Mesh

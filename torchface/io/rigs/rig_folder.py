@@ -24,7 +24,7 @@ _MAX_NOTES = 2**26
 
 
 def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = None) -> BlendshapeRig:
-    """A rig of OBJ files with the same faces.
+    r"""A rig of OBJ files with the same faces.
 
     Shapes come in the order of ``rig.json``, which ``save_obj_folder`` writes; others follow, sorted by name.
 
@@ -36,6 +36,14 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
     Raises:
         FileFormatError: no neutral or several, no shape, or a broken file.
         TopologyError: a shape has other vertices or faces than the neutral.
+
+    Example:
+        >>> from pathlib import Path
+        >>> Path("rig").mkdir()
+        >>> for name, x in (("neutral", 0), ("jawOpen", 1)):
+        ...     _ = Path(f"rig/{name}.obj").write_text(f"v {x} 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\n")
+        >>> load_obj_folder("rig", unit="cm").deltas[0, 0].tolist()
+        [10.0, 0.0, 0.0]
     """
     folder = Path(folder)
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".obj"}

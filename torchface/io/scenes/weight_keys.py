@@ -36,6 +36,11 @@ class ShapeMatch:
         driven: shapes of the rig that follow a channel.
         missing: shapes of the rig that no channel drives; they stay at 0.
         unused: channels of the take that the rig has no shape for.
+
+    Example:
+        >>> match = ShapeMatch(driven=("jawOpen",), missing=("mouthClose",), unused=("tongueOut",))
+        >>> f"{match.missing[0]} stays at 0, {match.unused[0]} moves nothing"
+        'mouthClose stays at 0, tongueOut moves nothing'
     """
 
     driven: tuple[str, ...]
@@ -71,7 +76,7 @@ def weight_keys(rig: BlendshapeRig, take: Take) -> tuple[WeightKeys, ShapeMatch]
     if times is None:
         times = torch.arange(len(values), dtype=torch.float64) / take.fps
     by_shape, by_channel = drives.any(1).tolist(), drives.any(0).tolist()
-    return WeightKeys(times.double(), values @ matrix.T, take.fps), ShapeMatch(
+    return WeightKeys(times.double(), values @ matrix.T.to(values), take.fps), ShapeMatch(
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if is_driven),
         tuple(name for name, is_driven in zip(rig.names, by_shape, strict=True) if not is_driven),
         tuple(name for name, is_used in zip(track.names, by_channel, strict=True) if not is_used),

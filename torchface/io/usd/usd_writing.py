@@ -60,12 +60,26 @@ def write_usd_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None 
         MissingExtraError: usd-core is not installed.
         FileFormatError: the folder cannot be written to.
         TopologyError: the mesh has no triangle.
+
+    Example:
+        >>> from pathlib import Path
+        >>> rig = BlendshapeRig.from_tensors(torch.eye(3), torch.tensor([[0, 1, 2]]), torch.ones(1, 3, 3), ["jawOpen"])
+        >>> write_usd_rig(rig, "actor.usda")
+        >>> 'skel:blendShapes = ["jawOpen"]' in Path("actor.usda").read_text()
+        True
     """
     _write(path, rig.neutral, rig, keys)
 
 
 def write_usd_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Writes a mesh as USD in metres; see :func:`write_usd_rig`."""
+    """Writes a mesh as USD in metres; see :func:`write_usd_rig`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> write_usd_mesh(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]])), "triangle.usda")
+        >>> "metersPerUnit = 1" in Path("triangle.usda").read_text()
+        True
+    """
     _write(path, mesh, None, None)
 
 

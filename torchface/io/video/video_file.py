@@ -38,6 +38,12 @@ class VideoFile:
         width, height: pixels, upright: a phone's rotation is applied.
         count: frames that are shown; of a file that is cut off, those its header promises.
         even: whether frames must come at an even rate; else what reads them asks ``uneven_seconds`` when they come.
+
+    Example:
+        >>> from torchface.io.video import write_video
+        >>> video = write_video([torch.full((10, 16, 32), 0.5)], "grey.avi", fps=25.0)
+        >>> video.width, video.height, video.count, video.fps
+        (32, 16, 10, 25.0)
     """
 
     path: Path
@@ -169,6 +175,12 @@ def open_video(path: str | Path) -> VideoFile:
 
     Raises:
         FileFormatError: the file is missing, no video, of a codec that is not there, or claims absurd sizes.
+
+    Example:
+        >>> from torchface.io.video import write_video
+        >>> _ = write_video([torch.zeros(10, 16, 32)], "black.avi", fps=25.0)
+        >>> sum(int(frame.max()) for frame in open_video("black.avi").frames())
+        0
     """
     path = Path(path)
     packets = read_packets(path)

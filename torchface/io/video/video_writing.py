@@ -44,6 +44,11 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
         FileFormatError: another ending, or the file cannot be written.
         ShapeError: no frames, frames that differ in size, or grey ones among those in colour.
         ValueRangeError: ``fps`` is no camera's.
+
+    Example:
+        >>> noise = torch.randint(0, 256, (4, 16, 32), dtype=torch.uint8)
+        >>> torch.equal(write_video([noise], "noise.mkv", fps=30.0).frame(2), noise[2])
+        True
     """
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -68,7 +73,12 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
 
 
 def to_bytes(frame: Tensor) -> Tensor:
-    """Grey or colour values as uint8, of the same shape; floats are in [0,1]."""
+    """Grey or colour values as uint8, of the same shape; floats are in [0,1].
+
+    Example:
+        >>> to_bytes(torch.tensor([0.0, 0.5, 1.0])).tolist()
+        [0, 128, 255]
+    """
     if frame.dtype == torch.uint8:
         return frame.contiguous()
     return (frame.clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

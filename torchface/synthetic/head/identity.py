@@ -29,6 +29,10 @@ class IdentityParameter:
         description: what is measured, and its unit.
         mean: of the measurement on the mean head; 0 where the parameter is an offset from the mean.
         standard_deviation: of the measurement over the population, same unit.
+
+    Example:
+        >>> IDENTITY[0].name, IDENTITY[0].description
+        ('head_length', 'glabella to the back of the head, mm')
     """
 
     name: str
@@ -343,6 +347,11 @@ def draw_identities(count: int, generator: torch.Generator, scale: float = 1.0) 
         count: how many heads.
         generator: where the randomness comes from.
         scale: of the standard deviations; 1 is the variation of people.
+
+    Example:
+        >>> identities = draw_identities(3, torch.Generator().manual_seed(0))
+        >>> identities.shape == (3, len(IDENTITY)), bool(identities.abs().max() <= 2.5)
+        (True, True)
     """
     drawn = torch.randn(count, len(IDENTITY), generator=generator, device=generator.device)
     return (scale * drawn).clamp(-2.5, 2.5).cpu()

@@ -26,6 +26,12 @@ def neutral_head(identity: Tensor | None = None, texture: bool = True) -> Mesh:
     Raises:
         ShapeError: ``identity`` is not (K,).
         ValueRangeError: a coefficient is NaN or infinite.
+
+    Example:
+        >>> head = neutral_head(texture=False)
+        >>> height = head.vertices[:, 1].max() - head.vertices[:, 1].min()
+        >>> len(head.landmarks), bool(150 < height < 400)
+        (68, True)
     """
     return dress(anatomy(identity), texture)
 

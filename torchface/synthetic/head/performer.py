@@ -30,6 +30,14 @@ def performer(identity: Tensor | None = None, texture: bool = True) -> Blendshap
     Raises:
         ShapeError: ``identity`` is not (K,).
         ValueRangeError: a coefficient is NaN or infinite.
+
+    Example:
+        >>> rig = performer(texture=False)
+        >>> open_jaw = rig.vertices.new_zeros(1, len(rig.names))
+        >>> open_jaw[0, rig.index(["jawOpen"])] = 1
+        >>> chin = rig.neutral.landmarks[8]
+        >>> bool(rig(open_jaw)[0, chin, 1] < rig.vertices[chin, 1] - 10)
+        True
     """
     person = anatomy(identity)
     made = upper_face(person) | lower_face(person)

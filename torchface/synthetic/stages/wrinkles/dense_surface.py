@@ -177,5 +177,5 @@ def vertex_spacing(mesh: Mesh) -> Tensor:
     area = triangle_areas(mesh.vertices, mesh.faces)
     corner = mesh.faces.flatten()
     count = len(mesh.vertices)
-    total = torch.zeros(count).index_add_(0, corner, area.float().repeat_interleave(3) / 3)
+    total = area.new_zeros(count, dtype=torch.float32).index_add_(0, corner, area.float().repeat_interleave(3) / 3)
     return total.clamp(min=1e-6).sqrt()

@@ -40,6 +40,11 @@ def expression_sequences(weights: Tensor, names: Sequence[str], fps: float) -> t
         ShapeError: ``weights`` are not (T,N) with one name a column.
         NameMismatchError: no shape but gaze and blinks.
         ValueRangeError: a weight is NaN or infinite, or ``fps`` is no rate.
+
+    Example:
+        >>> rise = torch.sin(torch.linspace(0, 6.2832, 121))[:, None] ** 2
+        >>> expression_sequences(rise, ["jawOpen"], fps=60.0)
+        (slice(0, 60, None), slice(60, 120, None))
     """
     activity = _activity(weights, names, fps)
     span = float(np.ptp(activity)) if len(activity) else 0.0
@@ -67,6 +72,12 @@ def from_neutral_to_neutral(weights: Tensor, names: Sequence[str], fps: float) -
         ShapeError: not (T,N) with one name a column, or fewer than three frames.
         NameMismatchError: no shape but gaze and blinks.
         ValueRangeError: a weight is NaN or infinite, ``fps`` is no rate, or no frame is more active than its ends.
+
+    Example:
+        >>> rise = 0.1 + torch.sin(torch.linspace(0, 3.1416, 61))[:, None]
+        >>> piece = from_neutral_to_neutral(rise, ["jawOpen"], fps=60.0)
+        >>> piece[[0, -1]].tolist(), bool((piece[30] == rise[30]).all())
+        ([[0.0], [0.0]], True)
     """
     activity = _activity(weights, names, fps)
     if len(weights) < 3:

@@ -51,6 +51,14 @@ class WrinkledPerformer:
     Raises:
         ValueRangeError: ``identity`` beside ``rig``, or ``vertices`` below the coarse rig's or above two million;
             the rig has no landmarks.
+
+    Example:
+        >>> face = WrinkledPerformer(vertices=10000)
+        >>> smile = torch.zeros(60, len(face.names), dtype=torch.float32)
+        >>> smile[30:, face.rig.index(["mouthSmileLeft"])] = 1
+        >>> folding = face.folding(smile, fps=60.0).amax(1)
+        >>> bool(folding[29] < folding[32] < folding[59])
+        True
     """
 
     def __init__(
