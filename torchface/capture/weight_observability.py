@@ -52,6 +52,11 @@ class Observability:
         confusions: one for each singular direction that is not visible and not of a single unseen shape, weakest first.
         points: what they are called.
         unit: of ``noise``.
+
+    Example:
+        >>> basis = torch.tensor([[[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]]])  # one point, which two shapes move alike
+        >>> weight_observability(basis, ["jawOpen", "mouthClose"], noise=0.1).ambiguous
+        ('jawOpen', 'mouthClose')
     """
 
     shapes: int

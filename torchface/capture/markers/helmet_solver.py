@@ -36,6 +36,11 @@ class HelmetMotion:
         rotation: :math:`R`, (T,3,3).
         translation: :math:`t`, (T,3), millimetres of rig space.
         pivot: :math:`c`, (3,), the mean of the marker sites at rest.
+
+    Example:
+        >>> slip = HelmetMotion(torch.eye(3)[None], torch.tensor([[0.0, 4.0, 0.0]]), torch.zeros(3))
+        >>> slip.undo(slip.apply(torch.ones(1, 2, 3))).tolist()
+        [[[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]]
     """
 
     rotation: Tensor
@@ -80,6 +85,15 @@ class HelmetSolver(nn.Module):
 
     Source: thesis 4.1.6, equations 34 to 37, with the derivative of the rotation in place of the 90-degree shapes,
         which also stretch the face.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> seen = sites.on(rig.neutral.faces, rig.vertices) + torch.tensor([0.0, 4.0, 0.0])
+        >>> weights, motion = HelmetSolver(rig, sites)(seen[None])
+        >>> bool(weights.max() < 0.1), round(motion.translation[0, 1].item())
+        (True, 4)
     """
 
     def __init__(

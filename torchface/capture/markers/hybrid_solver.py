@@ -43,6 +43,13 @@ def gamma_curves(active: Tensor, maximum: float = GAMMA, window: int = 15, order
         ValueRangeError: a negative ``maximum``.
 
     Source: thesis 4.1.8.
+
+    Example:
+        >>> blinks = torch.zeros(60, 1, dtype=torch.bool)
+        >>> blinks[25:40] = True
+        >>> gamma = gamma_curves(blinks)
+        >>> gamma[0].item(), round(gamma[32].item(), 1)
+        (0.0, 4.0)
     """
     if active.ndim != 2:
         raise ShapeError(f"active: found {tuple(active.shape)}, expected (T,N)")
@@ -65,6 +72,18 @@ class HybridSolver(nn.Module):
         markers: the solver for frames with markers alone.
 
     Source: thesis 4.1.8, equation 38.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> blink = solver.names.index("eyeBlinkLeft")
+        >>> still = solver.points(torch.zeros(1, len(solver.names)))
+        >>> predicted = torch.zeros(1, len(solver.names), dtype=torch.float64)
+        >>> predicted[0, blink] = 1.0  # a classifier saw the eye shut, the markers did not
+        >>> trust = torch.zeros_like(predicted)
+        >>> trust[0, blink] = 1e6
+        >>> round(HybridSolver(solver)(still, predicted, trust)[0, blink].item(), 2)
+        1.0
     """
 
     def __init__(self, markers: MarkerSolver) -> None:

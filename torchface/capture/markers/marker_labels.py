@@ -19,6 +19,11 @@ class LabelMatch:
         channels: of the take's labels, those that are markers of the attachment.
         labels: the attachment's label of each of them.
         unmatched: the take's labels that are none of the attachment's.
+
+    Example:
+        >>> match = match_labels(["Actor:M001", "elbow"], ["M001"])
+        >>> match.channels, match.labels, match.unmatched
+        (('Actor:M001',), ('M001',), ('elbow',))
     """
 
     channels: tuple[str, ...]

@@ -61,6 +61,17 @@ class MarkerSolver(nn.Module):
         ShapeError: ``alignment`` holds more than one similarity, or ``sparsity`` or ``ridge`` more than one number.
 
     Source: thesis 4.1.3, 4.1.4 and appendix.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> solver = MarkerSolver(rig, sites, sparsity=0.0)
+        >>> weights = rig.vertices.new_zeros(1, len(rig.names))
+        >>> weights[0, rig.index(["jawOpen"])] = 0.5
+        >>> found = solver(sites.on(rig.neutral.faces, rig(weights)))
+        >>> bool((found - weights).abs().max() < 0.05)
+        True
     """
 
     basis: Tensor
@@ -267,6 +278,14 @@ class MarkerSolver(nn.Module):
         Raises:
             NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
             ValueRangeError: no frame shows any marker.
+
+        Example:
+            >>> from torchface import Track, zoo
+            >>> solver = zoo.get_model("marker_solver")
+            >>> still = solver.points(torch.zeros(5, len(solver.names)))
+            >>> solved = solver.solve_take(Take(60.0, markers=Track(solver.labels, still.float())))
+            >>> solved.weights.names == solver.names, bool(solved.weights.values.max() < 1e-3)
+            (True, True)
         """
         if take.markers is None:
             raise NameMismatchError("take: has no markers, expected a track of them")

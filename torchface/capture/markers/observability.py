@@ -14,5 +14,13 @@ def observability(solver: MarkerSolver, noise: float = 0.1) -> Observability:
         noise: millimetres; a direction whose unit change moves the markers less drowns in it.
 
     Source: thesis 4.1.4: the rank of B should be at least N.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> from torchface import Attachment
+        >>> rig = performer(texture=False)
+        >>> chin = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[[8]])
+        >>> "browInnerUp" in observability(MarkerSolver(rig, chin)).unseen
+        True
     """
     return weight_observability(solver.basis, solver.names, noise)

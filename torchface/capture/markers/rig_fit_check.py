@@ -43,6 +43,11 @@ class FitCheck:
             empty where nothing is.
         corrected: the distance without that cause, millimetres; NaN where no correction helps.
         similarity: that aligns the markers with the rig best, (1,).
+
+    Example:
+        >>> check = FitCheck(distance=60.0, radius=70.0, cause="mirror", corrected=0.4)
+        >>> check.refused
+        True
     """
 
     distance: float
@@ -99,6 +104,14 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
 
     Returns:
         A ``FitCheck``.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> sites, shapes = (torch.randn(20, 3, count, generator=generator) for count in (1, 2))
+        >>> affine = torch.cat([50 * sites, shapes], -1)
+        >>> check = check_fit(affine, affine[None, ..., 0].repeat(9, 1, 1) / 10)
+        >>> check.cause, check.unit
+        ('unit', 'cm')
     """
     affine, markers = affine.double(), markers.double()
     rest = affine[..., 0]

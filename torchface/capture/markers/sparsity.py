@@ -21,6 +21,14 @@ def sparsity_by_rule(solver: MarkerSolver, markers: Tensor) -> float:
         markers: (T,M,3), a take that shows what the performer does.
 
     Source: thesis 4.1.4, on the value of β.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> noise = torch.randn(20, len(solver.labels), 3, generator=torch.Generator().manual_seed(0))
+        >>> quiet, loud = (solver.points(torch.full((20, 51), 0.3)) + size * noise for size in (0.1, 0.5))
+        >>> sparsity_by_rule(solver, quiet) < sparsity_by_rule(solver, loud)
+        True
     """
     free = with_sparsity(solver, 0.0)
     weights = free(markers)

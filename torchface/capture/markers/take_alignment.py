@@ -46,6 +46,16 @@ def align_take(
         TopologyError: the attachment belongs to another mesh.
 
     Source: thesis 4.1.2.
+
+    Example:
+        >>> from torchface import Track
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> seen = sites.on(rig.neutral.faces, rig.vertices) / 10  # a stage in centimetres
+        >>> take = Take(60.0, markers=Track(sites.labels, seen[None]))
+        >>> round(align_take(rig, sites, take, neutral_frame=0).scale.item(), 3)
+        10.0
     """
     attachment.check(rig.neutral)
     rig = rig.linear("align_take")
@@ -89,6 +99,17 @@ def rest_residual(
         residual.
 
     Source: thesis 4.1.2, after algorithm 4.
+
+    Example:
+        >>> from torchface import Track
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> seen = sites.on(rig.neutral.faces, rig.vertices) + torch.tensor([0.0, 0.0, 3.0])
+        >>> take = Take(60.0, markers=Track(sites.labels, seen[None]))
+        >>> off = rest_residual(rig, sites, take, iterations=4).residual.mean(0)
+        >>> off[2].item() > 1.5  # millimetres that the markers stand off the skin
+        True
     """
     for _ in range(iterations):
         solver = MarkerSolver(rig, attachment, alignment)

@@ -56,6 +56,15 @@ class WholeTakeSolver:
         ValueRangeError: a setting is negative or NaN.
 
     Source: thesis 4.1.5 asks for curves that are smooth; the term is a robust form of Whittaker's.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.evaluation import weight_jitter
+        >>> solver = zoo.get_model("marker_solver")
+        >>> still = solver.points(torch.full((30, len(solver.names)), 0.3))
+        >>> noisy = still + 0.2 * torch.randn(still.shape, generator=torch.Generator().manual_seed(0))
+        >>> weight_jitter(WholeTakeSolver(solver)(noisy)) < 0.5 * weight_jitter(solver(noisy))
+        True
     """
 
     markers: MarkerSolver

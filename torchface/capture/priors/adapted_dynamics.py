@@ -40,6 +40,14 @@ class AdaptedDynamicsPrior(nn.Module):
         ValueRangeError: ``fps`` is not within a factor of 8 of the learned rate.
 
     Source: thesis 4.2.10, for one rate and one set of names.
+
+    Example:
+        >>> from torchface import zoo
+        >>> learned = zoo.get_model("dynamics_prior").double()
+        >>> at_24 = AdaptedDynamicsPrior(learned, ["jawOpen", "tongueOut"], fps=24.0)
+        >>> mean, variance = at_24(torch.full((1, at_24.window, 2), 0.3, dtype=torch.float64))
+        >>> round(mean[0, 1].item(), 3)  # not learned, so it stays
+        0.3
     """
 
     to_learned: Tensor
@@ -146,6 +154,12 @@ def adapt_dynamics(
     Raises:
         NameMismatchError: too few of the rig's shapes are among those learned.
         ValueRangeError: ``fps`` is not within a factor of 8 of the learned rate.
+
+    Example:
+        >>> from torchface import zoo
+        >>> learned = zoo.get_model("dynamics_prior")
+        >>> adapt_dynamics(learned, learned.names) is learned, adapt_dynamics(learned, ["jawOpen"], fps=24.0).fps
+        (True, 24.0)
     """
     learned = prior.learned if isinstance(prior, AdaptedDynamicsPrior) else prior
     rate = prior.fps if fps is None else fps

@@ -34,6 +34,12 @@ class DynamicsSettings:
             correlated, and a process that counts each of them overfits the takes.
         floor: minimum of the predicted standard deviation, in weights.
         seed: draws windows and noise.
+
+    Example:
+        >>> take = torch.linspace(0, 12, 120).sin()[:, None].square()
+        >>> quick = DynamicsSettings(inducing=8, subset=60, iterations=2)
+        >>> DynamicsPrior.fit([take], ["jawOpen"], window=2, settings=quick).window
+        2
     """
 
     inducing: int = 100
@@ -80,6 +86,14 @@ class DynamicsPrior(nn.Module):
         ShapeError: the parts do not fit each other.
 
     Source: thesis 4.2.10, equations 58 to 64.
+
+    Example:
+        >>> from torchface import zoo
+        >>> prior = zoo.get_model("dynamics_prior").double()
+        >>> still = torch.zeros(1, prior.window, len(prior.names), dtype=torch.float64)
+        >>> mean, variance = prior(still)
+        >>> bool(mean.abs().max() < 0.05), bool((variance > 0).all())
+        (True, True)
     """
 
     fit: ClassVar[Callable[..., DynamicsPrior]]

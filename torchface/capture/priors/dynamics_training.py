@@ -81,6 +81,14 @@ def fit_dynamics_prior(
         ValueRangeError: no window without a NaN, or a setting out of range.
 
     Source: thesis 4.2.10 and the appendix "Learning the prior".
+
+    Example:
+        >>> take = torch.linspace(0, 12, 120).sin()[:, None].square()
+        >>> quick = DynamicsSettings(inducing=8, subset=60, iterations=2)
+        >>> prior = fit_dynamics_prior([take], ["jawOpen"], window=2, settings=quick).double()
+        >>> rising = take[10:12].double()
+        >>> bool(prior(rising[None])[0] > rising[-1])
+        True
     """
     names, settings = tuple(names), settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))

@@ -24,6 +24,12 @@ class GaussianMixture(nn.Module):
         means: (K,D).
         factors: L with :math:`\Sigma_k^{-1} = L_k L_k^\top`, lower triangular, (K,D,D).
         log_mixing_weights: :math:`\log \pi_k`, (K,).
+
+    Example:
+        >>> clusters = torch.tensor([[0.0, 0.0], [5.0, 5.0]]).repeat(50, 1)
+        >>> clusters += 0.1 * torch.randn(100, 2, generator=torch.Generator().manual_seed(0))
+        >>> GaussianMixture.fit(clusters, components=2).means.abs().round().sort(0).values.tolist()
+        [[0.0, 0.0], [5.0, 5.0]]
     """
 
     means: Tensor

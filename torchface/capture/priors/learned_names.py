@@ -34,7 +34,12 @@ def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor,
 
 
 def unlearned(learned: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """The shapes of a rig that a prior has not learned, under whatever name: it says nothing of them."""
+    """The shapes of a rig that a prior has not learned, under whatever name: it says nothing of them.
+
+    Example:
+        >>> unlearned(["jawOpen", "eyeBlinkLeft"], ["jawOpen", "eyeBlink_L", "tongueOut"])
+        ('tongueOut',)
+    """
     known = mapping(learned, names).any(1).tolist()
     return tuple(name for name, found in zip(names, known, strict=True) if not found)
 

@@ -85,6 +85,11 @@ def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:
     Raises:
         ShapeError: the take is too short for a single window with a frame after it.
         ValueRangeError: no window is free of NaN.
+
+    Example:
+        >>> windows, following = windows_of(torch.arange(4.0)[:, None], window=2)
+        >>> windows[..., 0].tolist(), following[:, 0].tolist()
+        ([[0.0, 1.0], [1.0, 2.0]], [2.0, 3.0])
     """
     if weights.ndim != 2 or len(weights) <= window:
         raise ShapeError(
@@ -116,6 +121,10 @@ def resampled(weights: Tensor, from_fps: float, to_fps: float) -> Tensor:
 
     Raises:
         ValueRangeError: a rate is no camera's.
+
+    Example:
+        >>> resampled(torch.tensor([[0.0], [1.0], [2.0]]), from_fps=30.0, to_fps=60.0).flatten().tolist()
+        [0.0, 0.5, 1.0, 1.5, 2.0]
     """
     for fps in (from_fps, to_fps):
         check_rate(fps, "take", ValueRangeError)

@@ -29,6 +29,12 @@ class ParzenDensity(nn.Module):
         bandwidth: :math:`\sigma`, a positive number, in the unit of the centres.
 
     Source: thesis 4.2.7, equation 42, without its normaliser; 4.2.8.
+
+    Example:
+        >>> two = ParzenDensity(torch.tensor([[0.0], [1.0]], dtype=torch.float64), bandwidth=0.1)
+        >>> at, between = two.log_density(torch.tensor([[1.0], [0.5]], dtype=torch.float64)).tolist()
+        >>> at > between
+        True
     """
 
     centers: Tensor
@@ -112,6 +118,11 @@ def automatic_bandwidth(samples: Tensor, quantile: float = 0.3, seed: int = 0) -
         seed: of the draw.
 
     Source: thesis 4.2.8; the rule of scikit-learn's ``estimate_bandwidth``.
+
+    Example:
+        >>> dense, wide = torch.linspace(0, 1, 101)[:, None], torch.linspace(0, 10, 101)[:, None]
+        >>> round(automatic_bandwidth(wide) / automatic_bandwidth(dense))
+        10
     """
     _check_samples(samples)
     generator = torch.Generator().manual_seed(seed)

@@ -74,6 +74,13 @@ class ShapePrior(nn.Module):
         ShapeError: not one density a group, or groups that do not divide the shapes.
 
     Source: thesis 4.2.7 and 4.2.9; expectation maximisation's bound for the quadratic.
+
+    Example:
+        >>> take = torch.rand(200, 1, generator=torch.Generator().manual_seed(0)).repeat(1, 2)
+        >>> prior = ShapePrior.fit([take], ["mouthSmileLeft", "mouthSmileRight"])
+        >>> both, one = torch.tensor([[0.5, 0.5], [0.5, 0.0]], dtype=torch.float64)
+        >>> bool(prior.log_density(both[None]) > prior.log_density(one[None]))
+        True
     """
 
     def __init__(
@@ -247,6 +254,13 @@ class ReciprocalPrior(ShapePrior):
         guard: :math:`p_0`, relative to kernels of height 1.
 
     Source: thesis 4.2.9, equation 44.
+
+    Example:
+        >>> take = torch.rand(200, 1, generator=torch.Generator().manual_seed(0)).repeat(1, 2)
+        >>> prior = ReciprocalPrior.fit([take], ["mouthSmileLeft", "mouthSmileRight"])
+        >>> both, one = torch.tensor([[0.5, 0.5], [0.5, 0.0]], dtype=torch.float64)
+        >>> bool(prior.energy(both[None]).value(both[None]) < prior.energy(one[None]).value(one[None]))
+        True
     """
 
     def __init__(

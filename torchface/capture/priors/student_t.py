@@ -31,6 +31,12 @@ class StudentDensity(nn.Module):
         degrees_of_freedom: :math:`\nu`, positive; infinite for a Gaussian.
 
     Source: Liu and Rubin 1995 for the fit; Lange, Little and Taylor 1989 for the bound.
+
+    Example:
+        >>> density = StudentDensity.fit(torch.randn(500, 1, generator=torch.Generator().manual_seed(0)))
+        >>> near, far = density.log_density(torch.tensor([[0.0], [5.0]], dtype=torch.float64)).tolist()
+        >>> near > far
+        True
     """
 
     factor: Tensor

@@ -43,6 +43,18 @@ class VideoState:
         window: weights of the latest frames, the newest last, (1,J,N) with J growing up to the dynamics prior's window.
         solved: whether the frame showed at least six landmarks.
         hidden: for how long each shape has not been seen, (1,N), seconds; None before the first.
+
+    Example:
+        >>> from torchface.capture import VideoSolver
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> camera = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+        >>> head = rig.vertices[rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 700])
+        >>> solver = VideoSolver(rig, None, camera)
+        >>> first = solver.step(solver.start(), 900 * head[:, :2] / head[:, 2:] + torch.tensor([320.0, 240.0]))
+        >>> hidden = solver.step(first, torch.full((68, 2), torch.nan))
+        >>> first.solved, hidden.solved, torch.equal(first.weights, hidden.weights)
+        (True, False, True)
     """
 
     head: HeadState | None

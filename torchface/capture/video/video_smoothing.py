@@ -43,6 +43,20 @@ def solve_whole_take(
         ValueRangeError: the solver has no dynamics prior, or as ``VideoSolver.forward``.
 
     Source: Rauch, Tung and Striebel 1965.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.capture import VideoSolver
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> camera = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+        >>> head = rig.vertices[rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 700])
+        >>> pixels = (900 * head[:, :2] / head[:, 2:] + torch.tensor([320.0, 240.0])).repeat(3, 1, 1)
+        >>> pixels[1] = torch.nan  # a hand before the face
+        >>> solver = VideoSolver(rig, None, camera, dynamics=zoo.get_model("dynamics_prior"))
+        >>> found = solve_whole_take(solver, pixels)
+        >>> bool((found.translation[1, 2] - 700).abs() < 20)
+        True
     """
     if solver.dynamics is None:
         raise ValueRangeError("whole take: found a solver without a dynamics prior, expected one that has it")

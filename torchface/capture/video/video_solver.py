@@ -65,6 +65,17 @@ class VideoSolver(VideoSolverParts):
         ShapeError, ValueRangeError: an argument is not as above.
 
     Source: thesis 4.2.6, 4.2.9, 4.2.10; equations 40, 44, 65.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> camera = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+        >>> head = rig.vertices[rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 700])
+        >>> pixels = 900 * head[:, :2] / head[:, 2:] + torch.tensor([320.0, 240.0])
+        >>> solution = VideoSolver(rig, None, camera, zoo.get_model("shape_prior"))(pixels[None])
+        >>> bool(solution.weights.max() < 0.1), bool((solution.translation[0, 2] - 700).abs() < 10)
+        (True, True)
     """
 
     def forward(

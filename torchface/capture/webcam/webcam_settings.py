@@ -28,6 +28,13 @@ class WebcamSettings:
 
     Raises:
         ValueRangeError: an argument is not as above.
+
+    Example:
+        >>> from torchface.capture.webcam import WebcamSolver
+        >>> from torchface.synthetic import performer
+        >>> few = WebcamSolver(performer(texture=False), settings=WebcamSettings(coefficients=8))
+        >>> len(few.start().person)  # what is learned of a person
+        8
     """
 
     noise: float = 0.015

@@ -93,6 +93,19 @@ class WebcamSolver(nn.Module):
         ValueRangeError: the prior is none of Student's distributions.
 
     Source: thesis 4.2.6; Li, Yu, Ye and Bregler 2013 and Bouaziz, Wang and Pauly 2013 for learning while solving.
+
+    Example:
+        >>> from torchface.landmarks.images.face_reading import FaceReading
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> head = rig.vertices[rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 500])
+        >>> pixels = 600 * head[:, :2] / head[:, 2:] + torch.tensor([320.0, 240.0])
+        >>> sure, both = torch.ones(68), torch.ones(2)
+        >>> seen = FaceReading(pixels, sure, sure, both[0], pixels[[36, 42]], 0.3 * both, 0 * both, both)
+        >>> solver = WebcamSolver(rig)
+        >>> state = solver.step(solver.start(), seen, interval=1 / 30)
+        >>> state.tracked.item() > 0
+        True
     """
 
     rest: Tensor

@@ -32,6 +32,10 @@ class WebcamControls:
 
     Raises:
         ValueRangeError: an argument is not as above.
+
+    Example:
+        >>> WebcamControls(gain=1.5, freeze=True).tensor().tolist()
+        [0.0, 1.5, 0.5, 0.0, 1.0]
     """
 
     pose: int = 0
@@ -77,6 +81,13 @@ class WebcamState:
         straight_seen: for how long that has been learned, (), seconds.
         gains: logarithms of how far the person's landmarks go beside the rig's, of groups of shapes, (3,).
         gains_seen: for how long that has been learned, (3,), seconds.
+
+    Example:
+        >>> from torchface.capture.webcam import WebcamSolver
+        >>> from torchface.synthetic import performer
+        >>> state = WebcamSolver(performer(texture=False)).start()
+        >>> len(state.weights), state.tracked.item()
+        (52, 0.0)
     """
 
     weights: Tensor

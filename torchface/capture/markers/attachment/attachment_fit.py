@@ -95,6 +95,17 @@ def fit_attachment(
         TopologyError: ``initial`` belongs to another mesh.
 
     Source: thesis 4.1.2, algorithm 4, run to convergence; bundle adjustment for the joint steps (Triggs et al. 2000).
+
+    Example:
+        >>> from torchface import Track
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False).select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[31:])
+        >>> weights = torch.rand(20, len(rig.names), generator=torch.Generator().manual_seed(0))
+        >>> seen = sites.on(rig.neutral.faces, rig(weights.to(rig.vertices)))
+        >>> fit = fit_attachment(rig, Take(60.0, markers=Track(sites.labels, seen)), sites, insist=True)
+        >>> bool(fit.off_skin.mean() < 0.5)  # millimetres
+        True
     """
     progress = progress or silent
     initial.check(rig.neutral)

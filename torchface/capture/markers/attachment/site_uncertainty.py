@@ -35,6 +35,12 @@ class SiteUncertainty:
         levels: of each shape's mean weight, (N,).
         layout: of each shape's mean weight for known sites, (N,): the limit of the marker layout.
         noise: of a marker's coordinate, the residual of the fit, millimetres.
+
+    Example:
+        >>> sure = torch.full((2,), 0.1)
+        >>> places = torch.tensor([0.2, 9.0])
+        >>> SiteUncertainty(("jawOpen", "cheekPuff"), ("chin", "ear"), places, sure, sure, noise=0.3).markers
+        ('ear',)
     """
 
     names: tuple[str, ...]

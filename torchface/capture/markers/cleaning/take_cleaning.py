@@ -32,6 +32,10 @@ class Defect:
         first, last: frames, ``last`` included.
         size: largest distance from where the rig expects the marker, millimetres; 0 for a gap.
         action: what was done: ``swapped back``, ``masked``, ``filled`` or ``left``.
+
+    Example:
+        >>> Defect("swap", ("M041", "M042"), 150, 189, 12.0, "swapped back").labels
+        ('M041', 'M042')
     """
 
     kind: str
@@ -51,6 +55,15 @@ class Cleanup:
         filled: the same with short gaps closed by the rig's own prediction: for solving frame by frame.
         defects: in order of their first frame.
         masked: samples that were seen and are not used, (T,M) bool, in the order of the take's markers.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> markers = solver.points(torch.zeros(60, len(solver.names))).float()
+        >>> markers[30:34, 7] = torch.nan
+        >>> cleanup = clean_take(solver, Take(60.0, markers=Track(solver.labels, markers)))
+        >>> [bool(take.markers.values.isnan().any()) for take in (cleanup.take, cleanup.filled)]
+        [True, False]
     """
 
     take: Take
@@ -94,6 +107,15 @@ def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
 
     Raises:
         NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> markers = solver.points(torch.zeros(60, len(solver.names))).float()
+        >>> markers[30, 7, 2] += 20.0
+        >>> cleanup = clean_take(solver, Take(60.0, markers=Track(solver.labels, markers)))
+        >>> [(defect.kind, defect.labels, defect.first) for defect in cleanup.defects]
+        [('spike', ('M008',), 30)]
     """
     track = take.markers
     if track is None:

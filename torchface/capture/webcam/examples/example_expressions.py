@@ -30,6 +30,11 @@ class ExampleExpression:
         prompt: what the person is asked to do.
         shapes: weights by ARKit's names.
         yaw, roll: of the head, degrees: toward the person's left, the crown toward the person's left shoulder.
+
+    Example:
+        >>> pucker = ExampleExpression("kiss", "Purse your lips.", {"mouthPucker": 1.0}, yaw=0.0, roll=0.0)
+        >>> pucker.shapes
+        {'mouthPucker': 1.0}
     """
 
     name: str
@@ -44,6 +49,11 @@ def paper_expressions() -> tuple[ExampleExpression, ...]:
     """The 16 of the paper: neutral, 11 expressions, and the head turned and tilted to either side.
 
     Source: realtime_facial_animation, appendix, ``initial_example_face_matrix``.
+
+    Example:
+        >>> expressions = paper_expressions()
+        >>> len(expressions), expressions[0].name, expressions[0].shapes
+        (16, 'neutral', {})
     """
     rows = read_toml(_TABLE, _FORMAT)["expressions"].rows()
     return tuple(
@@ -71,6 +81,10 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
 
     Raises:
         NameMismatchError: no example moves a shape of the character.
+
+    Example:
+        >>> character_matrix(["jawOpen", "jawLeft"], ["jawLeft", "jawOpen"]).tolist()
+        [[0.0, 1.0], [1.0, 0.0]]
     """
     known = {one.name: one for one in paper_expressions()}
     matrix = mapping(names, shapes)
@@ -87,6 +101,12 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
 
 
 def head_angles(names: Sequence[str]) -> Tensor:
-    """Yaw and roll of the head in degrees that a weight of 1 of each example means, (N,2)."""
+    """Yaw and roll of the head in degrees that a weight of 1 of each example means, (N,2).
+
+    Example:
+        >>> names = [expression.name for expression in paper_expressions()]
+        >>> head_angles(names)[-2:].tolist()
+        [[0.0, 15.0], [0.0, -15.0]]
+    """
     known = {one.name: (one.yaw, one.roll) for one in paper_expressions()}
     return torch.tensor([known.get(name, (0.0, 0.0)) for name in names])

@@ -27,6 +27,15 @@ class AllAtOnce:
         objective: what is minimised.
 
     Source: realtime_facial_animation 5.2.2, listings 3 and 4.
+
+    Example:
+        >>> from torchface.capture.webcam import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, AllAtOnce())
+        >>> weights = solver(examples.landmarks[:4].double())
+        >>> weights.argmax(1).tolist()  # each of four is found to be itself
+        [0, 1, 2, 3]
     """
 
     objective: LandmarkObjective = field(default_factory=SquaredDistances)
@@ -48,6 +57,15 @@ class Regional:
         objective: what is minimised in each of the two steps.
 
     Source: realtime_facial_animation 5.2.2, listings 5 and 6.
+
+    Example:
+        >>> from torchface.capture.webcam import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, Regional())
+        >>> weights = solver(examples.landmarks[:4].double())
+        >>> weights.argmax(1).tolist()  # each of four is found to be itself
+        [0, 1, 2, 3]
     """
 
     objective: LandmarkObjective = field(default_factory=SquaredDistances)

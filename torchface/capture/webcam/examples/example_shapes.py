@@ -49,6 +49,14 @@ class ExampleShapes:
         ValueRangeError: a landmark is NaN or infinite, or the neutral's eyes or its box have no size.
 
     Source: realtime_facial_animation 5.1.
+
+    Example:
+        >>> from torchface.capture.webcam import paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> examples.save("me.json")
+        >>> ExampleShapes.load("me.json").names == examples.names
+        True
     """
 
     names: tuple[str, ...]

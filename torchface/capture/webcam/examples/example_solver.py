@@ -39,6 +39,14 @@ class ExampleFit:
     Args:
         weights: in [0,1], (B,N).
         placement: of the examples in the picture.
+
+    Example:
+        >>> from torchface.capture.webcam import paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> twice = 2 * examples.neutral.double()[None]  # the same face, nearer
+        >>> ExampleSolver(examples).fit(twice).placement.matrix.round(decimals=3).tolist()
+        [[[2.0, 0.0], [0.0, 2.0]]]
     """
 
     weights: Tensor
@@ -63,6 +71,16 @@ class ExampleSolver(nn.Module):
         ValueRangeError: all examples are the neutral.
 
     Source: realtime_facial_animation 5.2.2.
+
+    Example:
+        >>> from torchface.capture.webcam import paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples)
+        >>> shown = examples.neutral + 0.5 * examples.basis[..., 0]
+        >>> weights = solver(shown[None].double())[0]
+        >>> examples.names[int(weights.argmax())] == examples.names[0]
+        True
     """
 
     neutral: Tensor

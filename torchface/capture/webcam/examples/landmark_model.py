@@ -49,6 +49,15 @@ class LandmarkModel(nn.Module):
         ValueRangeError: a penalty or ``noise`` is negative or not finite.
 
     Source: realtime_facial_animation 5.2.2; Tipping and Bishop 1999, Probabilistic principal component analysis.
+
+    Example:
+        >>> from torchface.capture.webcam import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, LandmarkModel.fit(examples))
+        >>> weights = solver(examples.landmarks[:4].double())
+        >>> weights.argmax(1).tolist()  # each of four is found to be itself
+        [0, 1, 2, 3]
     """
 
     mean: Tensor

@@ -39,6 +39,14 @@ class SquaredDistances:
         ValueRangeError: a penalty is negative or not finite.
 
     Source: realtime_facial_animation, equation 2.
+
+    Example:
+        >>> from torchface.capture.webcam import AllAtOnce, ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, AllAtOnce(SquaredDistances(sparsity=0.0)))
+        >>> round(solver(examples.landmarks[:1].double())[0, 0].item(), 2)
+        1.0
     """
 
     sparsity: float = 2e-5
@@ -88,6 +96,14 @@ class Distances:
         ValueRangeError: a number is negative or not finite, ``smoothing`` or ``iterations`` is zero.
 
     Source: realtime_facial_animation, appendix, ``minFunction``; Weiszfeld 1937.
+
+    Example:
+        >>> from torchface.capture.webcam import AllAtOnce, ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, AllAtOnce(Distances(sparsity=0.0)))
+        >>> round(solver(examples.landmarks[:1].double())[0, 0].item(), 2)
+        1.0
     """
 
     sparsity: float = 1e-4

@@ -45,6 +45,15 @@ class LandmarkBoxes:
     so the whole face; a head that leans makes it wider.
 
     Source: realtime_facial_animation 5.2.2, listings 1 and 2. Whole pixels, to which its boxes were cut, are not.
+
+    Example:
+        >>> from torchface.capture.webcam import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, placement=LandmarkBoxes())
+        >>> farther = 0.5 * examples.neutral.double() + 40.0
+        >>> bool(solver(farther[None]).max() < 0.01)
+        True
     """
 
     def equations(self, landmarks: Tensor, neutral: Tensor, basis: Tensor) -> LandmarkEquations:
@@ -90,6 +99,15 @@ class SolvedSimilarity:
     .. math:: r_i = (a p_i + c J p_i + b) - (e_{0i} + \sum_k w_k (e_{ki} - e_{0i})), \quad J = (0, -1; 1, 0)
 
     so that weights and placement come out of one quadratic program, and an open jaw is no larger face.
+
+    Example:
+        >>> from torchface.capture.webcam import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, placement=SolvedSimilarity())
+        >>> farther = 0.5 * examples.neutral.double() + 40.0
+        >>> bool(solver(farther[None]).max() < 0.01)
+        True
     """
 
     def equations(self, landmarks: Tensor, neutral: Tensor, basis: Tensor) -> LandmarkEquations:

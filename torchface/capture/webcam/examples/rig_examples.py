@@ -39,6 +39,11 @@ def rig_examples(
     Raises:
         NameMismatchError: the rig lacks a shape.
         ShapeError: there are no 68 landmarks.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig_examples(performer(texture=False), ["jawOpen", "browInnerUp"]).names
+        ('jawOpen', 'browInnerUp', 'rotate_left', 'rotate_right', 'tilt_left', 'tilt_right')
     """
     marks = _marks(rig, landmark_vertices)
     moves = rig.deltas[:, marks].norm(dim=-1).amax(1) > 1e-4
@@ -62,6 +67,12 @@ def paper_examples(rig: BlendshapeRig, landmark_vertices: Tensor | None = None) 
     Raises:
         NameMismatchError: the rig has no shape that one of the expressions means.
         ShapeError: there are no 68 landmarks.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> len(examples.names), examples.names[0]
+        (15, 'brow_lower_left')
     """
     marks = _marks(rig, landmark_vertices)
     shown = [one for one in paper_expressions() if one.name != NEUTRAL]

@@ -32,6 +32,15 @@ def shown_examples(names: Sequence[str], landmarks: Tensor) -> ExampleShapes:
     Raises:
         NameMismatchError: no neutral, or a name twice.
         ShapeError: not as many faces as names.
+
+    Example:
+        >>> from torchface.capture.webcam import paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> pictures = torch.stack([examples.neutral, examples.landmarks[0] + 5.0])  # the head moved
+        >>> shown = shown_examples(["neutral", examples.names[0]], pictures)
+        >>> shown.names, bool((shown.landmarks[0] - examples.landmarks[0]).abs().mean() < 1)
+        (('brow_lower_left',), True)
     """
     if landmarks.shape != (len(names), 68, 2):
         raise ShapeError(f"examples: found landmarks {tuple(landmarks.shape)}, expected ({len(names)},68,2)")
@@ -47,7 +56,18 @@ def shown_examples(names: Sequence[str], landmarks: Tensor) -> ExampleShapes:
 
 
 def example_remarks(examples: ExampleShapes) -> list[str]:
-    """What somebody should know of examples of a person, a sentence each: mirrored pictures, faces that hardly move."""
+    """What somebody should know of examples of a person, a sentence each: mirrored pictures, faces that hardly move.
+
+    Example:
+        >>> from torchface.capture.webcam import paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> example_remarks(examples)
+        []
+        >>> still = ExampleShapes(("smile",), examples.neutral, examples.neutral[None])
+        >>> example_remarks(still)[0][:38]
+        'warning: smile hardly differ from the '
+    """
     moves = (examples.landmarks - examples.neutral).norm(dim=-1) / examples.eyes_distance
     strongest = moves.sort(dim=1, descending=True).values[:, :7].square().mean(1).sqrt()
     faint = [name for name, size in zip(examples.names, strongest.tolist(), strict=True) if size < _FAINT]
