@@ -5,7 +5,7 @@ RUN := $(VENV)/bin/python
 export OMP_WAIT_POLICY ?= PASSIVE
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-blender test-cluster bench fuzz lint app clean
+.PHONY: demo test test-blender test-cluster bench fuzz lint docs app clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes"
@@ -52,6 +52,11 @@ lint: $(VENV)/.installed-lint
 	$(VENV)/bin/lint-imports
 	$(VENV)/bin/pip-licenses --output-file $(VENV)/licences.txt
 	$(RUN) -m pytest -q tests/test_licences.py
+
+# Tutorials run on the first build and when they change; a warning is an error.
+docs: $(VENV)/.installed-docs
+	OMP_NUM_THREADS=2 $(RUN) -m sphinx -W --keep-going -d out/docs_doctrees docs out/docs
+	@echo "open out/docs/index.html"
 
 demo: $(STAMP)
 	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")

@@ -22,7 +22,7 @@ from packaging.utils import canonicalize_name
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 GPL_PARTS = {
-    "av": "FFmpeg with x264 and x265 (GPL-2.0-or-later); README and docs/architecture.md say what a studio does",
+    "av": "FFmpeg with x264 and x265 (GPL-2.0-or-later); docs/concepts/architecture.md says what a studio does",
     "bpy": "Blender, GPL-3.0-or-later: an extra, run in a process of its own; nothing imports it",
     "torch": "the licence of the tests of a library inside Kineto; the wheel holds no such code",
 }
