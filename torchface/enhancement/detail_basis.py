@@ -32,7 +32,7 @@ class StreamingBasis:
     def __init__(self, size: int, rank: int) -> None:
         self.rank = rank
         self._kept = min(2 * rank, max(rank, _NUMBERS // size))
-        self._basis = torch.zeros(0, size)
+        self._basis = torch.zeros(0, size, dtype=torch.float32)
         self._coefficients = torch.zeros(0, 0, dtype=torch.float64)
         self._total = torch.zeros((), dtype=torch.float64)
         self._dropped = torch.zeros((), dtype=torch.float64)
@@ -78,7 +78,7 @@ class StreamingBasis:
         lift = (vectors[:, new] / roots).T.float()
         to_old, to_new = turned[:old].T.float(), turned[old:].T.float() @ lift
         # Into its own memory once it has its full size: at 500,000 vertices it is most of what there is.
-        basis = self._basis if turned.shape[1] == old else torch.empty(turned.shape[1], rows.shape[1])
+        basis = self._basis if turned.shape[1] == old else rows.new_empty(turned.shape[1], rows.shape[1])
         for begin in range(0, rows.shape[1], _CHUNK):
             some = slice(begin, begin + _CHUNK)
             basis[:, some] = to_old @ self._basis[:, some] + to_new @ rest[:, some]

@@ -41,6 +41,16 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
         TopologyError: correspondences of another template.
         ValueRangeError: points only, and a template without annotated landmarks; or beside a USD file, without a unit.
         ShapeError: another number of points than the template has landmarks.
+
+    Example:
+        >>> from torchface.io import Correspondences, save_correspondences
+        >>> from torchface.synthetic import neutral_head
+        >>> template = neutral_head(texture=False)
+        >>> nose = template.landmarks[[30]]
+        >>> save_correspondences(Correspondences(nose, torch.tensor([[1.0, 2, 3]]), ("nose",)), "picks.json")
+        >>> vertices, points = load_scan_landmarks("picks.json", template, "scan.obj")
+        >>> torch.equal(vertices, nose), points.tolist()
+        (True, [[1.0, 2.0, 3.0]])
     """
     path = Path(path)
     if _is_correspondences(path):

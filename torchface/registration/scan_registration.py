@@ -122,6 +122,15 @@ def register(
             comes to lie on the scan.
 
     Source: Amberg, Romdhani, Vetter 2007; thesis 3.2.3, equation 7 and Algorithm 1.
+
+    Example:
+        >>> from torchface.synthetic import draw_identities, neutral_head
+        >>> template = neutral_head(texture=False)
+        >>> somebody = neutral_head(draw_identities(1, torch.Generator().manual_seed(0))[0], texture=False)
+        >>> marks = (template.landmarks, somebody.vertices[somebody.landmarks])
+        >>> registered = register(template, somebody, marks, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]))
+        >>> bool(registered.distance.median() < 1)  # millimetres
+        True
     """
     begin, progress = time.perf_counter(), progress or silent
     if texture_size < 0 or texture_size > 16384:

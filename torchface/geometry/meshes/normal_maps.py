@@ -129,7 +129,7 @@ def _check_maps(maps: Tensor, neutral: Tensor | None) -> None:
 
 def flat_normal_map(height: int, width: int) -> Tensor:
     """The map (3,H,W) that changes nothing."""
-    flat = torch.zeros(3, height, width)
+    flat = torch.zeros(3, height, width, dtype=torch.float32)
     flat[2] = 1
     return flat
 

@@ -106,6 +106,15 @@ def bake_normal_map(
         AlignmentError: the scan does not find its place by itself.
 
     Source: thesis 3.3.2.
+
+    Example:
+        >>> from torchface.geometry.similarity import Similarity
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> baked = bake_normal_map(head, head, size=32, alignment=still)  # a head on itself: no detail
+        >>> bool(baked.statistics.far_distance < 0.01), bool(baked.normals[2].median() > 0.99)
+        (True, True)
     """
     height, width = _checked_size(size)
     _check_limits(maximum_distance, maximum_angle, padding)
@@ -137,7 +146,7 @@ def bake_normal_map(
     image.view(3, -1)[:, texels.texels] = normals.T
     hit = torch.zeros(height * width, dtype=torch.bool)
     hit[texels.texels] = seen
-    heights = torch.zeros(1, height, width)
+    heights = torch.zeros(1, height, width, dtype=torch.float32)
     heights.view(-1)[texels.texels] = torch.where(seen, offset, 0.0)
     return NormalMap(
         dilate(image, texels.mask(), padding),
@@ -161,6 +170,16 @@ def detail_maps(names: Sequence[str], baked: Sequence[NormalMap], neutral: Norma
     Raises:
         ShapeError: the sizes differ, or there is no map.
         NameMismatchError: not one name a map, or a name twice.
+
+    Example:
+        >>> from torchface.modeling import bake_normal_map
+        >>> from torchface.geometry.similarity import Similarity
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> maps = detail_maps(["jawOpen"], [bake_normal_map(head, head, size=16, alignment=still)])
+        >>> maps.names, maps.maps.shape == (1, 3, 16, 16)
+        (('jawOpen',), True)
     """
     sizes = {tuple(one.normals.shape) for one in (*baked, *([neutral] if neutral else []))}
     if len(baked) == 0 or len(sizes) != 1:
@@ -218,8 +237,8 @@ def _cast_all(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Tangent-space normals (M,3), offsets (M,), infinite where nothing counted, and the share that met back sides."""
     count = len(texels.texels)
-    normals = torch.tensor([0.0, 0.0, 1.0]).repeat(count, 1)
-    offsets = torch.full((count,), torch.inf)
+    normals = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32).repeat(count, 1)
+    offsets = torch.full((count,), torch.inf, dtype=torch.float32)
     opposed = torch.zeros(())
     for start in range(0, count, _BATCH):  # batches bound the memory
         piece = torch.arange(start, min(start + _BATCH, count))
@@ -242,7 +261,7 @@ def _nearest_hits(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Signed distance along the normal, infinite without a hit that counts; its normal; whether a back side is near."""
     best = torch.full((len(points),), torch.inf, dtype=torch.float64)
-    normals = torch.zeros(len(points), 3)
+    normals = torch.zeros(len(points), 3, dtype=torch.float32)
     back = torch.zeros(len(points), dtype=torch.bool)
     for side in (1.0, -1.0):
         distance, found = scan.hits(points - side * _STAND_OFF * ways, side * ways)

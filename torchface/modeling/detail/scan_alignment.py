@@ -61,6 +61,14 @@ def align_scan(
         ShapeError: fewer than three correspondences, or not of the shapes above.
         ValueRangeError: a correspondence is NaN, on a line, or the scan is in another unit.
         AlignmentError: no initial pose ends close enough, or the correspondences are mirrored.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> ids = head.landmarks[::8]
+        >>> laid = align_scan(head, head.with_vertices(head.vertices + 30.0), (ids, head.vertices[ids] + 30.0))
+        >>> laid.similarity.translation.round().tolist()
+        [[-30.0, -30.0, -30.0]]
     """
     _check_extent(mesh, scan)
     target = _Target.of(scan)

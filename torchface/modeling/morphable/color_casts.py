@@ -39,6 +39,12 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
         ValueRangeError: colours that are not finite, or a scan whose colours are all clipped.
 
     Source: thesis 3.2.4 (textures in UV space); Blanz, Vetter 1999 (gain and offset of a channel).
+
+    Example:
+        >>> skin = torch.full((1, 50, 3), 0.5)
+        >>> casts = color_casts(torch.cat([skin, skin * torch.tensor([1.2, 1.0, 1.0])]))
+        >>> bool(casts[1, 0] > 0.1 > casts[1, 1].abs())  # the second scan is too red
+        True
     """
     if colors.ndim != 3 or colors.shape[2] != 3:
         raise ShapeError(f"colors: found {tuple(colors.shape)}, expected (M,V,3)")
@@ -78,6 +84,13 @@ def without_cast(colors: Tensor, cast: Tensor) -> Tensor:
 
     Returns:
         sRGB, (M,V,3), within [0,1].
+
+    Example:
+        >>> skin = torch.full((1, 50, 3), 0.5)
+        >>> scans = torch.cat([skin, skin * torch.tensor([1.2, 1.0, 1.0])])
+        >>> neutral = without_cast(scans, color_casts(scans))
+        >>> bool((neutral[0] - neutral[1]).abs().max() < 0.01)
+        True
     """
     return to_srgb(to_linear(colors) * (-cast[:, None]).exp().to(colors)).clamp(0, 1)
 
@@ -87,6 +100,14 @@ def texture_areas(mesh: Mesh) -> Tensor:
 
     Raises:
         TopologyError: the mesh has no texture coordinates.
+
+    Example:
+        >>> corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+        >>> quad = torch.tensor([[0, 1, 2], [0, 2, 3]])
+        >>> square = Mesh(torch.nn.functional.pad(corners, (0, 1)), quad, uvs=corners, uv_faces=quad)
+        >>> areas = texture_areas(square)
+        >>> round((areas[0] / areas[1]).item(), 3)  # vertex 0 has two triangles, vertex 1 has one
+        2.0
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("mesh: found no texture coordinates, expected some to weigh colours in")

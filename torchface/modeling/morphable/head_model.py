@@ -21,7 +21,15 @@ _TOPOLOGY = ("faces", "polygons", "uvs", "uv_faces", "landmarks", "mirror", "con
 
 
 class Heads(NamedTuple):
-    """Vertices (B,V,3) in millimetres and colours (B,V,3), where they were asked for."""
+    """Vertices (B,V,3) in millimetres and colours (B,V,3), where they were asked for.
+
+    Example:
+        >>> from torchface import zoo
+        >>> model = zoo.get_model("head")
+        >>> heads = model(torch.zeros(2, model.shape.count))
+        >>> len(heads.vertices), heads.colors is None
+        (2, True)
+    """
 
     vertices: Tensor
     colors: Tensor | None
@@ -45,6 +53,13 @@ class HeadModel(nn.Module):
         ShapeError: a tensor has the wrong shape.
 
     Source: thesis 3.2.4.
+
+    Example:
+        >>> from torchface import zoo
+        >>> model = zoo.get_model("head")
+        >>> average = model.mesh(torch.zeros(model.shape.count))
+        >>> len(average.landmarks), torch.equal(average.vertices, model.template().vertices)
+        (68, True)
     """
 
     faces: Tensor

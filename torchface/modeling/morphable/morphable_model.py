@@ -35,6 +35,13 @@ class MorphableModel(nn.Module):
         ShapeError: the shapes do not fit.
 
     Source: thesis 3.2.4, equations 8 and 9 (whose exponent means the squares of coefficients over variances).
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> line = torch.randn(20, 1, 1, generator=generator) * torch.ones(5, 3)  # samples that differ in one way
+        >>> model = MorphableModel.fit(line.float())
+        >>> model.count, round(model.explained[0].item(), 3)
+        (1, 1.0)
     """
 
     mean: Tensor

@@ -56,6 +56,15 @@ def fit_sequence(
         FileFormatError: the checkpoint cannot be written.
 
     Source: thesis 3.2.4, equation 8; Lehoucq, Sorensen, Yang 1998 (Lanczos).
+
+    Example:
+        >>> from torchface.io import MeshSequence, MeshSequenceWriter
+        >>> heads = torch.randn(6, 40, 3, generator=torch.Generator().manual_seed(0)).float()
+        >>> with MeshSequenceWriter("heads.safetensors", 6, 40, torch.tensor([[0, 1, 2]])) as writer:
+        ...     writer.append(heads)
+        >>> streamed, at_once = fit_sequence(MeshSequence("heads.safetensors"), 3), MorphableModel.fit(heads, 3)
+        >>> torch.allclose(streamed.standard_deviations, at_once.standard_deviations, rtol=1e-4)
+        True
     """
     report = progress or silent
     count, vertices, channels = samples.shape

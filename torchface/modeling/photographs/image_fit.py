@@ -113,6 +113,17 @@ def fit_images(
         AlignmentError: a face seen from behind, or landmarks that are not a face's in iBUG's order.
 
     Source: thesis 3.2.5, algorithm 2, equations 12 to 17.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.geometry.cameras.pinhole import look_at
+        >>> from torchface.synthetic import performer
+        >>> model, rig = zoo.get_model("head"), performer(texture=False).select(["jawOpen"])
+        >>> points = model.template().vertices[rig.neutral.landmarks].double()
+        >>> camera = look_at(points.mean(0), yaw=20.0, width=600, height=800)
+        >>> fit = fit_images(model, rig, camera.project(points)[None], (600, 800), transfers=0)
+        >>> fit.errors.item() < 5  # pixels
+        True
     """
     progress = progress or silent
     rig = rig.linear("fit_images")

@@ -47,6 +47,10 @@ class FitSettings:
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.
+
+    Example:
+        >>> FitSettings(focal_deviation=0.05, shared_focal=True).identity_bound
+        3.0
     """
 
     inner_weight: float = 2.0

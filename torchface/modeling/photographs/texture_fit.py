@@ -76,6 +76,18 @@ def fit_colors(
         AlignmentError: a photograph shows next to nothing of the head.
 
     Source: thesis 3.2.5, algorithm 3, equation 16.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.geometry.cameras.pinhole import look_at
+        >>> model = zoo.get_model("head")
+        >>> head = model.mesh(torch.zeros(model.shape.count), torch.zeros(model.color.count))
+        >>> camera = look_at(head.vertices[head.landmarks].mean(0), 0.0, width=60, height=80)
+        >>> from torchface.rendering.clay_shading import Lighting, render
+        >>> even = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
+        >>> photograph = render(head, camera, lighting=even, samples=1)
+        >>> fit_colors(model.color, head, [photograph], [camera], lighting=False).error.item() < 0.1
+        True
     """
     if len(images) != len(cameras) or not images:
         raise ShapeError(f"fit_colors: found {len(images)} images and {len(cameras)} cameras, expected one each")

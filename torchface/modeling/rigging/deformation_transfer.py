@@ -35,6 +35,12 @@ class TransferReport:
         flat_shapes: by shape name, triangles that lose their area in the source's shape; their edges still count.
         contacts: by shape name, how many contact pairs were asked to keep their gap.
         undoes: by the name of a shape that only makes sense on top of another, the name of that other.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False).select(["jawOpen"])
+        >>> transfer_with_report(actor, actor.neutral).report.summary()
+        ''
     """
 
     similarity: Similarity
@@ -57,7 +63,15 @@ class TransferReport:
 
 @dataclass(frozen=True, eq=False)
 class TransferredRig:
-    """A transferred rig and the report of how it came about."""
+    """A transferred rig and the report of how it came about.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False).select(["jawOpen"])
+        >>> transferred = transfer_with_report(actor, actor.neutral)
+        >>> transferred.rig.names
+        ('jawOpen',)
+    """
 
     rig: BlendshapeRig
     report: TransferReport
@@ -94,6 +108,14 @@ def transfer_deformation(
         ValueRangeError: the source has no shapes, the target has collapsed, or the weight is negative.
 
     Source: thesis 3.3.1; Sumner and Popovic 2004.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False).select(["jawOpen", "browInnerUp"])
+        >>> larger = actor.neutral.with_vertices(1.5 * actor.vertices)
+        >>> rig = transfer_deformation(actor, larger)
+        >>> torch.allclose(rig.deltas, 1.5 * actor.deltas, atol=0.05)
+        True
     """
     transferred = transfer_with_report(source, target, contact_weight, progress)
     if summary := transferred.report.summary():
@@ -107,7 +129,16 @@ def transfer_with_report(
     contact_weight: float = CONTACT_WEIGHT,
     progress: Progress | None = None,
 ) -> TransferredRig:
-    """The same as ``transfer_deformation``, with a report in place of a warning."""
+    """The same as ``transfer_deformation``, with a report in place of a warning.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False).select(["jawOpen"])
+        >>> larger = actor.neutral.with_vertices(1.5 * actor.vertices)
+        >>> report = transfer_with_report(actor, larger).report
+        >>> round(report.similarity.scale.item(), 3), len(report.flat_target)
+        (1.5, 0)
+    """
     _check(source, target, contact_weight)
     job = ShapeTransfer(source, target, contact_weight)
     moved = job.transfer(progress)

@@ -45,6 +45,11 @@ class RiggingSchedule:
         ValueRangeError: no iteration, or a number that is not positive.
 
     Source: Li, Weise and Pauly 2010.
+
+    Example:
+        >>> schedule = RiggingSchedule(iterations=3, beta=(0.5, 0.1), gamma=(100.0, 10.0))
+        >>> [round(schedule.at(number)[0], 2) for number in range(3)]
+        [0.5, 0.3, 0.1]
     """
 
     iterations: int = 10
@@ -140,6 +145,18 @@ def rig_from_examples(
         ValueRangeError: NaN or infinite numbers, weights outside [0,1], or a template without shapes.
 
     Source: thesis 3.3.3, equations 27 to 29; Li, Weise and Pauly 2010.
+
+    Example:
+        >>> y, x = torch.meshgrid(torch.linspace(-50, 50, 9), torch.linspace(-50, 50, 9), indexing="ij")
+        >>> sheet = torch.stack([x, y, 50 - (x**2 + y**2) / 100], -1).reshape(-1, 3)
+        >>> corner = torch.arange(72).reshape(8, 9)[:, :8].reshape(-1, 1)
+        >>> neutral = Mesh.from_polygons(sheet, corner + torch.tensor([0, 1, 10, 9]))
+        >>> bulge = torch.exp(-(x**2 + y**2) / 400).reshape(-1, 1) * torch.tensor([0.0, 2.0, 6.0])
+        >>> template = BlendshapeRig(neutral, bulge[None], ["jawOpen"])
+        >>> shown = sheet + 2 * bulge  # this person's goes twice as far
+        >>> learned = rig_from_examples(template, neutral, shown[None], torch.ones(1, 1)).rig
+        >>> 1.5 < (learned.deltas[0, 40, 2] / bulge[40, 2]).item() < 2.0  # under way to the person's own
+        True
     """
     progress = progress or silent
     _check(template, neutral, examples, weights, contact_weight)

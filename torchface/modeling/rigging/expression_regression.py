@@ -48,6 +48,15 @@ class ExpressionRegression(nn.Module):
         form: "offsets" or "expressions".
 
     Source: thesis 3.3.4, equations 30 to 32.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import neutral_head
+        >>> regression = zoo.get_model("expressions")
+        >>> head = neutral_head(texture=False)
+        >>> open_jaw = regression(head.vertices[None])[0, regression.names.index("jawOpen")]
+        >>> bool(open_jaw[head.landmarks[8], 1] < head.vertices[head.landmarks[8], 1] - 10)
+        True
     """
 
     neutral_mean: Tensor
@@ -236,6 +245,14 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
         NameMismatchError: the regression has none of the template's shapes.
 
     Source: thesis 3.3.4 for predicted shapes, 3.3.1 for the others.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import performer
+        >>> template = performer(texture=False).select(["jawOpen", "mouthSmileLeft"])
+        >>> rig = rig_from_neutral(zoo.get_model("expressions"), template, template.neutral)
+        >>> rig.names
+        ('jawOpen', 'mouthSmileLeft')
     """
     own = neutral.fingerprint()
     for what, found in (("template", template.neutral.fingerprint()), ("regression", regression.topology)):

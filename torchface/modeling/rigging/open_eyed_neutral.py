@@ -43,6 +43,14 @@ def open_eyes(
         TopologyError: the face has another topology than the template.
 
     Source: thesis 3.3.3, results; Sumner and Popovic 2004.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> blink = actor.vertices + actor.deltas[actor.index(["eyeBlinkLeft", "eyeBlinkRight"])].sum(0)
+        >>> opened = open_eyes(actor, actor.neutral.with_vertices(blink))
+        >>> bool((opened.vertices - actor.vertices).norm(dim=1).max() < 1)  # millimetres
+        True
     """
     if shapes is None:
         means_blink = mapping(_BLINKS, template.names).any(1)

@@ -34,6 +34,15 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
         parts: of a head in the rig's topology; see ``inner_parts``.
         poses: weights to test, (K,N), in this order; every shape by itself and mixtures of the shapes that move the
             skin before the eyes if absent.
+
+    Example:
+        >>> from torchface.modeling import inner_parts, shape_depths
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> parts, jaw = inner_parts(actor), actor.select(["jawOpen"])
+        >>> before, after = (shape_depths(rig, parts).max() for rig in (jaw, clear_parts(jaw, parts)))
+        >>> bool(after <= before)
+        True
     """
     poses = clearance_poses(rig, parts) if poses is None else poses
     rest, deltas = rig.vertices.detach().cpu().double(), rig.deltas.detach().cpu().double().clone()

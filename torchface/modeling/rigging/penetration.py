@@ -58,6 +58,13 @@ class InnerParts:
         body: the connected part that carries the skin.
         skin: triangles near the parts that are open to the outside at rest, (S,3) int64.
         hard: which vertices are bone, such as teeth, gums and eyeballs, and not shells of the eye, (P,) bool.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> parts = inner_parts(actor)
+        >>> parts.depth(actor.vertices.double()).max().item()  # nothing stands out of the skin at rest
+        0.0
     """
 
     vertices: Tensor
@@ -117,6 +124,13 @@ def inner_parts(template: BlendshapeRig) -> InnerParts:
 
     Args:
         template: a rig, millimetres; its shapes show which parts are bone.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> parts = inner_parts(actor)
+        >>> bool(parts.hard.any()), len(parts.vertices) < len(actor.vertices)  # eyeballs are bone
+        (True, True)
     """
     mesh = template.neutral
     vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
@@ -141,7 +155,15 @@ def inner_parts(template: BlendshapeRig) -> InnerParts:
 
 
 def shape_depths(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
-    """How far each vertex of a part stands out of the skin at rest and in every shape at weight 1, (N+1,P)."""
+    """How far each vertex of a part stands out of the skin at rest and in every shape at weight 1, (N+1,P).
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> actor = performer(texture=False)
+        >>> depths = shape_depths(actor.select(["jawOpen"]), inner_parts(actor))
+        >>> len(depths), depths[0].max().item()  # at rest, then each shape
+        (2, 0.0)
+    """
     poses = torch.cat([torch.zeros_like(rig.deltas[:1]), rig.deltas.detach()])
     return torch.stack([parts.depth(rig.vertices + pose) for pose in poses])  # each pose is ray cast by itself
 

@@ -10,7 +10,12 @@ from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_numbe
 
 
 class Level(Enum):
-    """What is free to move in a stage; the cost function is the same."""
+    """What is free to move in a stage; the cost function is the same.
+
+    Example:
+        >>> [level.value for level in Level]  # from coarse to fine
+        ['graph', 'translations', 'vertices']
+    """
 
     GRAPH = "graph"
     """An affine map a node of a coarse graph; the vertices blend their nodes' maps."""
@@ -33,6 +38,12 @@ class Stage:
         iterations: at most.
         tolerance: :math:`\\varepsilon`, millimetres; the stage ends when the vertices move less on average.
         contact_weight: :math:`\\gamma`, of vertices that touch in the template and between which the scan shows no gap.
+
+    Example:
+        >>> coarse = Stage(Level.GRAPH, stiffness=18.0, landmark_weight=1.0, reach=30.0)
+        >>> fine = Stage(Level.GRAPH, stiffness=2.0, landmark_weight=0.1, reach=5.0)
+        >>> [stage.stiffness for stage in Schedule((coarse, fine)).stages]
+        [18.0, 2.0]
     """
 
     level: Level
@@ -67,6 +78,12 @@ class Schedule:
         largest_angle: between the normals of a correspondence, degrees.
         opening: millimetres within which nothing may stand before a vertex that looks for a correspondence; what lies
             behind lips, lids and in nostrils follows its neighbours.
+
+    Example:
+        >>> from torchface.registration import DEFAULT_SCHEDULE
+        >>> quick = Schedule(DEFAULT_SCHEDULE.stages[:3])
+        >>> quick.stages[0].stiffness > quick.stages[-1].stiffness
+        True
     """
 
     stages: tuple[Stage, ...]
