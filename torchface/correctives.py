@@ -336,6 +336,19 @@ class CorrectiveActivation(nn.Module):
         """The definitions as plain values; see ``definitions_from_records``."""
         return [definition.record() for definition in self.definitions]
 
+    def expressions(self) -> list[str]:
+        """The activations in words that Blender's drivers, Maya and Python know, of the drivers' weights w0, w1, w2.
+
+        Example:
+            >>> CorrectiveActivation([Corrective("ab", ("a", "b")), Corrective("a4", ("a",), 0.4)], "ab").expressions()
+            ['w0*w1', 'max(0,min(w0/0.4,(1-w0)/0.6))']
+        """
+        found = ["*".join(f"w{place}" for place in range(len(one.drivers))) for one in self.definitions]
+        for row, (left, peak, right) in zip(self.in_betweens.tolist(), self.knots.tolist(), strict=True):
+            rise = f"(w0-{left:.9g})" if left else "w0"
+            found[row] = f"max(0,min({rise}/{peak - left:.9g},({right:.9g}-w0)/{right - peak:.9g}))"
+        return found
+
     def extra_repr(self) -> str:
         return f"{len(self.definitions)} correctives, {len(self.in_betweens)} of them in-betweens"
 

@@ -352,7 +352,8 @@ def test_nothing_in_the_library_writes_past_whole_files() -> None:
         "torchface/io/meshes/mesh_sequence.py",  # grows in its place
         "torchface/io/usd/stage_process.py",  # into a temporary folder, as what follows
         "torchface/io/usd/usd_writing.py",
-        "torchface/io/blender/blender_process.py",
+        "torchface/io/blender/blender_files.py",
+        "torchface/io/blender/reading_in_blender.py",
         "torchface/workflows/browser_app/built_page.py",  # other programs fill a folder, that then takes its place
     }
     found = {

@@ -9,7 +9,7 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
-from torchface.io.blender import BLENDER_ENDINGS, blender_command, read_blender_file, write_blender_file
+from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
@@ -66,7 +66,7 @@ def convert_file(
     if out.suffix.lower() in BLENDER_ENDINGS:
         require_usd()
     if {source.suffix.lower(), out.suffix.lower()} & set(BLENDER_ENDINGS):
-        blender_command()
+        blender_program()
     if out.suffix:
         check_writable(out)
     else:
@@ -118,6 +118,12 @@ def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | None, out
         notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]
+    if suffix == ".fbx" and rig.correctives is not None:
+        moved = "which the animation moves and sliders do not" if take is not None else "which no slider moves"
+        notes.append(
+            f"{suffix} has no correctives: the {len(rig.correctives.names)} are shape keys of their own, {moved}; "
+            ".blend has drivers for them"
+        )
     if suffix in BLENDER_ENDINGS:
         write_blender_file(rig, out, keys)
     else:

@@ -1,7 +1,8 @@
 """What Blender shows of a file, and what it writes of it: run by Blender's own Python.
 
 ``shown_in_blender.py show FILE OUT.npz FPS`` opens a file and keeps the names of its shape keys and the places of all
-evaluated vertices, metres, frame by frame. ``shown_in_blender.py export FILE OUT`` opens one and writes it with
+evaluated vertices, metres, frame by frame. ``shown_in_blender.py pose FILE OUT.npz NAME=WEIGHT ...`` keeps the places
+that they have when somebody moves these sliders. ``shown_in_blender.py export FILE OUT`` opens one and writes it with
 Blender's exporters and their defaults.
 """
 
@@ -25,7 +26,10 @@ OPEN = {
 def opened(path: str, fps: float) -> list[Any]:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.scene.render.fps = round(fps)
-    OPEN[Path(path).suffix](filepath=path)
+    if path.endswith(".blend"):
+        bpy.ops.wm.open_mainfile(filepath=path)
+    else:
+        OPEN[Path(path).suffix](filepath=path)
     return [one for one in bpy.context.scene.objects if one.type == "MESH"]
 
 
@@ -62,6 +66,16 @@ def show(path: str, out: str, fps: str) -> None:
     np.savez(out, names=names, rest=places(found), frames=np.array(frames), images=images)
 
 
+def pose(path: str, out: str, *sliders: str) -> None:
+    found = opened(path, 24.0)
+    for one in found:
+        for slider in sliders:
+            name, _, value = slider.partition("=")
+            one.data.shape_keys.key_blocks[name].value = float(value)
+    bpy.context.view_layer.update()
+    np.savez(out, places=places(found))
+
+
 def export(path: str, out: str) -> None:
     opened(path, 24.0)
     if out.endswith(".glb"):
@@ -74,4 +88,4 @@ def export(path: str, out: str) -> None:
 
 if __name__ == "__main__":
     words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-    {"show": show, "export": export}[words[0]](*words[1:])
+    {"show": show, "pose": pose, "export": export}[words[0]](*words[1:])

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rig_samples import corrective_sheet
 from scipy.spatial import cKDTree
 
 from torchface.cli import main
-from torchface.io import load_animation, load_rig, save_animation
-from torchface.io.blender import blender_command, blender_process
+from torchface.correctives import Corrective, Correctives
+from torchface.io import load_animation, load_rig, save_animation, save_rig
+from torchface.io.blender.blender_files import blender_command
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.take import Take, Track
@@ -23,11 +25,9 @@ FPS, FRAMES = 30.0, 4
 METRES, MILLIMETRES = 1e-5, 1e-2
 
 
-def in_blender(*words: str | Path) -> None:
-    """Runs the script beside this file."""
-    product = str(Path(blender_process.__file__).resolve())
-    command = [str(SCRIPT) if word == product else word for word in blender_command()]
-    done = subprocess.run([*command, *map(str, words)], capture_output=True, text=True, check=False)
+def in_blender(*words: str | Path, script: Path = SCRIPT) -> None:
+    """Runs a script beside this file."""
+    done = subprocess.run([*blender_command(script), *map(str, words)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
@@ -127,6 +127,87 @@ def test_a_rig_goes_through_blenders_files_vertex_by_vertex(
     played = load_animation(tmp_path / "back.usdc")
     assert played.fps == FPS
     assert (actor.weights_from(played.weights) - actor.weights_from(take.weights)).abs().max() < 1e-5
+
+
+@pytest.fixture(scope="module")
+def corrected() -> BlendshapeRig:
+    """A sheet with products, two in-betweens of one shape, and names that drivers have to escape."""
+    rig = corrective_sheet()
+    definitions = (*rig.correctives.definitions, Corrective('half of "jaw"', ("jawOpen",), 0.6))
+    deltas = torch.cat([rig.correctives.deltas, rig.correctives.deltas[:1].flip(1)])
+    return BlendshapeRig(rig.neutral, rig.deltas, rig.names, Correctives(deltas, definitions))
+
+
+def in_blenders_axes(places: torch.Tensor) -> np.ndarray:
+    """Millimetres, y up, (...,V,3) as metres, z up."""
+    metres = places.double() / 1000
+    return torch.stack([metres[..., 0], -metres[..., 2], metres[..., 1]], -1).numpy()
+
+
+@pytest.mark.parametrize("ending", [".fbx", ".blend"])
+def test_correctives_play_in_blender_and_come_back(
+    ending: str, corrected: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = 1.3 * torch.rand(6, 3, 1, generator=torch.Generator().manual_seed(2)) - 0.1
+    save_animation(corrected, Take(FPS, weights=Track(corrected.names, values)), tmp_path / "sheet.usdc")
+    main(["convert", str(tmp_path / "sheet.usdc"), str(tmp_path / f"sheet{ending}")])
+    told = " ".join(capsys.readouterr().err.split())
+    assert (".fbx has no correctives: the 4 are shape keys of their own" in told) == (ending == ".fbx")
+    in_blender("show", tmp_path / f"sheet{ending}", tmp_path / "shown.npz", FPS)
+    shown = np.load(tmp_path / "shown.npz")
+    assert shown["names"].tolist() == [*corrected.names, *corrected.correctives.names]
+    expected = in_blenders_axes(corrected(values[..., 0]))
+    assert np.abs(shown["frames"] - expected).max() < METRES
+    main(["convert", str(tmp_path / f"sheet{ending}"), str(tmp_path / "back.usdc")])
+    found = load_rig(tmp_path / "back.usdc")
+    assert found.names == corrected.names
+    assert {one.name: one for one in found.correctives.definitions} == {
+        one.name: one for one in corrected.correctives.definitions
+    }
+    assert (found(values[..., 0]) - corrected(values[..., 0])).abs().max() < MILLIMETRES
+    played = load_animation(tmp_path / "back.usdc")
+    assert played.weights.names == corrected.names
+    assert (played.weights.values - values).abs().max() < 1e-5
+
+
+def test_sliders_of_a_blender_file_move_its_correctives(corrected: BlendshapeRig, tmp_path: Path) -> None:
+    save_rig(corrected, tmp_path / "sheet.usdc")
+    main(["convert", str(tmp_path / "sheet.usdc"), str(tmp_path / "sheet.blend")])
+    for pose in ([0.2, 0.5, 0.9], [0.45, 1.0, 0.3], [0.8, 0.0, 1.0]):
+        sliders = [f"{name}={weight}" for name, weight in zip(corrected.names, pose, strict=True)]
+        in_blender("pose", tmp_path / "sheet.blend", tmp_path / "posed.npz", *sliders)
+        expected = in_blenders_axes(corrected(torch.tensor([pose]))[0])
+        assert np.abs(np.load(tmp_path / "posed.npz")["places"] - expected).max() < METRES
+
+
+@pytest.fixture(scope="module")
+def strange(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("strange")
+    in_blender(folder, script=SCRIPT.with_name("stranger_in_blender.py"))
+    return folder
+
+
+@pytest.mark.parametrize(("ending", "shown"), [(".blend", "grouped"), (".usdc", "frames")])
+def test_a_strangers_scene_is_what_blender_shows(ending: str, shown: str, strange: Path, tmp_path: Path) -> None:
+    main(["convert", str(strange / f"scene{ending}"), str(tmp_path / "scene.usdc")])
+    rig, take = load_rig(tmp_path / "scene.usdc"), load_animation(tmp_path / "scene.usdc")
+    places = in_blenders_axes(rig(rig.weights_from(take.weights))).transpose(1, 0, 2)
+    assert farthest(places, np.load(strange / f"{shown}.npz")["frames"].transpose(1, 0, 2)) < METRES
+    assert (rig.neutral.polygons >= 0).sum(1).max() == 17
+    if ending == ".blend":
+        assert rig.names == ("Lächeln", "笑顔.L", 'a/b:"c"')
+        assert set(rig.neutral.annotations.regions) == {"Kopf", "Zähne", "Sphere"}
+        assert rig.neutral.texture is not None
+
+
+@pytest.mark.parametrize("ending", [".glb", ".fbx"])
+def test_a_strangers_head_is_what_blender_shows(ending: str, strange: Path, tmp_path: Path) -> None:
+    main(["convert", str(strange / f"scene{ending}"), str(tmp_path / "head.usdc"), "--part", "Kopf"])
+    rig, take = load_rig(tmp_path / "head.usdc"), load_animation(tmp_path / "head.usdc")
+    assert rig.names == ("Lächeln", "笑顔.L", 'a/b:"c"')
+    places = in_blenders_axes(rig(rig.weights_from(take.weights))).transpose(1, 0, 2).reshape(507, -1)
+    shown = np.load(strange / "frames.npz")["frames"].transpose(1, 0, 2)
+    assert cKDTree(shown.reshape(len(shown), -1)).query(places, p=np.inf)[0].max() < METRES
 
 
 def test_what_blender_cannot_read_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

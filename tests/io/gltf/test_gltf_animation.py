@@ -17,12 +17,13 @@ from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.take import Take, Track
 
 
-def edited(path: Path, change: dict) -> Path:
-    """The file with members of its one animation changed."""
+def edited(path: Path, change: dict, before: tuple[dict, ...] = (), after: tuple[dict, ...] = ()) -> Path:
+    """The file with members of its one animation changed, and others before and after it."""
     data = path.read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
     root = json.loads(data[20 : 20 + length])
     root["animations"][0].update(change)
+    root["animations"] = [*before, *root["animations"], *after]
     text = json.dumps(root).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + length :]
@@ -58,6 +59,16 @@ def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
     again = read_gltf_weights(tmp_path / "again.glb")
     assert again is not None
     torch.testing.assert_close(again.uneven_seconds(), found.uneven_seconds())
+
+
+def test_the_first_animation_that_moves_shapes_is_the_take(tmp_path: Path) -> None:
+    save_animation(sheet_rig(), sheet_take(), tmp_path / "take.glb")
+    expected = read_gltf_weights(tmp_path / "take.glb")
+    body = {"channels": [{"sampler": 0, "target": {"node": 0, "path": "translation"}}], "samplers": []}
+    again = {"name": "again", "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}], "samplers": []}
+    with pytest.warns(UserWarning, match="take.glb: left out: animations .* again$"):
+        found = read_gltf_weights(edited(tmp_path / "take.glb", {}, (body,), (again,)))
+    assert torch.equal(found.weights.values, expected.weights.values)
 
 
 def test_key_poses_are_no_frames(tmp_path: Path) -> None:

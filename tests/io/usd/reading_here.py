@@ -21,7 +21,9 @@ def read_here(command: Sequence[str], path: Path, reader: str, seconds: float) -
         record, arrays = stage_process.extract(path.absolute(), lambda size: None)
     except stage_process.Refused as refused:
         raise FileFormatError(f"{path}: found {refused.found}, expected {refused.expected}") from None
-    return Scene(path, json.loads(json.dumps(record)), arrays)
+    scene = Scene(path, json.loads(json.dumps(record)), arrays)
+    scene.warn_of_left_out()
+    return scene
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import torch
 
 from torchface.correctives import Corrective
 from torchface.io import load_animation, load_mesh, load_rig
+from torchface.io.images.image_files import save_image
 
 pytestmark = pytest.mark.usefixtures("same_process")
 
@@ -156,3 +157,46 @@ def test_layers_beside_the_file_are_composed(tmp_path: Path) -> None:
     rig = load_rig(usda(tmp_path / "shot.usda", body))
     assert rig.vertices[2].tolist() == [10, 30, 0]
     assert rig.names == ("open", "wide")
+
+
+def material(name: str, image: str) -> str:
+    """A material with a texture, and what binds it."""
+    return f"""def Material "{name}"
+{{
+token outputs:surface.connect = </{name}/surface.outputs:surface>
+def Shader "surface"
+{{
+uniform token info:id = "UsdPreviewSurface"
+color3f inputs:diffuseColor.connect = </{name}/texture.outputs:rgb>
+token outputs:surface
+}}
+def Shader "texture"
+{{
+uniform token info:id = "UsdUVTexture"
+asset inputs:file = @./{image}@
+float3 outputs:rgb
+}}
+}}
+"""
+
+
+def painted(name: str, by: str) -> str:
+    return mesh_prim(name, QUAD + f"rel material:binding = </{by}>\n", '"MaterialBindingAPI"')
+
+
+def test_a_tiled_texture_is_told_and_the_mesh_read(tmp_path: Path) -> None:
+    path = usda(tmp_path / "tiles.usda", painted("face", "skin") + material("skin", "skin.<UDIM>.png"))
+    with pytest.warns(UserWarning, match=r"tiles\.usda: left out: the tiled texture \(UDIM\) \./skin\.<UDIM>\.png"):
+        mesh = load_mesh(path)
+    assert mesh.texture is None
+
+
+def test_of_two_textures_the_first_is_taken_and_the_other_told(tmp_path: Path) -> None:
+    for number, name in enumerate(("skin.png", "teeth.png")):
+        save_image(torch.full((3, 2, 2), float(number)), tmp_path / name)
+    parts = painted("face", "skin") + painted("mouth", "teeth")
+    path = usda(tmp_path / "two.usda", parts + material("skin", "skin.png") + material("teeth", "teeth.png"))
+    with pytest.warns(UserWarning, match=r"left out: 2 textures \(skin\.png, teeth\.png\), of which a mesh has one"):
+        mesh = load_mesh(path)
+    assert mesh.texture.max() == 0
+    assert mesh.polygons.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]  # quads stay quads where meshes are joined

@@ -3,9 +3,9 @@
 from torchface.io.blender.blender_files import (
     BLENDER_ENDINGS,
     BlenderScene,
-    blender_command,
+    blender_program,
     read_blender_file,
     write_blender_file,
 )
 
-__all__ = ["BLENDER_ENDINGS", "BlenderScene", "blender_command", "read_blender_file", "write_blender_file"]
+__all__ = ["BLENDER_ENDINGS", "BlenderScene", "blender_program", "read_blender_file", "write_blender_file"]

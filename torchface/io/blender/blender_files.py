@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from torchface.errors import FileFormatError, MissingExtraError
 from torchface.files.whole_files import replaced_file
-from torchface.io.blender import blender_process
+from torchface.io.blender import reading_in_blender, writing_in_blender
+from torchface.io.gltf.corrective_extras import all_targets
 from torchface.io.scene_processes.reading_process import read_scene, run_process
 from torchface.io.scene_processes.scene_arrays import scene_mesh, scene_rig, scene_weights
 from torchface.io.scenes.weight_keys import WeightKeys
@@ -42,33 +47,44 @@ class BlenderScene:
     take: Take | None
 
 
-def blender_command() -> list[str]:
-    """How to run ``blender_process.py``: with what ``TORCHFACE_BLENDER`` names, ``bpy`` here, or a Blender on the path.
+def blender_program() -> str:
+    """What ``TORCHFACE_BLENDER`` names, this Python where it has ``bpy``, or a Blender on the path.
 
     Raises:
         MissingExtraError: there is none; the message says how to install it.
     """
-    script = str(Path(blender_process.__file__).resolve())
     named = os.environ.get(PROGRAM)
     if named:
         program = shutil.which(os.path.expanduser(named))
         if program is None:
             raise MissingExtraError(f"{PROGRAM}: found no program {named!r}, expected Blender or a Python with bpy")
-    elif importlib.util.find_spec("bpy") is not None:
-        program = sys.executable
-    else:
-        program = shutil.which("blender")
-        if program is None:
-            raise MissingExtraError(f"FBX and Blender files: found neither bpy nor Blender, expected one; {_INSTALL}")
+        return program
+    if importlib.util.find_spec("bpy") is not None:
+        return sys.executable
+    program = shutil.which("blender")
+    if program is None:
+        raise MissingExtraError(f"FBX and Blender files: found neither bpy nor Blender, expected one; {_INSTALL}")
+    return program
+
+
+def blender_command(script: str | Path) -> list[str]:
+    """How to run a script of Blender's; its own words come behind.
+
+    Raises:
+        MissingExtraError: there is no Blender.
+    """
+    program = blender_program()
     if "python" in Path(program).name.lower():
-        return [program, "-I", script]
-    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", script, "--"]
+        return [program, "-I", str(script)]
+    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(script), "--"]
 
 
 def read_blender_file(path: str | Path, unit: str | None = None) -> BlenderScene:
     """What Blender finds in an FBX or one of its own files: meshes in their places, shape keys, their animation.
 
     Vertices and polygons keep the order that Blender gives them; a scene of several meshes gets a region a mesh.
+    Objects that are hidden, subdivision, and on meshes with shape keys other modifiers are left out; of what is shown
+    and has no place in a rig a ``UserWarning`` tells.
 
     Args:
         path: ``.fbx`` or ``.blend``.
@@ -79,9 +95,9 @@ def read_blender_file(path: str | Path, unit: str | None = None) -> BlenderScene
         FileFormatError: Blender cannot read it, or there is no mesh in it.
     """
     path = Path(path)
-    command = blender_command()
+    command = blender_command(Path(reading_in_blender.__file__).resolve())
     seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * checked_size(path) / 2**20
-    scene = read_scene([*command, "read"], path, "Blender", seconds)
+    scene = read_scene(command, path, "Blender", seconds)
     rig = scene_rig(scene, unit)
     return BlenderScene(scene_mesh(scene, unit) if rig is None else rig.neutral, rig, scene_weights(scene))
 
@@ -89,7 +105,9 @@ def read_blender_file(path: str | Path, unit: str | None = None) -> BlenderScene
 def write_blender_file(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None = None) -> None:
     """Writes a rig as FBX or as a Blender file, shapes as shape keys, the texture inside.
 
-    Blender has no in-betweens: correctives of a rig are refused.
+    A corrective is a shape key behind the shapes', what it adds. An animation has the weights that the shapes' call
+    for, frame by frame; in a Blender file drivers follow the shapes' instead, so that sliders move them too. When each
+    acts is noted in the object's custom property ``torchface``, by which :func:`read_blender_file` finds them again.
 
     Args:
         rig: the rig.
@@ -98,21 +116,39 @@ def write_blender_file(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | 
 
     Raises:
         MissingExtraError: there is no Blender, or usd-core is not installed, by which it is handed over.
-        FileFormatError: it cannot be written, or the rig has correctives.
+        FileFormatError: it cannot be written.
     """
     path = Path(path)
-    if rig.correctives is not None:
-        raise FileFormatError(
-            f"{path}: found a rig with correctives, which shape keys cannot hold; expected .glb or USD"
-        )
-    command = blender_command()
+    command = blender_command(Path(writing_in_blender.__file__).resolve())
+    deltas, names = all_targets(rig)
+    plain = BlendshapeRig(rig.neutral, deltas, [f"shape_{row}" for row in range(len(names))])
+    if keys is not None and rig.activation is not None:
+        followed = rig.activation(keys.weights.to(rig.vertices)).to(keys.weights)
+        keys = replace(keys, weights=torch.cat([keys.weights, followed], 1))
     with tempfile.TemporaryDirectory(prefix="torchface-blender-") as folder:
-        source, made = Path(folder, "rig.usdc"), Path(folder, f"made{path.suffix.lower()}")
-        write_usd_rig(rig, source, keys)
-        fps = 24.0 if keys is None else keys.fps
+        source, made, notes = (Path(folder, name) for name in ("rig.usdc", f"made{path.suffix.lower()}", "notes.json"))
+        write_usd_rig(plain, source, keys)
+        notes.write_text(json.dumps(_notes(rig, names, keys)))
         seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * source.stat().st_size / 2**20
-        said = run_process([*command, "write", str(source), str(made), repr(fps)], f"{path}", "Blender", seconds)
+        said = run_process([*command, str(source), str(made), str(notes)], f"{path}", "Blender", seconds)
         if not made.is_file():
             raise FileFormatError(f"{path}: cannot be written: Blender wrote nothing{said}")
         with replaced_file(path) as temporary:
             shutil.copyfile(made, temporary)
+
+
+def _notes(rig: BlendshapeRig, names: tuple[str, ...], keys: WeightKeys | None) -> dict[str, Any]:
+    """What Blender is told beside the USD file; see ``writing_in_blender.py``."""
+    ranges = torch.tensor([0.0, 1.0]).repeat(len(names), 1)
+    if keys is not None:  # Blender holds weights to what the sliders show
+        ranges = torch.stack([keys.weights.amin(0).clamp(max=0), keys.weights.amax(0).clamp(min=1)], 1)
+    correctives = []
+    if (activation := rig.activation) is not None:
+        records = zip(activation.records(), activation.expressions(), strict=True)
+        correctives = [record | {"expression": expression} for record, expression in records]
+    return {
+        "fps": 24.0 if keys is None else keys.fps,
+        "names": names,
+        "ranges": ranges.tolist(),
+        "correctives": correctives,
+    }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,17 @@ from torchface.io.gltf.container import Document, read_document
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.frame_rates import rate_of_keys
+from torchface.shown_text import visible
 from torchface.take import Take, Track
 
 _CUBIC = "CUBICSPLINE"
 
 
 def read_gltf_weights(path: str | Path) -> Take | None:
-    """The weights that a file's first animation gives its shapes, one frame a key; none where nothing moves shapes.
+    """The weights that a file's animations give its shapes, one frame a key; none where nothing moves shapes.
+
+    Each mesh has the weights of the first animation that moves it: some programs write one animation of several objects
+    as several, others write several takes of the same face. Of what is left out a ``UserWarning`` tells.
 
     Args:
         path: a ``.glb`` or ``.gltf`` whose keys are a film's frames, as :func:`torchface.save_animation` writes them.
@@ -40,43 +46,69 @@ def read_gltf_weights(path: str | Path) -> Take | None:
         True
     """
     document = read_document(path)
-    animations = document.objects("animations")
-    place = "animations[0]"
-    channels = document.array(animations[0], "channels", place) if animations else []
     weights: dict[str, np.ndarray] = {}
     times: np.ndarray | None = None
     meshes: set[int] = set()
+    first: int | None = None
+    left_out: list[str] = []
     followers = {corrective.name for corrective in scene_correctives(document)}
-    for number, row in enumerate(channels):
-        channel = document.record(row, f"{place}.channels[{number}]")
-        target = document.record(channel.get("target"), f"{place}.channels[{number}].target")
-        if target.get("path") != "weights":
-            continue
-        node = document.item("nodes", target.get("node"), f"{place}.channels[{number}].target.node")
-        mesh = document.integer(node, "mesh", f"{place}.channels[{number}].target.node")
-        if mesh in meshes:
-            continue  # another node shows it again, and the first's weights count
-        meshes.add(mesh)
-        here, names, values = _channel(document, animations[0], channel, mesh, f"{place}.channels[{number}]")
-        if times is not None and (len(here) != len(times) or not np.allclose(here, times)):
-            raise document.error(f"{place}.channels[{number}]", "keys at other times", "those of the first channel")
-        times = here
-        for name, column in zip(names, values.T, strict=True):
-            if name not in followers:
-                weights.setdefault(name, column)
+    for which, animation in enumerate(document.objects("animations")):
+        own: set[int] = set()
+        for place, channel, mesh in _weight_channels(document, animation, which):
+            if mesh in own:
+                continue  # another node shows it again, and the first's weights count
+            if mesh in meshes:
+                left_out.append(_shown_name(animation, which))
+                continue
+            here, names, values = _channel(document, animation, channel, mesh, place)
+            if times is not None and (len(here) != len(times) or not np.allclose(here, times)):
+                if first == which:
+                    raise document.error(place, "keys at other times", "those of the first channel")
+                left_out.append(_shown_name(animation, which))
+                continue
+            times, first = here, which if first is None else first
+            own.add(mesh)
+            for name, column in zip(names, values.T, strict=True):
+                if name not in followers:
+                    weights.setdefault(name, column)
+        meshes |= own
+    if left_out:
+        shown = ", ".join(dict.fromkeys(left_out[:5]))
+        warnings.warn(
+            f"{path}: left out: animations of other times or of the same mesh: {visible(shown)}", stacklevel=2
+        )
     if times is None or not weights:
         return None
     stacked = np.stack(list(weights.values()), axis=1)
+    place = f"animations[{first}]"
     rate, seconds = rate_of_keys(times, lambda found, expected: document.error(place, found, expected))
     extras = {} if seconds is None else {"seconds": seconds}
     return Take(rate, weights=Track(tuple(weights), torch.from_numpy(stacked.copy())[..., None]), extras=extras)
+
+
+def _weight_channels(
+    document: Document, animation: dict[str, Any], which: int
+) -> Iterator[tuple[str, dict[str, Any], int]]:
+    """The channels of an animation that move shapes: their places in words, themselves, and the meshes."""
+    for number, row in enumerate(document.array(animation, "channels", f"animations[{which}]")):
+        place = f"animations[{which}].channels[{number}]"
+        channel = document.record(row, place)
+        target = document.record(channel.get("target"), f"{place}.target")
+        if target.get("path") == "weights":
+            node = document.item("nodes", target.get("node"), f"{place}.target.node")
+            yield place, channel, document.integer(node, "mesh", f"{place}.target.node")
+
+
+def _shown_name(animation: dict[str, Any], which: int) -> str:
+    name = animation.get("name")
+    return name[:40] if isinstance(name, str) and name else f"animations[{which}]"
 
 
 def _channel(
     document: Document, animation: dict[str, Any], channel: dict[str, Any], mesh: int, place: str
 ) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
     """Times (T,), names and values (T,N) of one channel."""
-    samplers = document.array(animation, "samplers", "animations[0]")
+    samplers = document.array(animation, "samplers", place)
     index = document.integer(channel, "sampler", place)
     if index >= len(samplers):
         raise document.error(f"{place}.sampler", index, f"less than {len(samplers)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,11 @@ def _read(document: Document, scale: float) -> tuple[Mesh, Tensor, tuple[str, ..
         raise FileFormatError(f"{document.path}: found no triangle in its scene, expected a mesh")
     whole = rejoined(document, found)
     pieces = [_piece(document, instance, part, scale) for instance, part in ([whole] if whole else found)]
-    texture = next((part.texture for _, part in found if part.texture is not None), None)
+    textures = list(dict.fromkeys(part.texture for _, part in found if part.texture is not None))
+    if len(textures) > 1:
+        what = f"{len(textures)} textures, of which a mesh has one: the first is taken"
+        warnings.warn(f"{document.path}: left out: {what}", stacklevel=3)
+    texture = textures[0] if textures else None
     del parts, found, part, whole  # their shapes fit the memory once, not twice
     image = None if texture is None else read_texture(document, texture)
     document.reserve(joined_size(pieces), "the scene's morph targets")

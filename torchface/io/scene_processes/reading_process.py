@@ -18,7 +18,7 @@ _FOREIGN = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "PYTHONSTARTUP"
 
 
 def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:
-    """What ``command PATH FOLDER`` finds in a file.
+    """What ``command PATH FOLDER`` finds in a file; what it left out is told as ``UserWarning``.
 
     Args:
         command: leaves a scene in the folder; see ``torchface.io.scene_processes.scene_arrays``.
@@ -33,7 +33,9 @@ def read_scene(command: Sequence[str], path: Path, reader: str, seconds: float) 
         said = run_process([*command, str(path.absolute()), folder], f"{path}", reader, seconds)
         if not any(Path(folder, name).exists() for name in ("scene.json", "refused.json")):
             raise FileFormatError(f"{path}: {reader} ended without a result{said}; expected a whole file")
-        return load_scene(path, Path(folder))
+        scene = load_scene(path, Path(folder))
+    scene.warn_of_left_out()
+    return scene
 
 
 def run_process(command: Sequence[str], what: str, reader: str, seconds: float) -> str:

@@ -1,18 +1,20 @@
 """A scene as a process hands it over: records in ``scene.json``, their arrays in ``arrays.npz``.
 
-``scene.json`` holds ``metres_per_unit``, ``up`` (``"Y"`` or ``"Z"``), ``bytes`` of the files read, ``meshes`` and
-``animation``. A mesh has its ``name``, the ``place`` for errors, the ``matrix`` of 16 numbers from its points to the
-scene (for rows), ``notes`` (JSON of ``torchface.io.gltf.mesh_extras`` and ``corrective_extras``) and ``shapes``, with a
-``name`` each and ``between``, its in-betweens, with a ``name`` and a ``weight``. Mesh 0's arrays are ``0/points``
-(V,3), ``0/counts`` (P,), ``0/corners`` (C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light,
-``0/texture``, an encoded image, and for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they
-belong to, if these are not all, and ``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``,
-and the arrays ``animation/times`` (T,), seconds, and ``animation/weights`` (T,N).
+``scene.json`` holds ``metres_per_unit``, ``up`` (``"Y"`` or ``"Z"``), ``bytes`` of the files read, ``left_out``, what
+of the file no rig can hold, in words, ``meshes`` and ``animation``. A mesh has its ``name``, the ``place`` for errors,
+the ``matrix`` of 16 numbers from its points to the scene (for rows), ``notes`` (JSON of
+``torchface.io.gltf.mesh_extras`` and ``corrective_extras``) and ``shapes``, with a ``name`` each and ``between``, its
+in-betweens, with a ``name`` and a ``weight``. Mesh 0's arrays are ``0/points`` (V,3), ``0/counts`` (P,), ``0/corners``
+(C,), and where it has them ``0/uvs``, ``0/uv_corners``, ``0/colors``, in light, ``0/texture``, an encoded image, and
+for each shape ``0/shape/0/offsets``, with ``0/shape/0/rows``, the points that they belong to, if these are not all, and
+``0/shape/0/between/0``, offsets of the same points. ``animation`` has ``names``, and the arrays ``animation/times``
+(T,), seconds, and ``animation/weights`` (T,N).
 """
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -37,6 +39,7 @@ from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join
 from torchface.io.tables.frame_rates import rate_of_keys
 from torchface.mesh import Mesh, fan_triangulation
 from torchface.rig import BlendshapeRig
+from torchface.shown_text import visible
 from torchface.take import Take, Track
 
 _UNPACKED_ALWAYS, _UNPACKED_PER_BYTE = 2**28, 32
@@ -59,6 +62,11 @@ class Scene:
     path: Path
     record: dict[str, Any]
     arrays: Mapping[str, NDArray[Any]]
+
+    def warn_of_left_out(self) -> None:
+        """Tells by ``UserWarning`` what the process left out."""
+        for what in self.record["left_out"]:
+            warnings.warn(f"{self.path}: left out: {visible(what)}", stacklevel=3)
 
 
 def load_scene(path: Path, folder: Path) -> Scene:
@@ -117,11 +125,11 @@ def _mesh(scene: Scene, pieces: list[Piece]) -> Mesh:
 def _definitions(scene: Scene, names: Sequence[str]) -> tuple[list[Corrective], dict[str, str]]:
     """The scene's correctives, and what the keys of in-betweens among ``names`` are called.
 
-    Those that torchface noted come first, in their order; an in-between that nobody noted has its name in the file, or
-    its shape's before it where that is taken.
+    Those that torchface noted come first, in their order, in-betweens that are shapes of their own among them; one that
+    nobody noted has its name in the file, or its shape's before it where that is taken.
     """
     noted = _noted_correctives(scene)
-    found = [one for one in noted if not one.is_in_between]
+    found = [one for one in noted if not one.is_in_between or one.name in names]
     own = {name: None for name in names if _KEY not in name} | {one.name: None for one in noted}
     renamed: dict[str, str] = {}
     between = [(shape["name"], one) for mesh in _named_meshes(scene) for shape in mesh for one in shape["between"]]

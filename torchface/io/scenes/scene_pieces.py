@@ -66,7 +66,7 @@ def join_deltas(pieces: Sequence[Piece]) -> Tensor:
 
 
 def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
-    """One mesh of all; of several, polygons stay only for a single piece, and each piece becomes a region."""
+    """One mesh of all; of several, each piece becomes a region."""
     if len(pieces) == 1:
         one = pieces[0]
         return Mesh(one.vertices, one.faces, one.uvs, one.uv_faces, one.colors, texture, one.polygons, one.annotations)
@@ -85,7 +85,21 @@ def join_meshes(pieces: Sequence[Piece], texture: Tensor | None) -> Mesh:
     for i, piece in enumerate(pieces):
         regions[piece.name] = regions.get(piece.name, torch.zeros(len(owner), dtype=torch.bool)) | (owner == i)
     vertices = torch.cat([piece.vertices for piece in pieces])
-    return Mesh(vertices, faces, uvs, uv_faces, colors, texture, annotations=Annotations(regions=regions))
+    annotations = Annotations(regions=regions)
+    return Mesh(vertices, faces, uvs, uv_faces, colors, texture, _join_polygons(pieces, counts), annotations)
+
+
+def _join_polygons(pieces: Sequence[Piece], counts: list[int]) -> Tensor | None:
+    """All polygons, (P,K), triangles of pieces without any among them; none where no piece has some."""
+    if all(piece.polygons is None for piece in pieces):
+        return None
+    own = [piece.faces if piece.polygons is None else piece.polygons for piece in pieces]
+    widest = max(rows.shape[1] for rows in own)
+    padded = []
+    for rows, first in zip(own, _starts(counts), strict=True):
+        moved = torch.where(rows < 0, rows, rows + first)
+        padded.append(torch.nn.functional.pad(moved, (0, widest - rows.shape[1]), value=-1))
+    return torch.cat(padded)
 
 
 def _starts(counts: list[int]) -> list[int]:

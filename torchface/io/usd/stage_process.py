@@ -80,6 +80,10 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
         if not scene["meshes"]:
             raise Refused("no mesh in its scene", "at least one with faces")
         scene["animation"] = _weights(stage, animations, arrays)
+        if len(layers.images) > 1:
+            shown = ", ".join(_shown(posixpath.basename(name).rstrip("]"), 40) for name in layers.images[:5])
+            layers.leave(f"{len(layers.images)} textures ({shown}), of which a mesh has one: the first is taken")
+        scene["left_out"] = layers.left_out
         return scene, arrays
     except Tf.ErrorException as error:
         raise Refused(_shown(_said(error), 300), "a whole USD file") from error
@@ -94,6 +98,13 @@ class _Layers:
         self.root, self.folder, self.limit = root, os.path.realpath(root.parent), limit
         self.size = 0
         self.known: set[str] = set()
+        self.images: list[str] = []
+        self.left_out: list[str] = []
+
+    def leave(self, what: str) -> None:
+        """Notes what of the scene no rig can hold, once."""
+        if what not in self.left_out:
+            self.left_out.append(what)
 
     def open_all(self) -> None:
         """Opens all, so that nothing outside is looked for when they are composed."""
@@ -336,6 +347,7 @@ class _MeshReader:
         subsets = UsdShade.MaterialBindingAPI(self.prim).GetMaterialBindSubsets()
         parts = [(len(subset.GetIndicesAttr().Get() or ()), subset.GetPrim()) for subset in subsets]
         parts.sort(key=lambda part: -part[0])
+        found: tuple[bytes | None, str | None] = None, None
         for _, prim in [*parts, (0, self.prim)]:
             material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
             if material and material.GetPrim().GetCustomDataByKey(_PAINTED):
@@ -347,22 +359,30 @@ class _MeshReader:
             coordinates = _source(texture, "st")
             named = coordinates is not None and coordinates.GetIdAttr().Get() == _COORDINATES
             primvar = _value(coordinates, "varname") if named else None
-            image = self._image(texture)
+            image = self._image(texture, read=found[0] is None)
             if image is not None:
-                return image, str(primvar) if primvar else None
-        return None, None
+                found = image, str(primvar) if primvar else None
+        return found
 
-    def _image(self, texture: Any) -> bytes | None:
+    def _image(self, texture: Any, read: bool) -> bytes | None:
+        """The image of a texture, encoded; none where there is none, or it is not to be read."""
         from pxr import Ar
 
         found = texture.GetInput("file")
         attributes = found.GetValueProducingAttributes() if found else []
         value = attributes[0].Get() if attributes else None
         name = getattr(value, "path", "")
-        if not name or "<UDIM>" in name:
+        if not name:
+            return None
+        if "<UDIM>" in name:
+            self.layers.leave(f"the tiled texture (UDIM) {_shown(name)}, expected one image")
             return None
         stack = attributes[0].GetPropertyStack()
         file = self.layers.inside(stack[0].layer, name)
+        if file not in self.layers.images:
+            self.layers.images.append(file)
+        if not read:
+            return None
         asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(file))
         if not asset:
             raise Refused(f"an image that cannot be read, {_shown(name)}", "an existing file")
