@@ -175,3 +175,14 @@ def test_numbers_that_make_no_sense_are_refused(
     assert words[-2].lstrip("-") in told
     assert "found" in told
     assert "expected" in told or "not known" in told
+
+
+@pytest.mark.parametrize("words", ["export --help", "--version", "--help"])
+def test_output_that_nobody_reads_ends_quietly(words: str) -> None:
+    code = "from torchface.cli import main; import sys; sys.stdin.read(); main()"
+    run = subprocess.Popen([sys.executable, "-c", code, *words.split()], stdin=-1, stdout=-1, stderr=-1, text=True)
+    assert run.stdout is not None
+    run.stdout.close()
+    run.stdout = None
+    assert run.communicate("")[1] == ""
+    assert run.returncode == 141

@@ -76,13 +76,13 @@ _EXPORT = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs one command; an error that the user can mend ends with its message and exit status 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words in (["--version"], ["-V"]):
-        print(f"torchface {__version__}")
-        raise SystemExit(0)
-    if not words or words in (["--help"], ["-h"]):
-        _overview()
-        raise SystemExit(0 if words else 2)
     with plain_errors():
+        if words in (["--version"], ["-V"]):
+            print(f"torchface {__version__}")
+            raise SystemExit(0)
+        if not words or words in (["--help"], ["-h"]):
+            _overview()
+            raise SystemExit(0 if words else 2)
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
         elif words[:1] == ["export"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,18 +12,27 @@ from rich.text import Text
 from torchface.cli.progress import console
 from torchface.errors import TorchfaceError
 
-_MISTAKE, _STOPPED = 2, 130
+_MISTAKE, _STOPPED, _NOBODY_READS = 2, 130, 141  # as shells tell of SIGPIPE
 
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
     """Ends with a message and status 2 where the user made a mistake or a file cannot be used, with 130 on Ctrl-C.
 
+    What reads the output may stop doing so, as ``head`` does: that ends quietly, with 141.
+
     Raises:
         SystemExit: in place of what was raised inside.
     """
     try:
-        yield
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left in the buffer would raise again at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_NOBODY_READS) from None
     except TorchfaceError as error:
         _say("error", str(error))
         raise SystemExit(_MISTAKE) from None

@@ -30,6 +30,10 @@ class PlainConsole(Console):
     def render_str(self, text: str, **how: Any) -> Text:
         return super().render_str(visible(text), **how)
 
+    def on_broken_pipe(self) -> None:
+        """Leaves it to the command's end: rich would end with the status of an error."""
+        raise
+
 
 console = PlainConsole()
 
