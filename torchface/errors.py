@@ -1,5 +1,17 @@
 """What can go wrong at the user's end, one class a kind; every message says what was found and what was expected."""
 
+__all__ = [
+    "AlignmentError",
+    "FileFormatError",
+    "MissingExtraError",
+    "NameMismatchError",
+    "ShapeError",
+    "TopologyError",
+    "TorchfaceError",
+    "TraceError",
+    "ValueRangeError",
+]
+
 
 class TorchfaceError(Exception):
     """The root of every error that bad input causes.

@@ -15,6 +15,24 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
+__all__ = [
+    "ErrorFigures",
+    "MeshError",
+    "RigidAlignment",
+    "ShapeErrors",
+    "WeightError",
+    "error_figures",
+    "marker_rmse",
+    "mesh_error",
+    "moved_vertices",
+    "region_figures",
+    "rigidly_aligned",
+    "shape_errors",
+    "vertex_errors",
+    "weight_error",
+    "weight_jitter",
+]
+
 
 @dataclass(frozen=True, eq=False)
 class WeightError:

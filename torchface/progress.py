@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+__all__ = ["Progress", "silent"]
+
 
 class Progress(Protocol):
     """Called as work goes on: ``progress("rendering")``, or ``progress("rendering", 3, 20)`` after 3 of 20 images."""

@@ -22,6 +22,15 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources
 from torchface.take import Track
 
+__all__ = [
+    "MouthClose",
+    "jaw_into_mouth_close",
+    "jaw_out_of_mouth_close",
+    "mouth_close_of",
+    "with_jaw_in_mouth_close",
+    "without_jaw_in_mouth_close",
+]
+
 JAW, CLOSE = "jawOpen", "mouthClose"
 
 _FAR = 0.5

@@ -15,6 +15,8 @@ from torchface.files.documents import Value, read_toml
 from torchface.shape_names import mapping
 from torchface.take import Take, Track
 
+__all__ = ["ShapeMap", "ShapeRule", "load_shape_rules", "retarget_take", "shape_map"]
+
 _MAX_FACTORS = 8
 
 

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 
+__all__ = ["Similarity", "similarity_transform"]
+
 MIN_HEAD_SCALE, MAX_HEAD_SCALE = 0.8, 1.25
 """Two heads in the same unit, a child's and a large man's included, do not differ by more in size."""
 

@@ -10,6 +10,8 @@ from typing import Any
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.documents import Value, read_toml, write_toml
 
+__all__ = ["ActionLabels", "Performed", "load_action_labels", "save_action_labels"]
+
 _FORMAT = "torchface.action_labels/1"
 _MAX_BYTES = 2**22
 _MAX_FRAMES = 10_000_000

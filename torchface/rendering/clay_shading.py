@@ -15,6 +15,8 @@ from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 
+__all__ = ["Lighting", "render"]
+
 CLAY = (0.80, 0.72, 0.66)
 """The colour of a mesh that brings none."""
 

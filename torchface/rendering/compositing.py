@@ -20,6 +20,8 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import make_folder, write_file
 from torchface.shown_text import visible
 
+__all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
+
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
     """Colours (V,3) of non-negative values (V,), 0 to ``maximum``; beyond it the last colour."""

@@ -13,6 +13,8 @@ from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 
+__all__ = ["PointLight", "vertex_albedo"]
+
 MAX_DISTANCE = 100_000.0
 """Millimetres; a light 100 m away shines from one direction: the directional limit."""
 

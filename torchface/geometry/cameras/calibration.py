@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 
+__all__ = ["CameraCalibration", "assumed_calibration"]
+
 ASSUMED_FIELD_OF_VIEW = 60.0
 """Degrees across the longer side: what webcams and phones have, near enough, where nothing is known."""
 

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchface.number_checks import checked_count, checked_number
 
+__all__ = ["Camera", "look_at"]
+
 MAX_SIDE = 16384
 """Pixels that an image may have a side."""
 MAX_ANGLE = 36000.0

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 
+__all__ = ["DetailMaps", "blend_normal_maps"]
+
 _MIN_Z = 0.02  # a slope of 89 degrees; steeper ones have no finite height
 
 

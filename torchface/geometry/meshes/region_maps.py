@@ -10,6 +10,8 @@ from torch import Tensor
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import normal_slopes
 
+__all__ = ["RegionMaps"]
+
 
 @dataclass(frozen=True, eq=False)
 class RegionMaps:

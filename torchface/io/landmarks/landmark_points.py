@@ -16,6 +16,8 @@ from torchface.files.documents import read_json
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.landmarks.picks import load_correspondences
 
+__all__ = ["LandmarkPoints", "load_landmark_points", "save_pts"]
+
 _MAX_BYTES = 16 * 2**20
 _MAX_POINTS = 1_000_000
 _IBUG_GROUPS = (

@@ -18,6 +18,8 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
+__all__ = ["LabelSwap", "Recording", "StageFlaws", "place_markers", "record"]
+
 
 def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75.0) -> Attachment:
     """Markers spread over the skin that moves, denser where it moves more, as a make-up artist would set them.

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 
+__all__ = ["perform"]
+
 GESTURES: dict[str, dict[str, float]] = {
     "smile": {"mouthSmileLeft": 0.85, "mouthSmileRight": 0.8, "cheekSquintLeft": 0.5, "cheekSquintRight": 0.5},
     "crooked smile": {"mouthSmileLeft": 0.7, "mouthDimpleLeft": 0.5, "mouthLeft": 0.25},

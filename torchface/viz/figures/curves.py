@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchface.rendering.compositing import from_figure
 
+__all__ = ["error_curve", "named_bars", "weight_curves"]
+
 SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
 
 

@@ -16,6 +16,8 @@ from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, r
 from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
 from torchface.viz.figures.region_colors import as_seen
 
+__all__ = ["face_views", "frame_face", "heat_map"]
+
 FRONT, THREE_QUARTER, PROFILE = 0.0, 35.0, 90.0
 PICTURE_HEIGHTS = (16, 4096)
 """Least and largest height that a command draws a view in, pixels."""

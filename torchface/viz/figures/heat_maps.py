@@ -11,6 +11,8 @@ from torchface.mesh import Mesh
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
 from torchface.viz.figures.face_views import clay_colors, color_bar, face_views
 
+__all__ = ["compared_views", "error_colors", "error_views"]
+
 GREEN_TO_RED = "RdYlGn_r"
 """The colour map, as matplotlib calls it."""
 NOT_COMPARED = (0.75, 0.75, 0.75)

@@ -18,6 +18,8 @@ from torchface.viz.figures.face_views import FRONT, clay_colors, color_bar, fram
 from torchface.viz.figures.region_colors import as_seen
 from torchface.viz.figures.site_views import facing
 
+__all__ = ["marker_map"]
+
 SIDE = 55.0
 _WIDTH, _HEIGHT = 520, 650
 _NOT_KNOWN = (0.55, 0.55, 0.55)
