@@ -158,13 +158,11 @@ class _MeshReader:
 
     def _notes(self, one: Any, names: set[str]) -> str | None:
         """What torchface noted of correctives, as long as their shape keys are there."""
-        try:
-            noted = json.loads(one[_NOTES]) if isinstance(one.get(_NOTES), str) else {}
-            records = list(noted.get("correctives", ()))
-            kept = [record for record in records if names.issuperset([record["name"], *record["drivers"]])]
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        records = _noted_correctives(one)
+        if records is None:
             self._leave(f"a damaged note of correctives at {one.name[:40]!r}: they are shapes of their own")
             return None
+        kept = [record for record in records if names.issuperset([record["name"], *record["drivers"]])]
         if len(kept) < len(records):
             gone = len(records) - len(kept)
             self._leave(f"{gone} correctives noted at {one.name[:40]!r} whose shape keys or drivers have other names")
@@ -193,6 +191,18 @@ class _MeshReader:
             self.left_out.append(what)
 
 
+def _noted_correctives(one: Any) -> list[dict[str, Any]] | None:
+    """The records of correctives in an object's custom property; none where that is damaged."""
+    if not isinstance(one.get(_NOTES), str):
+        return []
+    try:
+        records = list(json.loads(one[_NOTES]).get("correctives", ()))
+        named = all(isinstance(name, str) for record in records for name in (record["name"], *record["drivers"]))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return records if named else None
+
+
 def _group_weights(one: Any, name: str) -> Any:
     """How much each vertex belongs to a group, (V,)."""
     index = one.vertex_groups[name].index
@@ -219,14 +229,16 @@ def _animation(found: list[Any], arrays: dict[str, Any], left_out: list[str]) ->
     first, last = round(min(span[0] for span in spans)), round(max(span[1] for span in spans))
     if last - first >= _MOST_FRAMES:
         raise Refused(f"an animation of {last - first} frames", f"at most {_MOST_FRAMES}")
-    blocks = [block for one in keys for block in one.key_blocks if block != one.reference_key]
-    values = np.zeros((last - first + 1, len(blocks)), np.float32)
-    for row in range(len(values)):  # Blender evaluates one frame at a time
-        scene.frame_set(first + row)
-        values[row] = [0.0 if block.mute else block.value for block in blocks]
+    noted = {record["name"] for one in found for record in _noted_correctives(one) or ()}
+    shapes = [(one, block) for one in keys for block in one.key_blocks if block != one.reference_key]
+    blocks = [(one, block) for one, block in shapes if block.name not in noted]  # correctives follow these
+    followers = {_path(name) for name in noted}
+    if not blocks:
+        return None
+    values = _sampled(blocks, range(first, last + 1), followers)
     scene.frame_set(first)
     columns: dict[str, int] = {}
-    for column, block in enumerate(blocks):
+    for column, (_, block) in enumerate(blocks):
         taken = columns.setdefault(block.name, column)
         if np.abs(values[:, taken] - values[:, column]).max() > 1e-4:
             left_out.append(f"other keys of {block.name[:40]!r} on a further mesh: those of the first are taken")
@@ -234,6 +246,52 @@ def _animation(found: list[Any], arrays: dict[str, Any], left_out: list[str]) ->
     weights = values[:, list(columns.values())]
     arrays |= {"animation/times": np.arange(len(values)) / rate, "animation/weights": weights}
     return {"names": list(columns)}
+
+
+def _sampled(blocks: list[tuple[Any, Any]], frames: range, followers: set[str]) -> Any:
+    """What animation gives shape keys, each with what holds it, in each frame, (T,N)."""
+    import bpy
+
+    values = np.zeros((len(frames), len(blocks)), np.float32)
+    curves: dict[Any, dict[str, Any]] = {}
+    for one, _ in blocks:
+        found = curves[one] if one in curves else _curves(one.animation_data, followers)
+        if found is None:
+            break
+        curves[one] = found
+    else:
+        for column, (one, block) in enumerate(blocks):
+            curve = curves[one].get(_path(block.name))
+            along = [block.value] * len(frames) if curve is None else [curve.evaluate(frame) for frame in frames]
+            values[:, column] = 0.0 if block.mute else np.clip(along, block.slider_min, block.slider_max)
+        return values
+    for row, frame in enumerate(frames):  # Blender evaluates one frame at a time, and the meshes with it
+        bpy.context.scene.frame_set(frame)
+        values[row] = [0.0 if block.mute else block.value for _, block in blocks]
+    return values
+
+
+def _curves(animated: Any, followers: set[str]) -> dict[str, Any] | None:
+    """The curves of an action by what they move; none where more than they may move shapes, strips and drivers."""
+    if animated is None:
+        return {}
+    strange = any(one.data_path not in followers for one in animated.drivers)
+    if len(animated.nla_tracks) or strange or animated.action_influence != 1:
+        return None
+    if animated.action is None:
+        return {}
+    if not hasattr(animated.action, "layers"):  # Blender before 4.4
+        return {curve.data_path: curve for curve in animated.action.fcurves if not curve.mute}
+    bags = [bag for layer in animated.action.layers for strip in layer.strips for bag in strip.channelbags]
+    own = [bag for bag in bags if bag.slot == animated.action_slot]
+    return {curve.data_path: curve for bag in own for curve in bag.fcurves if not curve.mute}
+
+
+def _path(name: str) -> str:
+    """What Blender's curves and drivers call the value of a shape key."""
+    import bpy
+
+    return f'key_blocks["{bpy.utils.escape_identifier(name)}"].value'
 
 
 def _spans(animated: Any) -> list[tuple[float, float]]:
