@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.optim import BoxQP
+from torchface.synthetic.stages.marker_stage import place_markers
 
 matplotlib.use("Agg")
 OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
@@ -45,7 +46,7 @@ def blendshape_problem(shapes: int, frames: int) -> tuple[Tensor, Tensor]:
 
 
 def widened_problem(capture: tuple[BlendshapeRig, Attachment, list[Tensor]], shapes: int) -> tuple[Tensor, Tensor]:
-    """A real rig's 53 shapes and smooth local copies of them, 100 markers, 0.3 mm of noise, ``MarkerSolver``'s terms.
+    """A real rig's 53 shapes and smooth local copies of them, its markers, 0.3 mm of noise, ``MarkerSolver``'s terms.
 
     Real takes move the rig's own shapes; each copy has the weights of a random shape at another time, times 0.7.
     """
@@ -123,11 +124,15 @@ def growth(problems: dict[int, tuple[Tensor, Tensor]]) -> tuple[list[float], dic
 
 @pytest.mark.real
 @pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("markers", [100, 300])
 def test_growth_of_a_real_rig_by_copies(
-    real_capture: tuple[BlendshapeRig, Attachment, list[Tensor]], print_machine: Callable[..., None]
+    markers: int, real_capture: tuple[BlendshapeRig, Attachment, list[Tensor]], print_machine: Callable[..., None]
 ) -> None:
+    rig, _, takes = real_capture
+    capture = rig, place_markers(rig, markers), takes
     print_machine("piqp", "daqp", "osqp", "quadprog")
-    growth({count: widened_problem(real_capture, count) for count in (140, 280, 600)})
+    print(f"{markers} markers")
+    growth({count: widened_problem(capture, count) for count in (140, 280, 600)})
 
 
 @pytest.mark.usefixtures("one_thread")
