@@ -19,6 +19,14 @@ MODULES = sorted(
     for path in LIBRARY.rglob("*.py")
     if ">>> " in path.read_text(encoding="utf-8")
 )
+# What always holds float32: pictures and their figures, graphs, a trained classifier.
+FLOAT32 = (
+    "torchface.capture.action_units.classifier_training",
+    "torchface.landmarks.images.network_detector",
+    "torchface.onnx.",
+    "torchface.rendering.clay_shading",
+    "torchface.viz.",
+)
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
@@ -34,6 +42,8 @@ def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
 def test_examples_give_what_they_say(
     name: str, float_format: torch.dtype, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if float_format is torch.float64 and name.startswith(FLOAT32):
+        pytest.skip("holds float32 whatever numbers become")
     monkeypatch.chdir(tmp_path)  # some write files
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
     results = doctest.testmod(importlib.import_module(name), extraglobs={"torch": torch}, optionflags=flags)

@@ -1,4 +1,4 @@
-"""Every public name stands in the reference, and every error has its causes and cures.
+"""Every public name stands in the reference, shows an example, and every error has its cures.
 
 Public is what an ``__all__`` names.
 """
@@ -17,6 +17,46 @@ from torchface import errors
 
 LIBRARY = Path(torchface.__file__).resolve().parent
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+UNSHOWN = {
+    "wants ICT-FaceKit's files": ("io.load_ict_facekit", "io.load_identity_modes"),
+    "wants Blender": (
+        "io.blender.BlenderScene",
+        "io.blender.blender_program",
+        "io.blender.read_blender_file",
+        "io.blender.write_blender_file",
+    ),
+    "wants Node": ("workflows.browser_app.AppReport", "workflows.browser_app.export_app"),
+    "wants a network that the user brings": ("landmarks.YuNetDetector",),
+    "wants a film of a painted face": (
+        "capture.action_units.ActionUnitCurves",
+        "capture.action_units.action_unit_curves",
+        "capture.action_units.classify",
+        "capture.action_units.read_regions",
+        "onnx.ActionUnitReport",
+        "onnx.export_action_units",
+    ),
+    "wants a textured scan, and seconds": (
+        "landmarks.AutomaticLandmarks",
+        "landmarks.FaceFrame",
+        "landmarks.ScanLandmarks",
+        "landmarks.contour_correspondences",
+        "landmarks.scan_landmarks",
+    ),
+    "takes seconds": (
+        "capture.markers.check_attachment",
+        "capture.markers.sites_by_shape",
+        "capture.video.lighting.LightFit",
+        "capture.video.lighting.estimate_light",
+        "landmarks.AppearanceFit",
+        "landmarks.AppearanceModel",
+        "onnx.export_dynamics_prior",
+        "onnx.export_wrinkle_weights",
+        "onnx.export_video_solver",
+        "onnx.VideoReport",
+    ),
+}
+"""Names without an example, by why."""
 
 
 @cache
@@ -41,6 +81,34 @@ def key(path: str, thing: Any) -> object:
     return path if isinstance(thing, str | float) else id(thing)
 
 
+def own_docstrings(thing: Any) -> list[str]:
+    members = vars(thing).values() if inspect.isclass(thing) else ()
+    texts = [inspect.getdoc(thing) if not inspect.isclass(thing) else thing.__doc__]
+    texts += [getattr(getattr(member, "__func__", member), "__doc__", None) for member in members]
+    return [text for text in texts if isinstance(text, str)]
+
+
+def shows_itself(thing: Any) -> bool:
+    return any(">>> " in text for text in own_docstrings(thing))
+
+
+def given_by_examples() -> set[str]:
+    """Names of the classes that functions and methods with examples return: what they hold is shown there."""
+    given = set()
+    for thing in public_names().values():
+        if inspect.isfunction(thing):
+            functions = [thing]
+        elif inspect.isclass(thing):
+            members = (getattr(member, "__func__", member) for member in vars(thing).values())
+            functions = [member for member in members if inspect.isfunction(member)]
+        else:
+            functions = []
+        if shows_itself(thing):
+            for function in functions:
+                given.update(re.findall(r"\w+", str(function.__annotations__.get("return", ""))))
+    return given
+
+
 def test_every_public_name_stands_in_the_reference_once() -> None:
     wanted = {key(path, thing): path for path, thing in public_names().items()}
     text = "\n".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "reference").glob("*.md")))
@@ -49,6 +117,23 @@ def test_every_public_name_stands_in_the_reference_once() -> None:
     assert sorted({path for path, one in zip(listed, keys, strict=True) if keys.count(one) > 1}) == []
     assert sorted(path for one, path in wanted.items() if one not in keys) == []
     assert sorted(path for path, one in zip(listed, keys, strict=True) if one not in wanted) == []
+
+
+def test_every_public_class_and_function_has_an_example() -> None:
+    given = given_by_examples()
+    unshown = {f"torchface.{name}" for names in UNSHOWN.values() for name in names}
+    homes: dict[int, str] = {}
+    for path, thing in public_names().items():
+        homes[id(thing)] = min(path, homes.get(id(thing), path), key=lambda one: (-one.count("."), one))
+    lacking = {
+        homes[id(thing)]
+        for thing in public_names().values()
+        if (inspect.isclass(thing) or inspect.isfunction(thing))
+        and not shows_itself(thing)
+        and thing.__name__ not in given
+    }
+    assert sorted(lacking - unshown) == []
+    assert sorted(unshown - lacking) == []
 
 
 def test_every_error_has_its_causes_and_cures() -> None:

@@ -8,7 +8,15 @@ __all__ = ["Progress", "silent"]
 
 
 class Progress(Protocol):
-    """Called as work goes on: ``progress("rendering")``, or ``progress("rendering", 3, 20)`` after 3 of 20 images."""
+    """Called as work goes on: ``progress("rendering")``, or ``progress("rendering", 3, 20)`` after 3 of 20 images.
+
+    Example:
+        >>> def tell(step: str, done: int = 0, total: int = 0) -> None:
+        ...     print(f"{step}: {done} of {total}")
+        >>> progress: Progress = tell
+        >>> progress("rendering", 3, 20)
+        rendering: 3 of 20
+    """
 
     def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
         """Tells how far the work is.
@@ -21,4 +29,8 @@ class Progress(Protocol):
 
 
 def silent(step: str, done: int = 0, total: int = 0) -> None:
-    """The progress of work that nobody watches."""
+    """The progress of work that nobody watches.
+
+    Example:
+        >>> silent("rendering", 3, 20)
+    """

@@ -59,6 +59,11 @@ def mouth_close_of(rig: BlendshapeRig) -> MouthClose | None:
 
     Raises:
         ValueRangeError: its ``mouthClose`` moves the chin part of the way, or ``jawOpen`` moves nothing.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> mouth_close_of(performer(texture=False)).opens_jaw  # ARKit's convention
+        False
     """
     rows = _rows(rig.names)
     if rows is None:
@@ -83,6 +88,12 @@ def with_jaw_in_mouth_close(rig: BlendshapeRig) -> BlendshapeRig:
     Raises:
         NameMismatchError: it lacks one of the shapes, or a corrective has no counterpart.
         ValueRangeError: it is of that convention already.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = with_jaw_in_mouth_close(performer(texture=False))
+        >>> mouth_close_of(rig).opens_jaw
+        True
     """
     _expect(rig, opens_jaw=False)
     return _converted(rig, 1.0)
@@ -92,6 +103,13 @@ def without_jaw_in_mouth_close(rig: BlendshapeRig) -> BlendshapeRig:
     """Audio2Face's rig in ARKit's convention: the same faces at weights of :func:`jaw_out_of_mouth_close`.
 
     Raises: as :func:`with_jaw_in_mouth_close`.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> back = without_jaw_in_mouth_close(with_jaw_in_mouth_close(rig))
+        >>> torch.allclose(back.deltas, rig.deltas, atol=1e-4)
+        True
     """
     _expect(rig, opens_jaw=True)
     return _converted(rig, -1.0)
@@ -104,12 +122,23 @@ def jaw_into_mouth_close(track: Track) -> Track:
 
     Raises:
         NameMismatchError: the track lacks one of the shapes.
+
+    Example:
+        >>> arkit = Track(("jawOpen", "mouthClose"), torch.tensor([[[0.75], [0.25]]]))
+        >>> jaw_into_mouth_close(arkit).values[0, :, 0].tolist()
+        [0.5, 0.25]
     """
     return _moved(track, -1.0)
 
 
 def jaw_out_of_mouth_close(track: Track) -> Track:
-    """The weights of a rig whose ``mouthClose`` opens the jaw, for ARKit's; see :func:`jaw_into_mouth_close`."""
+    """The weights of a rig whose ``mouthClose`` opens the jaw, for ARKit's; see :func:`jaw_into_mouth_close`.
+
+    Example:
+        >>> other = Track(("jawOpen", "mouthClose"), torch.tensor([[[0.5], [0.25]]]))
+        >>> jaw_out_of_mouth_close(other).values[0, :, 0].tolist()
+        [0.75, 0.25]
+    """
     return _moved(track, 1.0)
 
 

@@ -34,6 +34,12 @@ class ShapeRule:
         product: source shapes that are multiplied.
         gain: g.
         lower, upper: what the target takes.
+
+    Example:
+        >>> corrective = ShapeRule(product=("jawOpen", "mouthPucker"), gain=2.0)
+        >>> shapes = shape_map(["jawOpen", "mouthPucker"], ["openPucker"], {"openPucker": corrective})
+        >>> shapes(torch.tensor([[0.5, 0.5]])).tolist()
+        [[0.5]]
     """
 
     sum: Mapping[str, float] = field(default_factory=dict)
@@ -52,6 +58,11 @@ class ShapeMap:
         matrix: the sums, (N_to,N_from); all zero for a shape that is driven by products alone or by nothing.
         products: for each target shape the source shapes that are multiplied, as rows of ``from_names``.
         gain, lower, upper: one a target shape, (N_to,).
+
+    Example:
+        >>> shapes = shape_map(["jawOpen"], ["jawOpen", "tongueOut"])
+        >>> shapes.undriven
+        ('tongueOut',)
     """
 
     from_names: tuple[str, ...]
@@ -119,6 +130,12 @@ def shape_map(
         NameMismatchError: a rule is for a shape that the target lacks, names one that the source lacks, or nothing
             drives anything.
         ValueRangeError: a gain, limit or factor is not finite, or a lower limit above the upper.
+
+    Example:
+        >>> rules = {"jawDrop": ShapeRule({"jawOpen": 0.5})}
+        >>> shapes = shape_map(["eyeBlinkLeft", "jawOpen"], ["eyeBlink_L", "jawDrop"], rules)
+        >>> shapes(torch.tensor([[1.0, 0.5]])).tolist()
+        [[1.0, 0.25]]
     """
     rules = rules or {}
     _check_rules(rules, from_names, to_names)
@@ -155,6 +172,13 @@ def retarget_take(take: Take, shapes: ShapeMap) -> Take:
 
     Raises:
         ShapeError: the take has no weights by the names that the map comes from.
+
+    Example:
+        >>> from torchface import Track
+        >>> take = Take(30.0, weights=Track(("EyeBlinkLeft",), torch.ones(2, 1, 1)))
+        >>> shapes = shape_map(take.weights.names, ["eyeBlink_L", "jawOpen"])
+        >>> retarget_take(take, shapes).weights.values[0, :, 0].tolist()
+        [1.0, 0.0]
     """
     if take.weights is None or take.weights.names != shapes.from_names:
         raise ShapeError("retarget: found a take without weights of the map's shapes, expected them")
@@ -163,7 +187,7 @@ def retarget_take(take: Take, shapes: ShapeMap) -> Take:
 
 
 def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
-    """Reads a mapping table, TOML::
+    r"""Reads a mapping table, TOML::
 
         [browInnerUp]                       # a shape of the target rig
         sum = {browInnerUp_L = 0.5, browInnerUp_R = 0.5}
@@ -176,6 +200,12 @@ def load_shape_rules(path: str | Path) -> dict[str, ShapeRule]:
 
     Raises:
         FileFormatError: the file is no such table.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("table.toml").write_text("[jawDrop]\nsum = {jawOpen = 0.5}\n")
+        >>> load_shape_rules("table.toml")["jawDrop"].sum
+        {'jawOpen': 0.5}
     """
     return {name: _rule(entry) for name, entry in read_toml(path).table().items()}
 

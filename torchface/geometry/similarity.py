@@ -17,7 +17,13 @@ MIN_HEAD_SCALE, MAX_HEAD_SCALE = 0.8, 1.25
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """:math:`x \\mapsto s R x + t` for a batch: scale (B,), rotation (B,3,3), translation (B,3)."""
+    """:math:`x \\mapsto s R x + t` for a batch: scale (B,), rotation (B,3,3), translation (B,3).
+
+    Example:
+        >>> larger = Similarity(torch.tensor([2.0]), torch.eye(3)[None], torch.ones(1, 3))
+        >>> larger.inverse().apply(larger.apply(torch.eye(3))).tolist() == torch.eye(3)[None].tolist()
+        True
+    """
 
     scale: Tensor
     rotation: Tensor
@@ -60,6 +66,12 @@ def similarity_transform(
         ShapeError: the shapes differ, or fewer than three points are present.
 
     Source: Horn 1987; thesis 3.2.3 and 4.1.2.
+
+    Example:
+        >>> points = torch.tensor([[[0.0, 0, 0], [9, 0, 0], [0, 5, 0], [0, 0, 2]]])
+        >>> found = similarity_transform(points, 10 * points + 3.0)
+        >>> round(found.scale.item(), 3), found.translation.round(decimals=3).tolist()
+        (10.0, [[3.0, 3.0, 3.0]])
     """
     if source.shape != target.shape or source.ndim != 3 or source.shape[-1] != 3:
         raise ShapeError(

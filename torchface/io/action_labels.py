@@ -28,6 +28,11 @@ class Performed:
         units: their names, such as ``("1+2", "4")``.
         first: frame in which the motion begins.
         last: the frame before which it is over.
+
+    Example:
+        >>> frown = Performed(("4",), first=30, last=90)
+        >>> frown.last - frown.first
+        60
     """
 
     units: tuple[str, ...]
@@ -50,6 +55,12 @@ class ActionLabels:
     Raises:
         ValueRangeError: a frame outside the video, an empty stretch or box, or a number that is not finite.
         NameMismatchError: a stretch without a unit, or no region.
+
+    Example:
+        >>> brows = {"brow_left": (60.0, 40.0, 90.0, 60.0)}
+        >>> markers = ((20.0, 80.0), (110.0, 80.0))
+        >>> ActionLabels(300, 0, (5.0, 5.0), markers, brows, (Performed(("4",), 30, 90),)).units
+        ('4',)
     """
 
     frames: int
@@ -94,6 +105,13 @@ def load_action_labels(path: str | Path) -> ActionLabels:
     Raises:
         FileFormatError: the file is missing, too large, no TOML, or lacks a field.
         ValueRangeError, NameMismatchError: what it says cannot be; see :class:`ActionLabels`.
+
+    Example:
+        >>> brows = {"brow_left": (60.0, 40.0, 90.0, 60.0)}
+        >>> labels = ActionLabels(300, 0, (5.0, 5.0), ((20.0, 80.0), (110.0, 80.0)), brows)
+        >>> save_action_labels(labels, "take.toml")
+        >>> load_action_labels("take.toml") == labels
+        True
     """
     document = read_toml(path, _FORMAT, _MAX_BYTES)
     helmet, left, right = (
@@ -114,7 +132,15 @@ def load_action_labels(path: str | Path) -> ActionLabels:
 
 
 def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
-    """Writes TOML; the file appears only when it is complete."""
+    """Writes TOML; the file appears only when it is complete.
+
+    Example:
+        >>> from pathlib import Path
+        >>> brows = {"brow_left": (60.0, 40.0, 90.0, 60.0)}
+        >>> save_action_labels(ActionLabels(300, 0, (5.0, 5.0), ((20.0, 80.0), (110.0, 80.0)), brows), "take.toml")
+        >>> "brow_left" in Path("take.toml").read_text()
+        True
+    """
     document: dict[str, Any] = {
         "format": _FORMAT,
         "frames": labels.frames,

@@ -18,6 +18,14 @@ class HybridGraph(SolverGraph):
     Batches with neither gaps nor :math:`\gamma` take the one H of ``SolverGraph``.
 
     Source: thesis 4.1.8, equation 38.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> still = solver.points(torch.zeros(1, len(solver.names))).float()
+        >>> none = torch.zeros(1, len(solver.names)).float()
+        >>> bool(HybridGraph(solver)(still, none, none, none).max() < 0.01)
+        True
     """
 
     inputs = ("markers", "previous", "predicted", "gamma")

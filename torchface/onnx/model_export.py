@@ -42,6 +42,12 @@ def export_model(
 
     Raises:
         ValueRangeError: there is no graph for its class, or ONNX Runtime and PyTorch differ; nothing is written.
+
+    Example:
+        >>> from torchface import zoo
+        >>> report = export_model(zoo.get_model("face_boxes"), "boxes.onnx", {"licence": "MIT"})
+        >>> report.path.name, max(report.parity.values()) < 0.1
+        ('boxes.onnx', True)
     """
     if isinstance(model, HeadModel):
         return export_head_decoder(model, path, facts)

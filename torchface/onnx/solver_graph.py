@@ -50,6 +50,16 @@ class SolverGraph(nn.Module):
         rho: the metric's :math:`\rho`; see ``choose_rho``.
 
     Source: thesis 4.1.4.
+
+    Example:
+        >>> from torchface import zoo
+        >>> solver = zoo.get_model("marker_solver")
+        >>> graph = SolverGraph(solver)
+        >>> weights = torch.zeros(1, len(solver.names))
+        >>> weights[0, solver.names.index("jawOpen")] = 0.5
+        >>> found = graph(solver.points(weights).float(), torch.zeros_like(weights).float())
+        >>> bool((found - weights).abs().max() < 0.01)
+        True
     """
 
     inputs: tuple[str, ...] = ("markers", "previous")

@@ -127,6 +127,14 @@ def export_solver(
     Raises:
         ValueRangeError: ONNX Runtime and PyTorch differ by more than 1e-5 and more than rounding explains; nothing is
             written.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False).select(["jawOpen", "browInnerUp", "mouthPucker"])
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> report = export_solver(rig, sites, "solver.onnx")
+        >>> max(gap.parity for gap in report.gaps) < 0.01  # weights of ONNX Runtime to those of PyTorch
+        True
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
     return export_marker_solver(solver, path, steps, steps_with_gaps, markers)
@@ -175,6 +183,13 @@ def export_hybrid_solver(
     computes what the other graph does. It is checked with random predictions for a seventh of the weights.
 
     Args, Raises: as :func:`export_solver`.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False).select(["jawOpen", "browInnerUp", "mouthPucker"])
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> export_hybrid_solver(rig, sites, "hybrid.onnx").path.name
+        'hybrid.onnx'
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()

@@ -55,6 +55,13 @@ class VideoGraph(nn.Module):
         ValueRangeError: the solver uses tracked poses, or its prior is none of Student's distributions.
 
     Source: thesis 4.2.6, 4.2.9, 4.2.10.
+
+    Example:
+        >>> from torchface.capture import VideoSolver
+        >>> from torchface.synthetic import performer
+        >>> camera = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+        >>> VideoGraph(VideoSolver(performer(texture=False), None, camera)).state
+        ('weights', 'rotation', 'translation')
     """
 
     landmark_weights: Tensor

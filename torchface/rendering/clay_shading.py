@@ -31,6 +31,11 @@ class Lighting:
         occlusion_rays: rays a pixel to tell how close; 0 leaves the dimming out.
         occlusion_reach: millimetres beyond which a surface no longer dims.
         gloss: strength of the highlight.
+
+    Example:
+        >>> even = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)  # shows colours as they are
+        >>> even.ambient
+        1.0
     """
 
     lights: tuple[tuple[tuple[float, float, float], float], ...] = (
@@ -73,6 +78,15 @@ def render(
     Raises:
         ShapeError: the normal map is not (3,h,w).
         TopologyError: a normal map is given and the mesh has no texture coordinates.
+
+    Example:
+        >>> from torchface.geometry.cameras.pinhole import look_at
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> camera = look_at(head.vertices[head.landmarks].mean(0), 0.0, width=32, height=40)
+        >>> image = render(head, camera, samples=1)
+        >>> image.shape == (3, 40, 32), bool(image[:, 20, 16].mean() < 1)  # a face before white
+        (True, True)
     """
     origins, directions = camera.rays(samples)
     height, width = directions.shape[:2]

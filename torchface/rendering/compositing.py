@@ -24,13 +24,25 @@ __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
-    """Colours (V,3) of non-negative values (V,), 0 to ``maximum``; beyond it the last colour."""
+    """Colours (V,3) of non-negative values (V,), 0 to ``maximum``; beyond it the last colour.
+
+    Example:
+        >>> colors = heat_colors(torch.tensor([0.0, 2.0, 9.0]), maximum=2.0)
+        >>> torch.equal(colors[1], colors[2])  # beyond the maximum
+        True
+    """
     table = torch.tensor(np.asarray(colormaps[colormap].resampled(256)(np.arange(256)))[:, :3], dtype=torch.float32)
     return table[(values / maximum * 255).clamp(0, 255).long()]
 
 
 def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
-    """The image (3,H,W) with a line of text under it."""
+    """The image (3,H,W) with a line of text under it.
+
+    Example:
+        >>> image = torch.zeros(3, 40, 60)
+        >>> caption(image, "neutral").shape[1] > 40
+        True
+    """
     return torch.cat([image, _line(image.shape[2], text, size)], dim=1)
 
 
@@ -47,7 +59,12 @@ def _line(width: int, text: str, size: int) -> Tensor:
 
 
 def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
-    """Images (3,H,W) in rows of ``columns``, on white; columns as wide, and rows as high, as their largest image."""
+    """Images (3,H,W) in rows of ``columns``, on white; columns as wide, and rows as high, as their largest image.
+
+    Example:
+        >>> sheet([torch.zeros(3, 10, 20)] * 3, columns=2, gap=4).shape
+        torch.Size([3, 24, 44])
+    """
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     heights = [max(image.shape[1] for image in row) for row in rows]
     widths = [max(image.shape[2] for image in images[i::columns]) for i in range(min(columns, len(images)))]
@@ -87,6 +104,12 @@ def save_rendered_image(image: Tensor, path: str | Path) -> None:
 
     Raises:
         FileFormatError: another ending, or a folder that cannot be written to.
+
+    Example:
+        >>> from torchface.io import load_image
+        >>> save_rendered_image(torch.zeros(3, 4, 6), "black.png")
+        >>> load_image("black.png").max().item()
+        0.0
     """
     path = Path(path)
     kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}

@@ -39,6 +39,11 @@ class PointLight:
         ValueRangeError: a number is NaN or infinite, or a strength negative.
 
     Source: thesis 4.2.11, equation 66.
+
+    Example:
+        >>> lamp = PointLight.directional(torch.ones(3), torch.ones(3), torch.tensor([0.0, -1.0, 0.0]))
+        >>> lamp.toward(torch.zeros(1, 3)).round(decimals=3).abs().tolist()  # from above, y down
+        [[0.0, 1.0, 0.0]]
     """
 
     ambient: Tensor
@@ -116,6 +121,11 @@ def vertex_albedo(mesh: Mesh) -> Tensor:
     Raises:
         ValueRangeError: the mesh has neither. Colours taken from the video that is to be relit are no way out: they
             hold its light already, and the light found would be even, whatever it was.
+
+    Example:
+        >>> red = torch.tensor([[1.0, 0, 0]]).repeat(3, 1)
+        >>> torch.equal(vertex_albedo(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]), colors=red)), red)
+        True
     """
     if mesh.colors is not None:
         return mesh.colors.float()

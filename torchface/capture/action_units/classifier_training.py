@@ -38,6 +38,10 @@ class TrainingSettings:
         warps: replicas of every frame, each warped at random.
         warp_amplitude: of their control points, pixels.
         seed: of k-means and the warps.
+
+    Example:
+        >>> TrainingSettings(levels=3).levels
+        3
     """
 
     levels: int = 4
@@ -87,6 +91,20 @@ def fit_classifier(
     Raises:
         ShapeError: videos and labels differ in number or length.
         NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
+
+    Example:
+        >>> from torchface.io.action_labels import Performed
+        >>> height = 6 + 9 * torch.linspace(0, 3.1416, 60).sin() ** 2  # a painted brow, up and down again
+        >>> stroke = torch.exp(-(((torch.arange(24.0) - height[:, None]) / 2.5) ** 2))
+        >>> shown = stroke[:, None, :, None].repeat(1, 1, 1, 24).float()
+        >>> video = RegionVideo(("brow",), shown, shown[0], shown[0], fps=30.0)
+        >>> box = {"brow": (0, 0, 24, 24)}
+        >>> labels = ActionLabels(60, 0, (0, 0), ((0, 0), (9, 9)), box, (Performed(("1",), 2, 58),))
+        >>> classifier = fit_classifier([video], [labels], (RegionGroup("brow", ("brow",), ("1",)),))
+        >>> with torch.no_grad():
+        ...     intensity = classifier(shown, shown[0])[:, 0]
+        >>> intensity[0].item(), intensity[30].item()
+        (0.0, 1.0)
     """
     settings, progress = settings or TrainingSettings(), progress or silent
     check_training(videos, labels, groups)

@@ -33,6 +33,12 @@ class RegionVideo:
         neutral: the regions at rest, (R,h,w), unwarped: the reference of other videos.
         rest: the regions at rest, (R,h,w), warped to another performer's as all frames are.
         fps: frames a second.
+
+    Example:
+        >>> stroke = torch.zeros(10, 1, 24, 24)
+        >>> video = RegionVideo(("brow_left",), stroke, stroke[0], stroke[0], fps=60.0)
+        >>> video.patterns[0].shape == video.neutral.shape
+        True
     """
 
     names: tuple[str, ...]

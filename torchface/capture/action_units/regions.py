@@ -23,6 +23,11 @@ class RegionGroup:
         units: names of its action units.
         other_units: units that move the regions too but are classified by other groups: they are classes of their own,
             so that they are not taken for one of ``units``.
+
+    Example:
+        >>> forehead = RegionGroup("forehead", ("brow_left", "brow_right"), ("1+2", "4"))
+        >>> [group.name for group in GROUPS if set(group.units) & set(forehead.units)]
+        ['forehead']
     """
 
     name: str

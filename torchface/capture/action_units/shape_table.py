@@ -26,6 +26,11 @@ class ShapeTable:
     Raises:
         ValueRangeError: a weight is not in (0,1].
         NameMismatchError: there is no unit, or a unit without a shape.
+
+    Example:
+        >>> table = ShapeTable({"4": {"frown": 0.7}})
+        >>> table.matrix(["4"], ["jawOpen", "frown"]).round(decimals=3).tolist() == torch.tensor([[0.0, 0.7]]).tolist()
+        True
     """
 
     units: dict[str, dict[str, float]]
@@ -79,6 +84,10 @@ def load_shape_table(name_or_path: str | Path) -> ShapeTable:
         NameMismatchError: no such name.
         FileFormatError: the file cannot be read, or is no table.
         ValueRangeError: a weight is not in (0,1].
+
+    Example:
+        >>> sorted(load_shape_table("arkit").units["4"])  # the brow lowerer
+        ['browDownLeft', 'browDownRight']
     """
     path = Path(name_or_path)
     if not isinstance(name_or_path, Path) and path.suffix == "" and path.name == str(name_or_path):

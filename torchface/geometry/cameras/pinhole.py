@@ -30,6 +30,12 @@ class Camera:
 
     Raises:
         ValueRangeError: a side is not 1 to 16384 pixels.
+
+    Example:
+        >>> K = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> camera = Camera(K, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 640, 480)
+        >>> camera.project(torch.tensor([[10.0, 0.0, 900.0]], dtype=torch.float64)).tolist()
+        [[330.0, 240.0]]
     """
 
     intrinsics: Tensor
@@ -85,6 +91,11 @@ def look_at(
 
     Raises:
         ValueRangeError: an angle, ``span`` or a size is NaN or out of range.
+
+    Example:
+        >>> camera = look_at(torch.zeros(3), yaw=30.0, span=300.0, width=512, height=640)
+        >>> camera.project(torch.zeros(1, 3, dtype=torch.float64)).round().tolist()  # in the middle
+        [[255.0, 320.0]]
     """
     for name, angle in (("yaw", yaw), ("pitch", pitch)):
         checked_number(name, angle, -MAX_ANGLE, MAX_ANGLE)

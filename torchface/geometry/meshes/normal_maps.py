@@ -96,6 +96,12 @@ def blend_normal_maps(maps: Tensor, weights: Tensor, neutral: Tensor | None = No
         ValueRangeError: NaN or infinite.
 
     Source: partial-derivative blending, Hill and Barré-Brisebois 2012; thesis 3.2.1, equation 1, for the form.
+
+    Example:
+        >>> tilted = torch.tensor([0.6, 0.0, 0.8])[None, :, None, None].repeat(1, 1, 4, 4)
+        >>> flat = blend_normal_maps(tilted, torch.zeros(1))
+        >>> flat[:, 0, 0].tolist()
+        [0.0, 0.0, 1.0]
     """
     _check_maps(maps, neutral)
     if weights.shape != (len(maps),):

@@ -41,6 +41,10 @@ class AppearanceSettings:
         jaw_margin: how far beyond the jaw line textures reach, in parts of its distance from the nose.
         parts: upper and lower face each have texture modes of their own.
         mirror: learn from every image's mirror image too.
+
+    Example:
+        >>> AppearanceSettings(resolutions=(16.0,), iterations=5).features
+        'oriented_gradients'
     """
 
     features: Features = "oriented_gradients"

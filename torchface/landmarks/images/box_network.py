@@ -55,6 +55,14 @@ class BoxNetwork(nn.Module):
         ValueRangeError: not four levels, or a number below 1.
 
     Source: Zhou, Wang, Krähenbühl 2019 (centres as points); Howard et al. 2017 (separable convolutions).
+
+    Example:
+        >>> from torchface import zoo
+        >>> network = zoo.get_model("face_boxes")
+        >>> with torch.no_grad():
+        ...     faces = network(torch.full((1, 3, 128, 128), 0.5))
+        >>> bool(faces[..., 3].max() < 0.4)  # no score says that grey is a face
+        True
     """
 
     fit: ClassVar[Callable[..., BoxNetwork]]

@@ -33,6 +33,12 @@ class LabelledPicture:
         image: uint8 (3,H,W), red first.
         faces: x and y of the centre, side, pixels, roll angle, radians, (F,4); see ``ibug_68.turned_box``.
         doubtful: whether a face may be found or not, (F,): hidden, cut by the border, small.
+
+    Example:
+        >>> face = torch.tensor([[60.0, 50.0, 40.0, 0.0]])  # x, y, side, roll
+        >>> picture = LabelledPicture(torch.zeros(3, 100, 120, dtype=torch.uint8), face, torch.tensor([False]))
+        >>> len(picture.faces)
+        1
     """
 
     image: Tensor
@@ -58,6 +64,10 @@ class BoxTrainingSettings:
         averaged: steps over which the weights that are kept are averaged.
         channels, blocks: see :class:`BoxNetwork`.
         checkpoint: steps from one to the next.
+
+    Example:
+        >>> BoxTrainingSettings(pictures=1600, batch=16).steps
+        100
     """
 
     pictures: int = 80_000

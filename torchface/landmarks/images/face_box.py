@@ -27,7 +27,14 @@ _FIVE = torch.tensor([[0.33, 0.374], [0.68, 0.374], [0.49, 0.572], [0.357, 0.758
 
 
 class NoFaceError(TorchfaceError):
-    """An image shows no face, or fewer than asked for."""
+    """An image shows no face, or fewer than asked for.
+
+    Example:
+        >>> find_face(torch.full((120, 160), 128, dtype=torch.uint8))
+        Traceback (most recent call last):
+            ...
+        torchface.landmarks.images.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +46,11 @@ class FaceBoxes:
         scores: how sure the detector is, (F,) in [0,1].
         tilts: how far each face is turned in the image, (F,) radians, clockwise as it is seen; zeros if absent, as of
             a detector that finds upright faces alone.
+
+    Example:
+        >>> faces = FaceBoxes(torch.tensor([[10.0, 20.0, 60.0, 60.0]]), torch.tensor([0.9]))
+        >>> faces.tilts.tolist()  # upright
+        [0.0]
     """
 
     boxes: Tensor
@@ -74,6 +86,11 @@ class HaarDetector:
             ``"never"`` in none.
 
     Source: Viola and Jones 2001; Lienhart and Maydt 2002.
+
+    Example:
+        >>> frontal = HaarDetector(profiles="never", neighbours=5)
+        >>> len(frontal(torch.full((120, 160), 128, dtype=torch.uint8)).boxes)
+        0
     """
 
     smallest: float = 1 / 12
@@ -191,13 +208,26 @@ def find_faces(image: Tensor, detector: FaceDetector | None = None) -> FaceBoxes
 
     Raises:
         ShapeError: no such image.
+
+    Example:
+        >>> len(find_faces(torch.full((120, 160), 128, dtype=torch.uint8)).boxes)
+        0
     """
     check_image(image)
     return (detector or HaarDetector(profiles="always"))(image)
 
 
 def find_face(image: Tensor, number: int = 0, detector: FaceDetector | None = None) -> Tensor:
-    """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`."""
+    """The box of one face: x, y, width, height, (4,) pixels; see :func:`find_some_faces`.
+
+    Example:
+        >>> from torchface.landmarks import NoFaceError
+        >>> try:
+        ...     box = find_face(torch.full((120, 160), 128, dtype=torch.uint8))
+        ... except NoFaceError as error:
+        ...     print(error)
+        image of 160 x 120: found no face, expected one at least
+    """
     return find_some_faces(image, number, detector).boxes[number]
 
 

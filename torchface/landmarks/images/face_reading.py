@@ -22,6 +22,12 @@ class FaceReading:
         openness: distance of the lids over that of the eye's corners, (2,).
         closed: (2,) in [0,1]: how likely the eye is shut.
         eye_visibility: (2,) in [0,1]: how likely nothing hides the eye.
+
+    Example:
+        >>> sure, eyes = torch.ones(68), torch.ones(2)
+        >>> face = FaceReading(torch.zeros(68, 2), sure, sure, eyes[0], torch.zeros(2, 2), 0.3 * eyes, 0 * eyes, eyes)
+        >>> face.closed.tolist()  # both eyes are open
+        [0.0, 0.0]
     """
 
     landmarks: Tensor

@@ -32,6 +32,14 @@ class FoundLandmarks:
         confidence: (68,) in [0,1]; see :func:`confidence_of`.
         visibility: (68,) in [0,1]: how likely nothing stands before the landmark.
         presence: in [0,1]: how likely the box shows a face at all.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.landmarks import TreeFinder
+        >>> blank = torch.full((80, 80), 128, dtype=torch.uint8)
+        >>> found = TreeFinder(zoo.get_model("face_landmarks"))(blank, torch.tensor([10.0, 10.0, 60.0, 60.0]))
+        >>> len(found.landmarks), found.confidence.max().item()  # sees nothing, and says so
+        (68, 0.0)
     """
 
     landmarks: Tensor
@@ -46,6 +54,15 @@ class LandmarkFinder(Protocol):
     The image is uint8, (H,W) or (3,H,W) red first; the box x, y, width, height, (4,) pixels, as
     :func:`~torchface.landmarks.images.ibug_68.box_around` draws it; the tilt of the face is in radians, clockwise as
     the image is seen.
+
+    Example:
+        >>> class Middle:
+        ...     name = "middle"
+        ...     def __call__(self, image, box, tilt=0.0):
+        ...         return FoundLandmarks((box[:2] + box[2:] / 2).expand(68, 2), torch.ones(68), torch.ones(68), 1.0)
+        >>> finder: LandmarkFinder = Middle()
+        >>> finder(torch.zeros(80, 80, dtype=torch.uint8), torch.tensor([10.0, 10, 60, 60])).landmarks[0].tolist()
+        [40.0, 40.0]
     """
 
     def __call__(self, image: Tensor, box: Tensor, tilt: float = 0.0) -> FoundLandmarks: ...

@@ -32,6 +32,14 @@ def lid_openings(landmarks: Tensor) -> Tensor:
         ShapeError: not (...,68,2).
 
     Source: the eye aspect ratio of Soukupova and Cech 2016, over another width: that of one eye is less certain.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> shut = rig.vertices + rig.deltas[rig.index(["eyeBlinkRight"])[0]]
+        >>> right, left = lid_openings(shut[rig.neutral.landmarks][:, :2] * torch.tensor([1.0, -1.0]))
+        >>> bool(right < 0.03 < left)
+        True
     """
     return torch.stack([_gap(landmarks, pairs) for pairs in _LIDS], -1)
 
@@ -44,6 +52,14 @@ def mouth_gap(landmarks: Tensor) -> Tensor:
 
     Raises:
         ShapeError: not (...,68,2).
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> wide = rig.vertices + rig.deltas[rig.index(["jawOpen"])[0]]
+        >>> rest, gap = (mouth_gap(face[rig.neutral.landmarks][:, :2]) for face in (rig.vertices, wide))
+        >>> bool(gap.abs() > rest.abs() + 0.1)
+        True
     """
     return _gap(landmarks, _LIPS)
 
@@ -61,6 +77,12 @@ def find_blinks(openings: Tensor, closed: float = 0.7) -> Tensor:
     Raises:
         ShapeError: not (T,).
         ValueRangeError: ``closed`` is not in (0,1).
+
+    Example:
+        >>> openings = torch.full((30,), 0.3)
+        >>> openings[10:14] = 0.05
+        >>> find_blinks(openings).tolist()
+        [[10, 13]]
     """
     if openings.ndim != 1:
         raise ShapeError(f"openings: found {tuple(openings.shape)}, expected (T,)")
@@ -92,6 +114,12 @@ def agreement(found: Tensor, reference: Tensor) -> Agreement:
 
     Raises:
         ShapeError: they differ in shape.
+
+    Example:
+        >>> reference = torch.tensor([0.1, 0.3, 0.2, 0.4])
+        >>> found = agreement(0.5 * reference, reference)
+        >>> round(found.correlation, 3), round(found.slope, 3)  # in step, and half as far
+        (1.0, 0.5)
     """
     if found.shape != reference.shape:
         raise ShapeError(f"agreement: found {tuple(found.shape)} and {tuple(reference.shape)}, expected twice the same")
@@ -132,6 +160,11 @@ def landmark_jitter(landmarks: Tensor) -> Tensor:
 
     Raises:
         ShapeError: not (T,L,2).
+
+    Example:
+        >>> steady = torch.arange(50.0)[:, None, None] * torch.ones(1, 68, 2)
+        >>> landmark_jitter(steady).item()  # a constant speed is none
+        0.0
     """
     if landmarks.ndim != 3 or landmarks.shape[2] != 2:
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (T,L,2)")

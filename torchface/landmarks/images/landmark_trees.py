@@ -41,6 +41,15 @@ class LandmarkTrees(nn.Module):
         components: of the leaves, K.
 
     Source: thesis 4.2.2; Kazemi and Sullivan 2014.
+
+    Example:
+        >>> from torchface import zoo
+        >>> trees = zoo.get_model("face_landmarks")
+        >>> box = torch.tensor([[20.0, 20.0, 60.0, 60.0]])
+        >>> found = trees(torch.full((1, 1, 100, 100), 0.5), box)
+        >>> moved = trees(torch.full((1, 1, 100, 100), 0.5), box + torch.tensor([5.0, 0.0, 0.0, 0.0]))
+        >>> (moved - found).mean((0, 1)).round(decimals=2).tolist()
+        [5.0, 0.0]
     """
 
     fit: ClassVar[Callable[..., LandmarkTrees]]

@@ -51,6 +51,14 @@ class LandmarkNetwork(nn.Module):
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps); Kumar et al. 2020
     (uncertainty and visibility beside places).
+
+    Example:
+        >>> from torchface import zoo
+        >>> network = zoo.get_model("landmark_network")
+        >>> with torch.no_grad():
+        ...     found = network(torch.full((1, 3, network.size, network.size), 0.5))
+        >>> bool((found.landmarks >= 0).all() and (found.landmarks < network.size).all())  # pixels of the crop
+        True
     """
 
     fit: ClassVar[Callable[..., LandmarkNetwork]]

@@ -32,6 +32,12 @@ class NetworkDetector:
 
     Raises:
         ValueRangeError: no such score or length.
+
+    Example:
+        >>> from torchface import zoo
+        >>> detector = NetworkDetector(zoo.get_model("face_boxes"))
+        >>> len(detector(torch.full((3, 120, 160), 128, dtype=torch.uint8)).boxes)
+        0
     """
 
     def __init__(self, network: BoxNetwork, least_score: float = 0.4, longest: int = 640) -> None:

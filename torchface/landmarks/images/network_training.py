@@ -31,6 +31,10 @@ class NetworkSettings(DescentSettings):
         pair: weight of distances between landmarks, such as between lids.
         heat: weight of the heat maps' form, which fades over the first half.
         augmentation: how widely crops are drawn.
+
+    Example:
+        >>> NetworkSettings(steps=100, batch=8).steps
+        100
     """
 
     workers: int = 1

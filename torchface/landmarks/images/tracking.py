@@ -87,6 +87,11 @@ class TrackedFace:
         visibility: (68,) in [0,1]: how likely nothing stands before the landmark; 1 where the finder does not say, 0
             where the face is lost.
         presence: in [0,1]: how likely it is a face; 0 where it is lost.
+
+    Example:
+        >>> lost = TrackedFace.lost()
+        >>> lost.found, lost.confidence.max().item()
+        (False, 0.0)
     """
 
     landmarks: Tensor
@@ -131,6 +136,12 @@ class LandmarkTracker:
 
     Raises:
         ValueRangeError: trees find other landmarks than the 68, or ``face`` is negative.
+
+    Example:
+        >>> from torchface import zoo
+        >>> tracker = LandmarkTracker(zoo.get_model("face_landmarks"))
+        >>> tracker.step(torch.full((120, 160), 128, dtype=torch.uint8)).found
+        False
     """
 
     def __init__(
@@ -405,6 +416,13 @@ def track_landmarks(
     Raises:
         FileFormatError: the video cannot be decoded, changes size, or has a variable frame rate.
         ShapeError: frames of another kind.
+
+    Example:
+        >>> from torchface import zoo
+        >>> blank = torch.full((120, 160), 128, dtype=torch.uint8)
+        >>> track = track_landmarks([blank, blank], LandmarkTracker(zoo.get_model("face_landmarks")))
+        >>> len(track.names), bool(track.values.isnan().all())
+        (68, True)
     """
     progress = progress or silent
     if isinstance(video, str | Path):
@@ -443,6 +461,14 @@ def find_landmarks(
         NoFaceError: there are not so many faces, or the finder says that the box shows none.
         ShapeError: no such image, or a finder that gives other landmarks than the 68.
         ValueRangeError: trees that find other landmarks than the 68, or a finder that gives some that are not finite.
+
+    Example:
+        >>> from torchface import zoo
+        >>> blank = torch.full((120, 160), 128, dtype=torch.uint8)
+        >>> find_landmarks(blank, zoo.get_model("face_landmarks"))
+        Traceback (most recent call last):
+            ...
+        torchface.landmarks.images.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
     faces = find_some_faces(image, face, detector or find_faces_of_any_turn)

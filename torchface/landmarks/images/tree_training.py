@@ -43,6 +43,10 @@ class TreeSettings:
         gamma: standard deviation of the logarithm of the exponent that makes a sample's image lighter or darker.
         noise: added to the grey values, standard deviation, in [0,1].
         seed: of everything drawn.
+
+    Example:
+        >>> 2**TreeSettings(depth=4).depth  # leaves of a tree
+        16
     """
 
     cascades: int = 10

@@ -37,6 +37,10 @@ class TraceSettings:
             course.
         iterations: at most so many a blur; fewer when nothing moves any more.
         end_tolerance: a corner is only known to within so many pixels up or down.
+
+    Example:
+        >>> TraceSettings(border=20).border
+        20
     """
 
     border: int = 50
@@ -61,6 +65,11 @@ class Contour:
         points: one a pixel column from the left corner to the right one, (N,2), x right and y down.
         kept: whether a point is as dark as the line, or as like its profile, within one standard deviation, (N,) bool.
         energy: what was minimised, a column.
+
+    Example:
+        >>> straight = torch.stack([torch.arange(20.0, 81.0), torch.full((61,), 50.0)], 1)
+        >>> Contour(straight, torch.ones(61, dtype=torch.bool), 0.0).resampled(3).tolist()
+        [[20.0, 50.0], [50.0, 50.0], [80.0, 50.0]]
     """
 
     points: Tensor
@@ -119,6 +128,13 @@ def trace_contour(
         ValueRangeError: the corners are not finite, outside the image, or not left and right.
 
     Source: thesis 3.2.2; Besag 1986.
+
+    Example:
+        >>> image = torch.ones(1, 100, 100)
+        >>> image[0, 50] = 0.0  # a dark line
+        >>> line = trace_contour(image, torch.tensor([20.0, 50.0]), torch.tensor([80.0, 50.0]))
+        >>> line.points[:, 1].unique().tolist()
+        [50.0]
     """
     settings = settings or TraceSettings()
     box, rows, columns = _box(image, left, right, settings.border)

@@ -28,6 +28,15 @@ def curvature_image(head: UnwrappedHead, scale: float = 1.2, contrast: float = 8
 
     Returns:
         (1,S,S) in [0,1].
+
+    Example:
+        >>> from torchface.landmarks import CylinderLayout, unwrap
+        >>> from torchface.geometry.similarity import Similarity
+        >>> from torchface.synthetic import neutral_head
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> grey = curvature_image(unwrap(neutral_head(texture=False), still, CylinderLayout(size=64, pitch=4.0)))
+        >>> bool(grey.min() >= 0), bool(grey.max() <= 1)
+        (True, True)
     """
     layout = head.layout
     smooth = gaussian_blur(head.radius[None, None], scale / layout.pitch)[0, 0].double()

@@ -34,6 +34,13 @@ class CylinderLayout:
 
     Raises:
         ValueRangeError: a number is not positive, or the image is wider than the whole turn.
+
+    Example:
+        >>> layout = CylinderLayout(size=64, pitch=4.0)
+        >>> middle = (layout.size - 1) / 2
+        >>> front = layout.pixels(torch.tensor([[0.0, 0.0, 90.0]]))
+        >>> bool((front - middle).abs().max() <= 0.5)
+        True
     """
 
     size: int = 1024
@@ -132,6 +139,14 @@ def unwrap(mesh: Mesh, pose: Similarity, layout: CylinderLayout | None = None) -
         ValueRangeError: no ray hits the scan: the pose does not belong to it.
 
     Source: thesis 3.2.2 (UV space); the cylinder stands in for the UVs that raw scans do not share.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> unwrapped = unwrap(head, still, CylinderLayout(size=64, pitch=4.0))
+        >>> bool(unwrapped.mask[32, 32]), 50 < unwrapped.radius[32, 32].item() < 150
+        (True, True)
     """
     layout = layout or CylinderLayout()
     if len(pose.scale) != 1:

@@ -25,6 +25,12 @@ def save_detector(
     Raises:
         FileFormatError: the folder cannot be written to.
         ValueRangeError: an error is NaN or infinite.
+
+    Example:
+        >>> from torchface import zoo
+        >>> save_detector(zoo.get_model("uv_landmarks"), "detector")
+        >>> load_detector("detector").names[0]
+        'nose'
     """
     notes = notes or {}
     record = ModelRecord(KIND, "", "", metrics=dict(notes.get("errors", {})), settings=dict(notes.get("settings", {})))
@@ -36,5 +42,10 @@ def load_detector(folder: str | Path) -> UVLandmarkDetector:
 
     Raises:
         FileFormatError: a file is missing, damaged, of another kind, or does not fit the other.
+
+    Example:
+        >>> from torchface import zoo
+        >>> load_detector(zoo.find("uv_landmarks")).names[0]
+        'nose'
     """
     return read_model(folder, {KIND: UVLandmarkDetector})

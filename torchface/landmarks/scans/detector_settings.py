@@ -20,6 +20,10 @@ class DetectorSettings:
         responses: the best so many matches of each filter are kept, counted in pixels: a match at every fourth pixel of
             a row and a column stands for sixteen.
         bandwidth: of the mean shift.
+
+    Example:
+        >>> DetectorSettings(responses=160).matches
+        10
     """
 
     hog: HogLayout = field(default_factory=HogLayout)

@@ -36,6 +36,12 @@ class LandmarkPairs:
         points: on the scan, (K,3), millimetres.
         confidence: of each, (K,) in [0,1].
         names: what each belongs to: a landmark's name, or a line's name.
+
+    Example:
+        >>> ids, points = torch.tensor([7, 9]), torch.zeros(2, 3)
+        >>> pairs = LandmarkPairs(ids, points, torch.tensor([0.9, 0.1]), ("nose", "right_cheek"))
+        >>> pairs.above(0.5).names
+        ('nose',)
     """
 
     vertices: Tensor

@@ -61,6 +61,15 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
 
     Raises:
         ValueRangeError: a texture is wanted and the scan has no colours.
+
+    Example:
+        >>> from torchface.landmarks import CylinderLayout, unwrap
+        >>> from torchface.geometry.similarity import Similarity
+        >>> from torchface.synthetic import neutral_head
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> head = unwrap(neutral_head(texture=False), still, CylinderLayout(size=64, pitch=4.0))
+        >>> appearance_image(head, "curvature").shape
+        torch.Size([1, 64, 64])
     """
     if appearance == "curvature":
         return curvature_image(head, _BROAD_SCALE, _BROAD_CONTRAST)
@@ -74,7 +83,17 @@ def appearance_image(head: UnwrappedHead, appearance: str) -> Tensor:
 
 def line_image(head: UnwrappedHead, appearance: str) -> Tensor:
     """The image (C,S,S) in which such a detector traces lines: lips and lids are finer than what tells a landmark
-    from its surroundings."""
+    from its surroundings.
+
+    Example:
+        >>> from torchface.landmarks import CylinderLayout, unwrap
+        >>> from torchface.geometry.similarity import Similarity
+        >>> from torchface.synthetic import neutral_head
+        >>> still = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+        >>> head = unwrap(neutral_head(texture=False), still, CylinderLayout(size=64, pitch=4.0))
+        >>> line_image(head, "curvature").shape
+        torch.Size([1, 64, 64])
+    """
     return curvature_image(head) if appearance == "curvature" else appearance_image(head, appearance)
 
 

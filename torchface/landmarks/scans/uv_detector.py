@@ -61,6 +61,13 @@ class UVLandmarkDetector(nn.Module):
         frame: config of the ``FaceFrame`` that scans are laid into, where there is one.
 
     Source: thesis 3.2.2.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import neutral_head
+        >>> detector = zoo.get_model("uv_landmarks")
+        >>> len(detector.names), detector.sees(neutral_head(texture=False))  # looks at colours
+        (12, False)
     """
 
     filters: Tensor

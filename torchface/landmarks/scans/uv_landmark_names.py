@@ -62,6 +62,13 @@ def uv_landmarks_from_ibug(points: Tensor) -> Tensor:
 
     Raises:
         ShapeError: not 68 points.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> points = uv_landmarks_from_ibug(head.vertices[head.landmarks])
+        >>> torch.allclose(points[UV_LANDMARK_NAMES.index("nose")], head.vertices[head.landmarks[30]])
+        True
     """
     if points.ndim < 2 or points.shape[-2] != 68:
         raise ShapeError(f"uv_landmarks_from_ibug: found {tuple(points.shape)}, expected (...,68,D)")

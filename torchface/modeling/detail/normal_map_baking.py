@@ -34,6 +34,11 @@ class BakeStatistics:
         median_distance, far_distance: from mesh to scan along the normal, the median and the 95th percentile over
             the texels hit, millimetres; NaN where none was.
         median_offset: the same with a sign, positive where the scan lies outside the mesh.
+
+    Example:
+        >>> found = BakeStatistics(texels=1000, hit_share=0.9, median_distance=0.1, far_distance=0.4, median_offset=0.05)
+        >>> round(found.texels * found.hit_share)  # texels that the scan covers
+        900
     """
 
     texels: int

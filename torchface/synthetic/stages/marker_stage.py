@@ -39,6 +39,13 @@ def place_markers(rig: BlendshapeRig, count: int = 100, visible_from: float = 75
 
     Raises:
         ValueRangeError: fewer than ``count`` vertices qualify.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = place_markers(rig, 20)
+        >>> sites.labels[:2]
+        ('M001', 'M002')
     """
     mesh = rig.neutral
     vertices = mesh.vertices.double().cpu()
@@ -84,6 +91,15 @@ class StageFlaws:
         slip_translation: amplitude of the helmet's slow drift along each axis, millimetres.
         slip_rotation: amplitude of its drift about each axis, degrees.
         standoff: distance of marker centres from the skin along its normal, millimetres.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> still = rig.vertices.new_zeros(100, len(rig.names))
+        >>> taken = record(rig, sites, still, torch.Generator().manual_seed(0), StageFlaws(missing=0.1))
+        >>> round(taken.take.markers.values[..., 0].isnan().double().mean().item(), 1)
+        0.1
     """
 
     noise: float = 0.3
@@ -106,7 +122,17 @@ class StageFlaws:
 
 @dataclass(frozen=True)
 class LabelSwap:
-    """Two markers whose labels are exchanged from ``first`` frame to before ``last``."""
+    """Two markers whose labels are exchanged from ``first`` frame to before ``last``.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> still = rig.vertices.new_zeros(100, len(rig.names))
+        >>> taken = record(rig, sites, still, torch.Generator().manual_seed(0), StageFlaws(swaps=0.5))
+        >>> all(swap.first < swap.last for swap in taken.swaps)
+        True
+    """
 
     markers: tuple[int, int]
     first: int
@@ -157,6 +183,15 @@ def record(
     Raises:
         ShapeError: ``weights`` is not (T,N).
         TopologyError: the attachment belongs to another mesh.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
+        >>> still = rig.vertices.new_zeros(60, len(rig.names))
+        >>> taken = record(rig, sites, still, torch.Generator().manual_seed(0), StageFlaws(noise=0.3))
+        >>> round((taken.take.markers.values - taken.markers).std().item(), 1)
+        0.3
     """
     if weights.ndim != 2 or weights.shape[1] != len(rig.names):
         raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(rig.names)})")

@@ -16,7 +16,12 @@ SOLVED, TRUE, SINGLE = "#1f5fa8", "#d9822b", "#8e9aa8"
 
 
 def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> Tensor:
-    """An error a frame (T,) over time, with its median; an image (3,H,W)."""
+    """An error a frame (T,) over time, with its median; an image (3,H,W).
+
+    Example:
+        >>> error_curve(torch.rand(50), fps=25.0).shape[0]
+        3
+    """
     figure = Figure(figsize=(10, 2.6), dpi=100, layout="constrained")
     axes = figure.subplots()
     seconds = torch.arange(len(error)) / fps
@@ -29,7 +34,13 @@ def error_curve(error: Tensor, fps: float, label: str = "marker RMSE (mm)") -> T
 
 
 def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps: float, max_shapes: int = 6) -> Tensor:
-    """The sum of weights over time and the curves of the shapes that move most, solved (T,N) over true; (3,H,W)."""
+    """The sum of weights over time and the curves of the shapes that move most, solved (T,N) over true; (3,H,W).
+
+    Example:
+        >>> solved = torch.rand(30, 2)
+        >>> weight_curves(solved, None, ["jawOpen", "mouthPucker"], fps=30.0).shape[0]
+        3
+    """
     order = (solved if true is None else true).std(0).argsort(descending=True)[:max_shapes].tolist()
     figure = Figure(figsize=(10, 1.5 * (len(order) + 1)), dpi=100, layout="constrained")
     rows = figure.subplots(len(order) + 1, 1, sharex=True)
@@ -84,7 +95,13 @@ def compared_curves(
 
 
 def named_bars(values: Tensor, names: Sequence[str], label: str) -> Tensor:
-    """One horizontal bar a name, longest on top, for values (N,); (3,H,W)."""
+    """One horizontal bar a name, longest on top, for values (N,); (3,H,W).
+
+    Example:
+        >>> few, many = (named_bars(torch.rand(n), [f"s{i}" for i in range(n)], "error") for n in (3, 12))
+        >>> few.shape[1] < many.shape[1]
+        True
+    """
     order = values.argsort().tolist()
     figure = Figure(figsize=(6, 0.5 + 0.17 * len(order)), dpi=100, layout="constrained")
     axes = figure.subplots()

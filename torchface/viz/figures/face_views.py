@@ -40,7 +40,15 @@ def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
 
 
 def frame_face(mesh: Mesh, yaw: float = FRONT, pitch: float = 0.0, width: int = 400, height: int = 500) -> Camera:
-    """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh."""
+    """A camera that frames the face: round its landmarks or ``face`` region where annotated, else the whole mesh.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> pixels = frame_face(head, width=40, height=50).project(head.vertices[head.landmarks].double())
+        >>> bool((pixels > 0).all() and (pixels < 50).all())
+        True
+    """
     centre, span = framing(mesh, width / height)
     return look_at(centre, yaw, pitch, span=span, width=width, height=height)
 
@@ -56,7 +64,14 @@ def face_views(
     framed_by: Mesh | None = None,
     lighting: Lighting = DEFAULT_LIGHTING,
 ) -> Tensor:
-    """The mesh from several sides in one row, (3,H,W); ``framed_by`` keeps the framing of another pose."""
+    """The mesh from several sides in one row, (3,H,W); ``framed_by`` keeps the framing of another pose.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> views = face_views(neutral_head(texture=False), yaws=(0.0, 90.0), width=32, height=40, samples=1)
+        >>> views.shape[2] > 2 * 32 - 1
+        True
+    """
     cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
     seen = as_seen(mesh)
     row = sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
@@ -64,7 +79,14 @@ def face_views(
 
 
 def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int = 400, height: int = 500) -> Tensor:
-    """Per-vertex values (V,) painted on three views, with a colour bar from 0 to ``maximum``; (3,H,W)."""
+    """Per-vertex values (V,) painted on three views, with a colour bar from 0 to ``maximum``; (3,H,W).
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> heat_map(head, head.vertices[:, 2].clamp(min=0), 100.0, "depth (mm)", width=32, height=40).shape[0]
+        3
+    """
     row = face_views(mesh, colors=heat_colors(values, maximum), width=width, height=height)
     return sheet([row, color_bar(maximum, label, row.shape[1])], 2)
 

@@ -21,7 +21,13 @@ _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
 def error_colors(errors: Tensor, maximum: float, colormap: str = GREEN_TO_RED) -> Tensor:
-    """Colours (V,3) of errors (V,), the colour map's ends at 0 and ``maximum``; grey where the error is NaN."""
+    """Colours (V,3) of errors (V,), the colour map's ends at 0 and ``maximum``; grey where the error is NaN.
+
+    Example:
+        >>> colors = error_colors(torch.tensor([0.0, 1.0, torch.nan]), maximum=1.0)
+        >>> bool(colors[0, 1] > colors[0, 0]), bool(colors[1, 0] > colors[1, 1])  # green is good, red is bad
+        (True, True)
+    """
     errors = errors.cpu().float()
     colors = heat_colors(errors.nan_to_num(0.0), maximum, colormap)
     colors[errors.isnan()] = torch.tensor(NOT_COMPARED)
@@ -42,7 +48,14 @@ def round_maximum(value: float) -> float:
 
 
 def error_views(mesh: Mesh, errors: Tensor, maximum: float, title: str, height: int = 400) -> Tensor:
-    """Errors (V,), millimetres, on a mesh from front, three quarters and profile, with the scale beside; (3,H,W)."""
+    """Errors (V,), millimetres, on a mesh from front, three quarters and profile, with the scale beside; (3,H,W).
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> error_views(head, torch.zeros(len(head.vertices)), 1.0, "no error", height=60).shape[0]
+        3
+    """
     row = face_views(mesh, colors=error_colors(errors, maximum), width=height * 4 // 5, height=height)
     return headed(sheet([row, _scale(maximum, row.shape[1])], 2), title)
 
@@ -58,6 +71,12 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
         height: of each image, pixels.
 
     Source: thesis, figures 81 to 94.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> compared_views(head, head, torch.zeros(len(head.vertices)), 1.0, "the same", height=60).shape[0]
+        3
     """
     width = height * 4 // 5
     rows = [

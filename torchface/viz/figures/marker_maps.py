@@ -31,6 +31,13 @@ def marker_map(
     """Errors of markers (M,), millimetres, at their points (M,3) on a mesh, the worst by name; (3,H,W).
 
     Grey is a marker without an error (NaN), for which none was seen.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> points = head.vertices[head.landmarks[:3]]
+        >>> marker_map(head, points, torch.tensor([0.1, 0.2, 0.9]), 1.0, ["a", "b", "c"]).shape[0]
+        3
     """
     colors = heat_colors(errors.nan_to_num(0.0), maximum).numpy()
     colors[errors.isnan().numpy()] = _NOT_KNOWN

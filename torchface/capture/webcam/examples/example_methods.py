@@ -14,7 +14,13 @@ from torchface.capture.webcam.examples.landmark_objectives import LandmarkObject
 
 
 class ExampleMethod(Protocol):
-    """Finds weights in [0,1], and the placement, from the equations of landmarks."""
+    """Finds weights in [0,1], and the placement, from the equations of landmarks.
+
+    Example:
+        >>> ways: list[ExampleMethod] = [AllAtOnce(), Regional()]
+        >>> len(ways)
+        2
+    """
 
     def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns: ...
 

@@ -43,6 +43,15 @@ def eye_transforms(landmarks: Tensor, width: int = CROP_WIDTH, height: int = CRO
 
     Raises:
         ShapeError: not (...,68,2).
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> pixels = rig.vertices[rig.neutral.landmarks][:, :2] * torch.tensor([1.0, -1.0])
+        >>> right = eye_transforms(pixels)[0]
+        >>> inside = pixels[36:42].to(right) @ right[:, :2].T + right[:, 2]
+        >>> bool((inside > 0).all() and (inside < torch.tensor([48.0, 32.0])).all())
+        True
     """
     if landmarks.shape[-2:] != (68, 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected (...,68,2)")

@@ -59,6 +59,14 @@ class EyeNetwork(nn.Module):
         hidden: units between features and what is told of the whole eye.
 
     Source: Newell, Yang, Deng 2016 (encoder and decoder); Sun et al. 2018 (means of heat maps).
+
+    Example:
+        >>> from torchface import zoo
+        >>> network = zoo.get_model("eye_network")
+        >>> with torch.no_grad():
+        ...     found = network(torch.full((2, 3, 32, 48), 0.5))
+        >>> found.landmarks.shape == (2, 6, 2)
+        True
     """
 
     fit: ClassVar[Callable[..., EyeNetwork]]

@@ -39,6 +39,13 @@ class TreeFinder:
 
     Raises:
         ValueRangeError: they find other landmarks than the 68.
+
+    Example:
+        >>> from torchface import zoo
+        >>> blank = torch.full((80, 80), 128, dtype=torch.uint8)
+        >>> found = TreeFinder(zoo.get_model("face_landmarks"))(blank, torch.tensor([10.0, 10.0, 60.0, 60.0]))
+        >>> found.confidence.max().item()  # there is no face, and it is sure of nothing
+        0.0
     """
 
     trees: LandmarkTrees
