@@ -36,7 +36,7 @@ class BakeStatistics:
         median_offset: the same with a sign, positive where the scan lies outside the mesh.
 
     Example:
-        >>> found = BakeStatistics(texels=1000, hit_share=0.9, median_distance=0.1, far_distance=0.4, median_offset=0.05)
+        >>> found = BakeStatistics(1000, hit_share=0.9, median_distance=0.1, far_distance=0.4, median_offset=0.0)
         >>> round(found.texels * found.hit_share)  # texels that the scan covers
         900
     """

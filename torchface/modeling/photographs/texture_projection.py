@@ -75,6 +75,17 @@ def photo_texture(
         AlignmentError: no photograph shows the head.
 
     Source: thesis 3.2.5, algorithm 3; Burt and Adelson 1983 (bands blended apart).
+
+    Example:
+        >>> from torchface.geometry.cameras.pinhole import look_at
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> camera = look_at(head.vertices[head.landmarks].mean(0), 0.0, width=60, height=80)
+        >>> red = torch.tensor([0.8, 0.2, 0.2])[:, None, None].repeat(1, 80, 60)
+        >>> texture = photo_texture(head, [red], [camera], size=64)
+        >>> nose = head.landmarks[30]
+        >>> bool(texture.colors[nose, 0] > 0.7 > texture.colors[nose, 1])
+        True
     """
     if len(images) != len(cameras) or not images:
         raise ShapeError(f"photo_texture: found {len(images)} images and {len(cameras)} cameras, expected one each")
