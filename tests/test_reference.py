@@ -53,7 +53,6 @@ UNSHOWN = {
         "onnx.export_dynamics_prior",
         "onnx.export_wrinkle_weights",
         "onnx.export_video_solver",
-        "onnx.VideoReport",
     ),
 }
 """Names without an example, by why."""
