@@ -15,8 +15,9 @@ from torchface import zoo
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, resampled, windows_of
-from torchface.capture.priors.dynamics_training import cross_validated, fitted_kernel
 from torchface.capture.priors.gaussian_process import GaussianProcesses, Kernel, Statistics, posterior, whitening_of
+from torchface.capture.priors.kernel_training import fitted_kernel
+from torchface.capture.priors.left_out_process import LeftOutProcess
 from torchface.capture.priors.motion_features import motion_basis
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
@@ -102,9 +103,18 @@ def test_hyperparameters_come_back() -> None:
 def test_a_process_that_tells_nothing_is_not_trusted() -> None:
     inputs, noise = [normal(200, 3, seed=i) for i in range(3)], [normal(200, 2, seed=5 + i) for i in range(3)]
     kernel = Kernel(1.0, torch.full((3,), 2.0).double(), 0.1)
-    assert cross_validated(kernel, inputs[0][:50], inputs, noise, 1.0).gain < 0.1
-    told = [torch.sin(2 * part[:, :2]) for part in inputs]
-    assert cross_validated(kernel, inputs[0][:50], inputs, told, 1.0).gain > 0.8
+
+    def gain(targets: list[Tensor]) -> float:
+        process = LeftOutProcess(kernel, inputs[0][:50], 2, 3)
+        for fold, (part, target) in enumerate(zip(inputs, targets, strict=True)):
+            process.learn(fold, part, target)
+        process.settle(1.0)
+        for fold, (part, target) in enumerate(zip(inputs, targets, strict=True)):
+            process.compare(process.predict(fold, part)[0], target)
+        return process.gain
+
+    assert gain(noise) < 0.1
+    assert gain([torch.sin(2 * part[:, :2]) for part in inputs]) > 0.8
 
 
 def test_planted_motion_is_recovered(swinging: DynamicsPrior) -> None:

@@ -1,51 +1,66 @@
-"""Training of the dynamics prior: hyperparameters by gpytorch, the rest in closed form on takes left out in turn."""
+"""Training of the dynamics prior in passes over takes: hyperparameters by gpytorch, the rest in closed form."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torchface.capture.priors.autoregression import Autoregression
 from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
-from torchface.capture.priors.gaussian_process import (
-    GaussianProcesses,
-    Kernel,
-    Posterior,
-    Statistics,
-    posterior,
-    whitening_of,
-)
-from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts, windows_of
+from torchface.capture.priors.gaussian_process import GaussianProcesses
+from torchface.capture.priors.kernel_training import fitted_kernel
+from torchface.capture.priors.left_out_process import LeftOutProcess
+from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts
 from torchface.capture.priors.motion_noise import MotionNoise
+from torchface.capture.priors.running_moments import RunningMoments
+from torchface.capture.priors.seen_frames import MOST_FRAMES, drawn_rows
+from torchface.capture.priors.take_windows import FOLDS, Part, TakeWindows
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.progress import Progress, silent
 
-_FOLDS = 4  # of a single take
-_LEARNING_RATE = 0.1
-_RIDGE = 1e-6  # of the coefficients, in squared weights
-_POOLING = 0.02  # weight of the coefficients that all shapes share against each one's own
 _MIN_SCALE = 1e-3  # a standard deviation below which a shape counts as one that never moves
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """What is left out together: a take, or a quarter of one.
+class _Steps:
+    """What the first pass finds.
 
     Args:
-        windows: (B,J,N), with the noise that the prior should expect.
-        following: (B,N).
+        count: of all windows.
+        center: mean of the frames that follow them, (N,).
+        limits: smallest and largest weight, (2,).
+        coefficients: of the autoregression, (J,N).
+        left_out: the same from all but each fold.
     """
 
-    windows: Tensor
-    following: Tensor
+    count: int
+    center: Tensor
+    limits: Tensor
+    coefficients: Tensor
+    left_out: list[Tensor]
 
-    def steps(self, coefficients: Tensor) -> Tensor:
-        """The step to the next frame less what the shapes' own frames predict, (B,N)."""
-        return self.following - self.windows[:, -1] - (self.windows * coefficients).sum(1)
+
+@dataclass(frozen=True, eq=False)
+class _Scales:
+    """What the second pass finds, and the windows that were drawn.
+
+    Args:
+        feature: standard deviations of place, slope and curvature, (O,N).
+        target: of what the autoregression leaves of a step, (N,).
+        moving: root mean squares of the kinds of motion, (K,N).
+        inputs: of the windows drawn, scaled, (S,O·N).
+        targets: of the same, scaled, (S,N).
+    """
+
+    feature: Tensor
+    target: Tensor
+    moving: Tensor
+    inputs: Tensor
+    targets: Tensor
 
 
 def fit_dynamics_prior(
@@ -62,11 +77,17 @@ def fit_dynamics_prior(
     """Learns from takes, with cross-validation over takes that are left out in turn.
 
     The kernels' hyperparameters maximise the bound of the marginal likelihood (``gpytorch``). The gain of
-    the processes and the noise are those that predict left-out takes best; of a single take its quarters are left out.
+    the processes and the noise are those that predict left-out takes best; of a single take its quarters are left out,
+    of more than a hundred takes a hundredth at a time.
+
+    Takes are read one after the other, in four passes that add up means, normal equations and statistics of the
+    processes: memory is that of a few times the longest take's windows. What cannot be added up is learned from
+    windows that are drawn from all: the hyperparameters from ``settings.subset``, the noise from 40,000 where there
+    are more.
 
     Args:
-        takes: weights of each take, (T,N), all at one frame rate (see ``resampled``); windows with a NaN are left
-            out.
+        takes: weights of each take, (T,N), all at one frame rate (see ``resampled``), a list or what reads them from a
+            disk; windows with a NaN are left out.
         names: of the N shapes.
         window: J, at least 1.
         fps: frames a second of the takes.
@@ -94,64 +115,47 @@ def fit_dynamics_prior(
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
     progress = progress or silent
     _check(takes, names, window, fps, input_noise)
+    everything = TakeWindows(takes, window, input_noise, settings.seed)
     generator = torch.Generator().manual_seed(settings.seed)
-    parts = _parts(takes, window, input_noise, generator)
-    frames = torch.cat([part.following for part in parts])
-    center = frames.mean(0)
-    basis = motion_basis(window)
-    motions = [torch.einsum("bjn,jo->bon", part.windows - center, basis) for part in parts]
-    feature_scale = torch.cat(motions).std(0).clamp(min=_MIN_SCALE)
-    coefficients, left_out = _autoregression(parts)
-    target_scale = torch.cat([part.steps(coefficients) for part in parts]).std(0).clamp(min=_MIN_SCALE)
-    steps = torch.cat([part.steps(coefficients) for part in parts]) / target_scale
-    unseen = [part.steps(own) / target_scale for part, own in zip(parts, left_out, strict=True)]
-    inputs = [(motion / feature_scale).flatten(1) for motion in motions]
-    everything = torch.cat(inputs)
-    order = torch.randperm(len(everything), generator=generator)
-    inducing, some = everything[order[: settings.inducing]], order[: settings.subset]
-    kernels: list[Kernel] = []
-    chosen: list[CrossValidated] = []
+    found = _steps(everything, len(names), generator)
+    drawn = drawn_rows(found.count, max(settings.subset, settings.inducing), generator)
+    scales = _scales(everything, found, drawn)
+    inducing = scales.inputs[: settings.inducing]
+    processes: list[LeftOutProcess] = []
     for number, group in enumerate(regions):
         progress("fitting Gaussian processes", number, len(regions))
-        active = torch.zeros_like(feature_scale)
+        active = torch.zeros_like(scales.feature)
         active[:, list(group)] = 1.0
-        kernels.append(
-            fitted_kernel(everything[some], steps[some][:, list(group)], inducing, active, settings.iterations)
-        )
-        targets = [part[:, list(group)] for part in unseen]
-        chosen.append(
-            cross_validated(kernels[-1], inducing, inputs, targets, max(settings.correlation_time * fps, 1.0))
-        )
+        some, targets = scales.inputs[: settings.subset], scales.targets[: settings.subset, list(group)]
+        kernel = fitted_kernel(some, targets, inducing, active, settings.iterations)
+        processes.append(LeftOutProcess(kernel, inducing, len(group), everything.folds))
+    for part in everything.parts():
+        inputs, targets = _examples(part, found, scales)[1:]
+        for group, process in zip(regions, processes, strict=True):
+            process.learn(part.fold, inputs, targets[:, list(group)])
+    for process in processes:
+        process.settle(max(settings.correlation_time * fps, 1.0))
     progress("fitting the noise")
-    process_mean, process_variance = torch.zeros_like(steps), torch.zeros_like(steps)
+    noise = _noise(everything, found, scales, processes, regions, settings)
     weights = [torch.zeros(len(inducing), len(names), dtype=torch.float64) for _ in regions]
-    for group, one, row in zip(regions, chosen, weights, strict=True):
-        process_mean[:, list(group)], process_variance[:, list(group)] = one.mean, one.variance[:, None]
-        row[:, list(group)] = one.posterior.weights
-    moving = torch.cat([moving_parts(part.windows, motion) for part, motion in zip(parts, motions, strict=True)])
-    noise = MotionNoise.fit(
-        moving,
-        (torch.cat(unseen) - process_mean) * target_scale,
-        process_variance * target_scale.square(),
-        moving.square().mean(0).sqrt().clamp(min=_MIN_SCALE),
-        regions,
-        settings.floor,
-    )
+    for group, process, row in zip(regions, processes, weights, strict=True):
+        row[:, list(group)] = process.posterior.weights
     return (
         DynamicsPrior(
             names,
             window,
             regions,
             GaussianProcesses.stacked(
-                [replace(one.posterior, weights=row) for one, row in zip(chosen, weights, strict=True)], kernels
+                [replace(one.posterior, weights=row) for one, row in zip(processes, weights, strict=True)],
+                [process.kernel for process in processes],
             ),
             noise,
-            center=center,
-            coefficients=coefficients,
-            feature_scale=feature_scale,
-            target_scale=target_scale,
-            gain=torch.tensor([one.gain for one in chosen], dtype=torch.float64),
-            limits=torch.stack([frames.min().clamp(max=0.0), frames.max().clamp(min=1.0)]),
+            center=found.center,
+            coefficients=found.coefficients,
+            feature_scale=scales.feature,
+            target_scale=scales.target,
+            gain=torch.tensor([process.gain for process in processes], dtype=torch.float64),
+            limits=found.limits,
             fps=fps,
             input_noise=input_noise,
         )
@@ -160,149 +164,88 @@ def fit_dynamics_prior(
     )
 
 
-def fitted_kernel(inputs: Tensor, targets: Tensor, inducing: Tensor, active: Tensor, iterations: int) -> Kernel:
-    """Hyperparameters that maximise the bound of the marginal likelihood with inducing points, all targets together.
-
-    One length for places, one for slopes, one for curvatures; by Adam on what gpytorch makes of them so that they stay
-    positive.
-
-    Args:
-        inputs: (B,O·N), scaled.
-        targets: (B,n), scaled.
-        inducing: (M,O·N).
-        active: 1 for inputs that the kernel uses, else 0, (O,N).
-        iterations: of Adam.
-
-    Source: Titsias 2009.
-    """
-    import gpytorch  # takes seconds, and only training needs it
-    from linear_operator.utils.warnings import NumericalWarning
-
-    columns = [active[order].nonzero()[:, 0] + order * active.shape[1] for order in range(len(active))]
-    used = torch.cat(columns)
-    sizes = torch.tensor([len(column) for column in columns]).cumsum(0).tolist()
-    product = None
-    for stop, column in zip(sizes, columns, strict=True):
-        one = gpytorch.kernels.RBFKernel(active_dims=tuple(range(stop - len(column), stop)))
-        one.lengthscale = math.sqrt(len(used))
-        product = one if product is None else product * one
-    scaled = gpytorch.kernels.ScaleKernel(product)
-    scaled.outputscale = 0.3
-    likelihood = gpytorch.likelihoods.GaussianLikelihood()
-    likelihood.noise = 0.7
-    points = gpytorch.kernels.InducingPointKernel(scaled, inducing[:, used].clone(), likelihood).double().train()
-    points.inducing_points.requires_grad_(False)
-    optimizer = torch.optim.Adam(points.parameters(), lr=_LEARNING_RATE)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NumericalWarning)  # of the jitter that inducing points close by need
-        for _ in range(iterations):  # each step needs the one before
-            optimizer.zero_grad()
-            covariance = points(inputs[:, used]).evaluate_kernel().add_diagonal(likelihood.noise.expand(len(inputs)))
-            fit, volume = covariance.inv_quad_logdet(targets, logdet=True)
-            missed = sum(term.loss() for term in points.added_loss_terms())
-            loss = (0.5 * (fit + targets.shape[1] * volume) - targets.shape[1] * missed) / targets.numel()
-            loss.backward()
-            optimizer.step()
-    lengths = [one.lengthscale.item() for one in scaled.base_kernel.modules() if hasattr(one, "raw_lengthscale")]
-    inverse = active / torch.tensor(lengths, dtype=active.dtype)[:, None]
-    return Kernel(scaled.outputscale.item(), inverse.flatten(), likelihood.noise.item())
+def _steps(everything: TakeWindows, shapes: int, generator: torch.Generator) -> _Steps:
+    """The first pass; the generator goes on behind the noise of all windows."""
+    regression = Autoregression(shapes, everything.window, everything.folds)
+    total, limits, count = torch.zeros(shapes, dtype=torch.float64), torch.tensor([0.0, 1.0]).double(), 0
+    for part in everything.parts(generator):
+        regression.add(part)
+        total += part.following.sum(0)
+        count += len(part.following)
+        low, high = part.following.aminmax()
+        limits = torch.stack([torch.minimum(limits[0], low), torch.maximum(limits[1], high)])
+    return _Steps(count, total / count, limits, *regression.coefficients())
 
 
-@dataclass(frozen=True, eq=False)
-class CrossValidated:
-    """A process learned from all parts, and its predictions of each part when learned from the others.
-
-    Args:
-        posterior: of all parts.
-        gain: by what its mean is multiplied, in [0,1].
-        mean: of the parts left out, gain included, (B,n).
-        variance: of the same, without noise, (B,).
-    """
-
-    posterior: Posterior
-    gain: float
-    mean: Tensor
-    variance: Tensor
-
-
-def cross_validated(
-    kernel: Kernel, inducing: Tensor, inputs: Sequence[Tensor], targets: Sequence[Tensor], redundancy: float
-) -> CrossValidated:
-    """Learns a process, and its gain from the predictions of parts left out in turn.
-
-    Args:
-        kernel: of the process.
-        inducing: (M,F).
-        inputs: of each part, (B,F).
-        targets: of each part, under autoregression coefficients learned from the other parts, (B,n).
-        redundancy: number of correlated frames that count as one independent frame.
-    """
-    whitening = whitening_of(kernel, inducing)
-    near = [kernel.between(part, inducing) for part in inputs]
-    features = [part @ whitening for part in near]
-    statistics = [Statistics(f.T @ f, f.T @ t) for f, t in zip(features, targets, strict=True)]
-    means, variances = [], []
-    for i, (k, f) in enumerate(zip(near, features, strict=True)):
-        own = posterior(kernel, inducing, whitening, _summed(statistics[:i] + statistics[i + 1 :]), redundancy)
-        projected = k @ own.covariance_root
-        means.append(projected @ own.weights)
-        variances.append((kernel.signal - f.square().sum(1)).clamp(min=0.0) + projected.square().sum(1))
-    mean, target = torch.cat(means), torch.cat(list(targets))
-    # Errors count relative to those without the process, so that a take with much motion does not dominate.
-    weight = torch.cat([(1 / t.square().sum().clamp(min=_MIN_SCALE)).expand(len(t), 1) for t in targets])
-    gain = float(((weight * mean * target).sum() / (weight * mean.square()).sum().clamp(min=1e-12)).clamp(0, 1))
-    whole = posterior(kernel, inducing, whitening, _summed(statistics), redundancy)
-    return CrossValidated(whole, gain, gain * mean, gain**2 * torch.cat(variances))
+def _scales(everything: TakeWindows, found: _Steps, drawn: Tensor) -> _Scales:
+    """The second pass; of the windows with the numbers drawn, (S,), it keeps inputs and targets."""
+    basis = motion_basis(everything.window)
+    feature, target = RunningMoments(), RunningMoments()
+    squared = torch.zeros(())
+    motions = torch.empty(len(drawn), basis.shape[1], len(found.center), dtype=torch.float64)
+    targets = torch.empty(len(drawn), len(found.center), dtype=torch.float64)
+    for part in everything.parts():
+        motion, steps = _motion(part, found, basis), part.steps(found.coefficients)
+        feature.add(motion)
+        target.add(steps)
+        squared = squared + moving_parts(part.windows, motion).square().sum(0)
+        places, rows = part.rows_of(drawn)
+        motions[places], targets[places] = motion[rows], steps[rows]
+    feature_scale, target_scale = feature.std().clamp(min=_MIN_SCALE), target.std().clamp(min=_MIN_SCALE)
+    return _Scales(
+        feature_scale,
+        target_scale,
+        (squared / found.count).sqrt().clamp(min=_MIN_SCALE),
+        (motions / feature_scale).flatten(1),
+        targets / target_scale,
+    )
 
 
-def _autoregression(parts: Sequence[_Part]) -> tuple[Tensor, list[Tensor]]:
-    """Each shape's step from its own frames, (J,N): by least squares from all parts, and from all but each.
-
-    A window at rest must stay at rest whatever the weights there, so the step is a linear function of the steps before:
-    a shape that the takes never raised must not be drawn back to 0. The coefficients are pooled: each shape's are drawn
-    toward those that fit all shapes.
-    """
-    squares, products = [], []
-    for part in parts:
-        before = part.windows.diff(dim=1)
-        squares.append(torch.einsum("bin,bjn->nij", before, before))
-        products.append(torch.einsum("bin,bn->ni", before, part.following - part.windows[:, -1]))
-    square, product = torch.stack(squares).sum(0), torch.stack(products).sum(0)
-    solved = [
-        _from_steps(square - a, product - b)
-        for a, b in [(torch.zeros_like(square), torch.zeros_like(product)), *zip(squares, products, strict=True)]
-    ]
-    return solved[0], solved[1:]
+def _motion(part: Part, found: _Steps, basis: Tensor) -> Tensor:
+    return torch.einsum("bjn,jo->bon", part.windows - found.center, basis)
 
 
-def _from_steps(square: Tensor, product: Tensor) -> Tensor:
-    """Coefficients (J,N) of frames, of normal equations (N,J-1,J-1), (N,J-1) of the steps between them."""
-    count, steps = product.shape
-    ridge = _RIDGE * torch.eye(steps, dtype=torch.float64)
-    pooled = square.mean(0) + ridge
-    common = torch.linalg.solve(pooled, product.mean(0))
-    own = torch.linalg.solve(square + _POOLING * pooled, product + _POOLING * (pooled @ common))
-    zero = torch.zeros(count, 1, dtype=torch.float64)
-    padded = torch.cat([zero, own, zero], dim=1)
-    return (padded[:, :-1] - padded[:, 1:]).T
+def _examples(part: Part, found: _Steps, scales: _Scales) -> tuple[Tensor, Tensor, Tensor]:
+    """Motion (B,O,N) of a part, and what processes learn from: inputs (B,O·N), targets of the fold left out (B,N)."""
+    motion = _motion(part, found, motion_basis(part.windows.shape[1]))
+    targets = part.steps(found.left_out[part.fold]) / scales.target
+    return motion, (motion / scales.feature).flatten(1), targets
 
 
-def _parts(takes: Sequence[Tensor], window: int, input_noise: float, generator: torch.Generator) -> list[_Part]:
-    """Windows of each take; of a single take those of its quarters."""
-    pairs = [windows_of(take.detach().double().cpu(), window) for take in takes]
-    if len(pairs) == 1:
-        pairs = list(zip(*(part.chunk(_FOLDS) for part in pairs[0]), strict=True))
-    return [
-        _Part(windows + input_noise * torch.randn(windows.shape, generator=generator, dtype=torch.float64), following)
-        for windows, following in pairs
-    ]
-
-
-def _summed(statistics: Sequence[Statistics]) -> Statistics:
-    total = statistics[0]
-    for one in statistics[1:]:
-        total = total + one
-    return total
+def _noise(
+    everything: TakeWindows,
+    found: _Steps,
+    scales: _Scales,
+    processes: Sequence[LeftOutProcess],
+    regions: tuple[tuple[int, ...], ...],
+    settings: DynamicsSettings,
+) -> MotionNoise:
+    """The last pass: each fold is predicted from the others, and the noise learned from the errors."""
+    kept = drawn_rows(found.count, MOST_FRAMES, torch.Generator().manual_seed(settings.seed)).sort().values
+    shapes = len(found.center)
+    moving = torch.empty(len(kept), *scales.moving.shape, dtype=torch.float64)
+    targets, mean, variance = torch.empty(3, len(kept), shapes, dtype=torch.float64)
+    for part in everything.parts():
+        motion, inputs, own = _examples(part, found, scales)
+        places, rows = part.rows_of(kept)
+        moving[places], targets[places] = moving_parts(part.windows, motion)[rows], own[rows]
+        for group, process in zip(regions, processes, strict=True):
+            columns = torch.tensor(group)
+            predicted, uncertain = process.predict(part.fold, inputs)
+            process.compare(predicted, own[:, columns])
+            mean[places[:, None], columns] = predicted[rows]
+            variance[places[:, None], columns] = uncertain[rows, None].expand(-1, len(group))
+    gain = torch.zeros(shapes, dtype=torch.float64)
+    for group, process in zip(regions, processes, strict=True):
+        gain[list(group)] = process.gain
+    return MotionNoise.fit(
+        moving,
+        (targets - gain * mean) * scales.target,
+        gain.square() * variance * scales.target.square(),
+        scales.moving,
+        regions,
+        settings.floor,
+    )
 
 
 def _check(takes: Sequence[Tensor], names: tuple[str, ...], window: int, fps: float, input_noise: float) -> None:
@@ -315,8 +258,8 @@ def _check(takes: Sequence[Tensor], names: tuple[str, ...], window: int, fps: fl
             f"dynamics prior: found a window of {window} frames at {fps} a second and an input noise of {input_noise}, "
             "expected at least one frame, a positive rate and a standard deviation that is not negative"
         )
-    if len(takes) == 1 and len(takes[0]) < 2 * _FOLDS + window:
+    if len(takes) == 1 and len(takes[0]) < 2 * FOLDS + window:
         raise ShapeError(
-            f"dynamics prior: found one take of {len(takes[0])} frames, expected at least {2 * _FOLDS + window} "
+            f"dynamics prior: found one take of {len(takes[0])} frames, expected at least {2 * FOLDS + window} "
             f"for a window of {window}"
         )

@@ -14,8 +14,9 @@ from torchface.capture.energy import Quadratic
 from torchface.capture.priors.gaussian_mixture import GaussianMixture
 from torchface.capture.priors.learned_names import name_matrices, require_same_names
 from torchface.capture.priors.parzen_window import ParzenDensity
+from torchface.capture.priors.seen_frames import SeenFrames
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity
-from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, ShapeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
@@ -111,9 +112,10 @@ class ShapePrior(nn.Module):
 
         Of the densities that were compared by the error of solves of left-out takes it is the best: it keeps the
         correlation of shapes, does not draw toward the mean of its takes, and draws less on expressions beyond them.
+        Takes are read one after the other, a few dozen times; memory is that of the longest.
 
         Args:
-            takes: weights of each take, (T,N); frames with a NaN are left out.
+            takes: weights of each take, (T,N), a list or what reads them from a disk; frames with a NaN are left out.
             names: of the N shapes.
             groups: all shapes together if absent: brows and mouth are correlated in real takes.
 
@@ -121,9 +123,10 @@ class ShapePrior(nn.Module):
             ShapeError: no takes, or of another number of shapes.
             ValueRangeError: fewer than two frames with all weights.
         """
-        together = torch.cat(_seen_frames(takes, names))
+        SeenFrames(takes, len(names)).count()
         groups = (tuple(range(len(names))),) if groups is None else groups
-        return cls(names, groups, [StudentDensity.fit(together[:, list(group)]) for group in groups], STRENGTH)
+        seen = [SeenFrames(takes, len(names), tuple(group)) for group in groups]
+        return cls(names, groups, [StudentDensity.fit_parts(frames) for frames in seen], STRENGTH)
 
     def log_density(self, weights: Tensor) -> Tensor:
         """:math:`\\sum_g \\log p_g` of weights (B,N), (B,)."""
@@ -284,11 +287,13 @@ class ReciprocalPrior(ShapePrior):
     ) -> ReciprocalPrior:
         """Learns a Parzen window a group, over centres binned by mean shift with its automatic bandwidth.
 
-        Args, Raises: as ``ShapePrior.fit``.
+        Mean shift needs all frames at once: of more than 40,000, so many are drawn.
+
+        Args, Raises: as ``ShapePrior.fit``; seed: of the draws.
 
         Source: thesis 4.2.8.
         """
-        together = torch.cat(_seen_frames(takes, names))
+        together = SeenFrames(takes, len(names)).some(seed=seed)
         groups = face_halves(names) if groups is None else groups
         return cls(names, groups, [ParzenDensity.fit(together[:, list(group)], seed=seed) for group in groups])
 
@@ -310,19 +315,6 @@ class ReciprocalPrior(ShapePrior):
         made = ShapePrior.from_config(config)
         densities: list[Any] = list(made.densities)
         return cls(made.names, made.groups, densities, made.strength, float(config.get("guard", 1e-2)))
-
-
-def _seen_frames(takes: Sequence[Tensor], names: Sequence[str]) -> list[Tensor]:
-    """Each take's frames in which every weight is known, float64."""
-    wrong = [tuple(take.shape) for take in takes if take.ndim != 2 or take.shape[1] != len(names)]
-    if not takes or wrong:
-        found = f"takes of {wrong[0]}" if wrong else "no takes"
-        raise ShapeError(f"prior: found {found}, expected (T,{len(names)}) each")
-    seen = [take.detach().double()[torch.isfinite(take).all(1)] for take in takes]
-    seen = [take for take in seen if len(take) > 1]
-    if not seen:
-        raise ValueRangeError("prior: found no two frames with all weights, expected takes to learn from")
-    return seen
 
 
 def _checked_strength(strength: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -66,23 +66,47 @@ class StudentDensity(nn.Module):
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (T,D) with at least two")
         if not torch.isfinite(samples).all():
             raise ValueRangeError("samples: found NaN or infinity, expected weights")
+        return cls.fit_parts((samples,), degrees_of_freedom, floor)
+
+    @classmethod
+    def fit_parts(
+        cls, parts: Iterable[Tensor], degrees_of_freedom: float = 10.0, floor: float = PARTING_VARIANCE
+    ) -> StudentDensity:
+        r"""What :meth:`fit` learns, of samples that come in parts: memory is that of the largest.
+
+        Args:
+            parts: finite weights (T,D); gone through anew for every iteration, at most fifty times.
+            degrees_of_freedom: :math:`\nu`.
+            floor: added to each variance.
+
+        Raises:
+            ShapeError: there are no parts.
+            ValueRangeError: settings that are not positive.
+        """
         if not 0 < degrees_of_freedom < math.inf or not 0 < floor < math.inf:
             raise ValueRangeError(
                 f"Student density: found {degrees_of_freedom} degrees of freedom and floor {floor}, "
                 "expected positive numbers"
             )
-        x = samples.detach().double()
-        count, dimensions = x.shape
-        sample_weights = torch.ones(count, dtype=torch.float64, device=x.device)
-        precision = torch.eye(dimensions, dtype=torch.float64, device=x.device)
+        before: Tensor | None = None
+        precision: Tensor | None = None
         for _ in range(_ITERATIONS):  # each iteration needs the weights of the one before
-            covariance = (sample_weights[:, None] * x).T @ x / count
-            covariance.diagonal().add_(floor)
-            precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
-            distance = ((x @ precision) * x).sum(1)
-            before, sample_weights = sample_weights, (degrees_of_freedom + dimensions) / (degrees_of_freedom + distance)
-            if float((sample_weights - before).abs().max()) < 1e-4:
+            scatter, count, moved = torch.zeros(()), 0, 0.0
+            for part in parts:
+                x = part.detach().double()
+                weight = _sample_weights(x, precision, degrees_of_freedom)
+                if precision is not None:
+                    moved = max(moved, float((weight - _sample_weights(x, before, degrees_of_freedom)).abs().max()))
+                scatter = scatter.to(x) + (weight[:, None] * x).T @ x
+                count += len(x)
+            if not count:
+                raise ShapeError("samples: found none, expected parts (T,D)")
+            if precision is not None and moved < 1e-4:
                 break
+            covariance = scatter / count
+            covariance.diagonal().add_(floor)
+            before, precision = precision, torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+        assert precision is not None
         return cls(torch.linalg.cholesky(precision), degrees_of_freedom)
 
     def log_density(self, samples: Tensor) -> Tensor:
@@ -138,3 +162,10 @@ class StudentDensity(nn.Module):
         if dimensions > 2**14:
             raise FileFormatError(f"Student density: found {dimensions} dimensions, expected at most {2**14}")
         return cls(torch.zeros(dimensions, dimensions), 1.0)
+
+
+def _sample_weights(x: Tensor, precision: Tensor | None, degrees_of_freedom: float) -> Tensor:
+    """How much each sample of (T,D) counts under a precision (D,D), (T,); all 1 before there is one."""
+    if precision is None:
+        return torch.ones(len(x), dtype=x.dtype, device=x.device)
+    return (degrees_of_freedom + x.shape[1]) / (degrees_of_freedom + ((x @ precision) * x).sum(1))
