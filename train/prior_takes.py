@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,11 +12,14 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, load_take
 from torchface.capture.priors import resampled
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.content_keys import content_key
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
+from train.kept_takes import KeptTake, TakeStore, TakesRead
 
+_METHOD = "takes of priors/1"
 _SUFFIXES = (".csv", ".c3d", ".trc")
 _SAME_RATE = 1e-3  # relative; 59.94 and 60 frames a second are not the same, rounding is
 
@@ -28,35 +31,47 @@ class PriorTakes:
     Args:
         names: of the N shapes.
         fps: frames a second.
-        weights: of each take, (T,N), clipped to [0,1].
+        weights: of each take, (T,N), clipped to [0,1]; read from disk as they are asked for.
         labels: what each take is called.
+        frames: T of each take.
         solved: how many of them were solved from markers.
     """
 
     names: tuple[str, ...]
     fps: float
-    weights: list[Tensor]
-    labels: list[str]
+    weights: Sequence[Tensor]
+    labels: Sequence[str]
+    frames: Sequence[int]
     solved: int = 0
 
     def some(self, rows: Sequence[int]) -> PriorTakes:
-        """Some of the takes."""
-        return PriorTakes(
-            self.names, self.fps, [self.weights[row] for row in rows], [self.labels[row] for row in rows], self.solved
+        """Some of the takes; none is read."""
+        return replace(
+            self,
+            weights=TakesRead(self.weights, tuple(rows)),
+            labels=[self.labels[row] for row in rows],
+            frames=[self.frames[row] for row in rows],
         )
+
+    def spread(self, most: int) -> PriorTakes:
+        """At most so many of the takes, evenly spread."""
+        count = len(self.weights)
+        return self if count <= most else self.some([row * count // most for row in range(most)])
 
 
 def read_takes(
     folder: Path,
+    work: Path,
     fps: float | None = None,
     rig: BlendshapeRig | None = None,
     attachment: Attachment | None = None,
     progress: Progress | None = None,
 ) -> PriorTakes:
-    """All takes of a folder, by name.
+    """All takes of a folder, by name; one is in memory at a time.
 
     Args:
         folder: with .csv, .c3d and .trc files.
+        work: folder that keeps their weights, a file a take; those of an earlier run are taken up.
         fps: frame rate to bring all takes to; that of the first if absent.
         rig: of the performer of marker takes.
         attachment: where the markers sit on the rig.
@@ -73,59 +88,84 @@ def read_takes(
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
     if not paths:
         raise FileFormatError(f"{folder}: found no take, expected files ending in {', '.join(_SUFFIXES)}")
-    names: tuple[str, ...] | None = None
-    weights: list[Tensor] = []
-    solved = 0
-    for path in paths:
-        progress(f"reading {path.name}")
-        take = load_take(path)
-        if take.weights is None and take.markers is not None:
-            if rig is None or attachment is None:
-                raise NameMismatchError(
-                    f"{path}: found markers, expected weights, or the rig and the attachment that solve them"
-                )
-            progress(f"solving {path.name}")
-            take = solve_markers(rig, attachment, take, SolveSettings(align=True)).take
-            solved += 1
-        if take.weights is None:
-            raise ValueRangeError(f"{path}: found neither weights nor markers, expected one of them")
-        values = take.weights.values[..., 0].double()
-        bad = (~torch.isfinite(values)).any(1).nonzero()[:, 0]
-        if len(bad):
-            raise ValueRangeError(
-                f"{path}: found NaN or infinity in {len(bad)} of {len(values)} frames (the first is {int(bad[0])}), "
-                "expected weights in all"
+    solver = content_key(_METHOD, rig=_content(rig), attachment=attachment)
+    store = TakeStore(work, len(paths))
+    first: KeptTake | None = None
+    for number, path in enumerate(paths):
+        progress(f"reading {path.name}", number + 1, len(paths))
+        key = content_key(_METHOD, file=path, fps=fps, solver=solver)
+        take = store.kept(key, lambda path=path, rate=fps: _read(path, rate, rig, attachment, progress))  # type: ignore[misc]
+        if first is None:
+            first, fps = take, take.fps
+        _check_names(first.names, take.names, paths[0], path)
+    assert first is not None
+    return _stored(store, first, [path.stem for path in paths])
+
+
+def _read(
+    path: Path, fps: float | None, rig: BlendshapeRig | None, attachment: Attachment | None, progress: Progress
+) -> KeptTake:
+    """The weights of a file, clipped, at a frame rate."""
+    take, solved = load_take(path), False
+    if take.weights is None and take.markers is not None:
+        if rig is None or attachment is None:
+            raise NameMismatchError(
+                f"{path}: found markers, expected weights, or the rig and the attachment that solve them"
             )
-        if names is None:
-            names, fps = take.weights.names, take.fps if fps is None else fps
-        _check_names(names, take.weights.names, paths[0], path)
-        assert fps is not None
-        if abs(take.fps - fps) > _SAME_RATE * fps:
-            values = resampled(values, take.fps, fps)
-        weights.append(values.clamp(0.0, 1.0))
-    assert names is not None
-    assert fps is not None
-    return PriorTakes(names, fps, weights, [path.stem for path in paths], solved)
+        progress(f"solving {path.name}")
+        take, solved = solve_markers(rig, attachment, take, SolveSettings(align=True)).take, True
+    if take.weights is None:
+        raise ValueRangeError(f"{path}: found neither weights nor markers, expected one of them")
+    values = take.weights.values[..., 0].double()
+    bad = (~torch.isfinite(values)).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise ValueRangeError(
+            f"{path}: found NaN or infinity in {len(bad)} of {len(values)} frames (the first is {int(bad[0])}), "
+            "expected weights in all"
+        )
+    fps = take.fps if fps is None else fps
+    if abs(take.fps - fps) > _SAME_RATE * fps:
+        values = resampled(values, take.fps, fps)
+    return KeptTake(take.weights.names, fps, values.clamp(0.0, 1.0), solved)
 
 
-def synthetic_takes(count: int, frames: int, seed: int, fps: float | None = None) -> PriorTakes:
-    """Takes of the embedded performer; each draws from a seed of its own."""
-    rate = 60.0 if fps is None else fps
-    takes = [perform(frames, torch.Generator().manual_seed(seed + number), rate) for number in range(count)]
-    tracks = [take.weights for take in takes if take.weights is not None]
-    return PriorTakes(
-        tracks[0].names,
-        rate,
-        [track.values[..., 0].double() for track in tracks],
-        [f"made up {i}" for i in range(count)],
-    )
+def synthetic_takes(
+    count: int, frames: int, seed: int, work: Path, fps: float | None = None, progress: Progress | None = None
+) -> PriorTakes:
+    """Takes of the embedded performer, kept in a folder as by :func:`read_takes`; each draws from a seed of its own."""
+    progress, rate = progress or silent, 60.0 if fps is None else fps
+    store = TakeStore(work, count)
+
+    def made(number: int) -> KeptTake:
+        track = perform(frames, torch.Generator().manual_seed(seed + number), rate).weights
+        assert track is not None
+        return KeptTake(track.names, rate, track.values[..., 0], False)
+
+    first: KeptTake | None = None
+    for number in range(count):
+        key = content_key(_METHOD, frames=frames, seed=seed + number, fps=rate)
+        take = store.kept(key, lambda number=number: made(number))  # type: ignore[misc]
+        first = take if first is None else first
+        progress("making takes up", number + 1, count)
+    assert first is not None
+    return _stored(store, first, [f"made up {i}" for i in range(count)])
+
+
+def _stored(store: TakeStore, first: KeptTake, labels: Sequence[str]) -> PriorTakes:
+    found = store.takes()
+    return PriorTakes(first.names, first.fps, found, labels, found.frames, store.solved)
+
+
+def _content(rig: BlendshapeRig | None) -> object:
+    """What solved weights depend on."""
+    return None if rig is None else [list(rig.names), rig.vertices, rig.deltas]
 
 
 def renamed(takes: PriorTakes, names: Sequence[str]) -> tuple[PriorTakes, tuple[str, ...]]:
     """The takes in a rig's shapes: whole shapes drive both halves of split ones, halves give wholes their mean.
 
     Returns:
-        The takes, and the shapes that they say nothing of, which stay at 0.
+        The takes, each renamed as it is read, and the shapes that they say nothing of, which stay at 0.
 
     Raises:
         NameMismatchError: the takes have none of the shapes.
@@ -137,8 +177,8 @@ def renamed(takes: PriorTakes, names: Sequence[str]) -> tuple[PriorTakes, tuple[
             f"names: found {', '.join(names[:3])}, ..., none of which the takes have; expected names such as "
             f"{', '.join(takes.names[:3])}"
         )
-    weights = [(take @ matrix.T).clamp(0.0, 1.0) for take in takes.weights]
-    return PriorTakes(tuple(names), takes.fps, weights, takes.labels, takes.solved), silent
+    weights = TakesRead(takes.weights, tuple(range(len(takes.weights))), lambda take: (take @ matrix.T).clamp(0.0, 1.0))
+    return replace(takes, names=tuple(names), weights=weights), silent
 
 
 def split(takes: PriorTakes, held_out: int | None) -> tuple[PriorTakes, PriorTakes]:

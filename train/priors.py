@@ -7,12 +7,13 @@ instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's o
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import torch
+from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, load_rig, zoo
 from torchface.capture.priors import (
@@ -25,7 +26,9 @@ from torchface.capture.priors import (
     automatic_bandwidth,
     face_halves,
 )
+from torchface.capture.priors.seen_frames import MOST_FRAMES, SeenFrames
 from torchface.errors import ValueRangeError
+from torchface.files.whole_files import make_folder
 from torchface.progress import Progress, silent
 from torchface.synthetic import performer
 from train.prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
@@ -37,6 +40,7 @@ Kind = Literal["shape", "reciprocal", "dynamics", "both"]
 _WINDOWS = (2, 3, 4, 6, 8)
 _STRENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 _BANDWIDTHS = (0.5, 1.0, 2.0)  # times the automatic one
+_TRIED = 20  # takes: of more that are held out, so many are solved and predicted for the card
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,10 @@ def train(settings: Settings, progress: Progress | None = None) -> dict[str, dic
             shapes; marker takes without rig and attachment.
     """
     progress = progress or silent
-    material = _material(settings, progress)
+    work = settings.out.parent / f".{settings.out.name}.training"
+    _check_one_source(settings)
+    make_folder(work)
+    material = _material(settings, work, progress)
     both = settings.kind == "both"
     measured = {}
     if settings.kind != "dynamics":
@@ -130,6 +137,7 @@ def train(settings: Settings, progress: Progress | None = None) -> dict[str, dic
     if settings.kind in ("dynamics", "both"):
         out = settings.out.with_name(f"{settings.out.name}_dynamics") if both else settings.out
         measured[out.name] = _dynamics(settings, out, material, progress)
+    shutil.rmtree(work, ignore_errors=True)
     return measured
 
 
@@ -156,27 +164,28 @@ def _shape(settings: Settings, out: Path, material: Material, progress: Progress
         points["none"] = [(_STRENGTHS[0], without), (_STRENGTHS[-1], without)]
         for factor, own in widths.items():
             prior = _fitted(settings.kind, fitting, own, settings.seed)
-            tried = _STRENGTHS if settings.strength is None else (settings.strength,)
+            strengths = _STRENGTHS if settings.strength is None else (settings.strength,)
             label = f"{factor:g} times the automatic bandwidth" if own else "this prior"
-            points[label] = [(s, solve_error(trial, with_strength(prior, s), noise)) for s in tried]
+            points[label] = [(s, solve_error(trial, with_strength(prior, s), noise)) for s in strengths]
             best = min(points[label], key=lambda point: point[1])
             if best[1] < least:
                 least, chosen, strength = best[1], factor, best[0]
     progress("fitting the shape prior")
     prior = with_strength(_fitted(settings.kind, learn, widths[chosen], settings.seed), strength)
     metrics = {"strength": strength, **_densities(prior)}
-    together = torch.cat(test.weights)
     if settings.kind != "reciprocal":
-        metrics["held out, log density a frame"] = float(prior.double().log_density(together).mean())
+        metrics["held out, log density a frame"] = _mean_log_density(prior.double(), test)
         single = ShapePrior(names, prior.groups, [_gaussian(learn, group) for group in prior.groups])
-        metrics["held out, log density of one Gaussian"] = float(single.log_density(together).mean())
-    tested = synthetic_video(material.rig, names, test.weights, noise, count, settings.seed + 1)
+        metrics["held out, log density of one Gaussian"] = _mean_log_density(single, test)
+    tried = test.spread(_TRIED)
+    tested = synthetic_video(material.rig, names, tried.weights, noise, count, settings.seed + 1)
     if tested is not None:
         metrics |= {
             "held out, error of a weight without a prior": solve_error(tested, None, noise),
             "held out, error of a weight": solve_error(tested, prior, noise),
         }
     prior = prior.float()
+    limits = _limits(settings, material, "The Parzen window" if settings.kind == "reciprocal" else "")
     card = (
         "The density of a face's weights: "
         + (
@@ -185,7 +194,7 @@ def _shape(settings: Settings, out: Path, material: Material, progress: Progress
             else "the paper's 1/P over a Parzen window for each half of the face"
         )
         + ". Holds a solve from few points, such as 68 landmarks of one camera, to faces like those it has learned "
-        f"from. {_limits(settings, material)} The strength was chosen by solves of a take that was left out, from 68 "
+        f"from. {limits} The strength was chosen by solves of a take that was left out, from 68 "
         f"landmarks of one camera with {settings.pixel_noise:g} pixel of noise, the head's pose unknown; 1 is Bayes' "
         "rule. The test takes took no part in that."
     )
@@ -211,7 +220,7 @@ def _dynamics(settings: Settings, out: Path, material: Material, progress: Progr
     tried: dict[str, list[tuple[float, float]]] = {"negative log likelihood a weight": [], "one-step error": []}
     if window is None:
         fitting, choosing = _for_choice(learn)
-        shortest = min(len(take) for take in (*fitting.weights, *choosing.weights))
+        shortest = min(*fitting.frames, *choosing.frames)
         for candidate in _WINDOWS:
             if shortest <= candidate + 8:
                 continue
@@ -227,16 +236,16 @@ def _dynamics(settings: Settings, out: Path, material: Material, progress: Progr
         window = int(min(scores, key=lambda point: point[1])[0])
     progress(f"fitting the dynamics prior with a window of {window} frames")
     prior = fitted(learn, window)
-    trial = one_step(prior, test.weights, settings.input_noise)
+    trial = one_step(prior, test.spread(_TRIED).weights, settings.input_noise)
     metrics = {"window": float(window)} | {f"held out, {key}": value for key, value in trial.metrics().items()}
     card = (
         f"Mean and variance of the next frame's weights from the last {window} frames at "
         f"{learn.fps:g} frames a second: Gaussian processes, one for each region of the face, and a noise that grows "
         "with the motion. Holds a solve to how faces move and bridges frames without landmarks. "
-        f"{_limits(settings, material)} Windows carried noise of {settings.input_noise:g} a weight, in learning and in "
-        "the test, as solved weights do. Errors are root mean squares in weights; the log likelihood leaves out its "
-        "constant. The window was chosen on a take that was left out; the test takes took no part in that. A video of "
-        "another frame rate needs a prior of that rate (--fps)."
+        f"{_limits(settings, material, 'The noise')} Windows carried noise of {settings.input_noise:g} a weight, in "
+        "learning and in the test, as solved weights do. Errors are root mean squares in weights; the log likelihood "
+        "leaves out its constant. The window was chosen on a take that was left out; the test takes took no part in "
+        "that. A video of another frame rate needs a prior of that rate (--fps)."
     )
     _save(prior, out, settings, material, metrics, card)
     folder = settings.pictures or out / "pictures"
@@ -248,19 +257,24 @@ def _dynamics(settings: Settings, out: Path, material: Material, progress: Progr
     return metrics
 
 
-def _material(settings: Settings, progress: Progress) -> Material:
-    """The takes under the names that the priors are for; what cannot work is refused before anything is learned."""
+def _check_one_source(settings: Settings) -> None:
     if (settings.takes is None) == (settings.performances <= 0):
         raise ValueRangeError(
             f"found takes={settings.takes} and performances={settings.performances}; expected a folder of takes, or a "
             "number of performances"
         )
+
+
+def _material(settings: Settings, work: Path, progress: Progress) -> Material:
+    """The takes, on disk, under the names that the priors are for; what cannot work is refused before learning."""
     rig = None if settings.rig is None else load_rig(settings.rig, part=settings.part)
     if settings.takes is None:
-        takes = synthetic_takes(settings.performances, settings.frames, settings.seed, settings.fps)
+        takes = synthetic_takes(
+            settings.performances, settings.frames, settings.seed, work, settings.fps, progress
+        )
     else:
         attachment = None if settings.attachment is None else Attachment.load(settings.attachment)
-        takes = read_takes(settings.takes, settings.fps, rig, attachment, progress)
+        takes = read_takes(settings.takes, work, settings.fps, rig, attachment, progress)
     names: Sequence[str] = settings.names or (takes.names if rig is None else rig.names)
     if rig is None:
         rig = performer(texture=False)
@@ -270,8 +284,8 @@ def _material(settings: Settings, progress: Progress) -> Material:
     if silent:
         progress(f"the takes say nothing of {', '.join(silent)}; these stay at 0")
     learn, test = split(takes, settings.held_out)
-    progress(f"{sum(map(len, learn.weights))} frames of {len(learn.weights)} takes to learn from, "
-        f"{sum(map(len, test.weights))} of {len(test.weights)} to test on")  # fmt: skip
+    progress(f"{sum(learn.frames)} frames of {len(learn.weights)} takes to learn from, "
+        f"{sum(test.frames)} of {len(test.weights)} to test on")  # fmt: skip
     return Material(learn, test, rig, silent)
 
 
@@ -280,13 +294,13 @@ def _for_choice(learn: PriorTakes) -> tuple[PriorTakes, PriorTakes]:
     if len(learn.weights) > 1:
         return split(learn, 1)
     first, last = learn.weights[0].tensor_split([3 * len(learn.weights[0]) // 4])
-    return replace(learn, weights=[first]), replace(learn, weights=[last])
+    return replace(learn, weights=[first], frames=[len(first)]), replace(learn, weights=[last], frames=[len(last)])
 
 
 def _fitted(kind: Kind, takes: PriorTakes, widths: Sequence[float], seed: int) -> ShapePrior:
     if kind != "reciprocal":
         return ShapePrior.fit(takes.weights, takes.names)
-    together = torch.cat(takes.weights)
+    together = _some(takes, seed)
     groups = face_halves(takes.names)
     densities = [
         ParzenDensity.fit(together[:, list(group)], width, seed) for group, width in zip(groups, widths, strict=True)
@@ -295,12 +309,22 @@ def _fitted(kind: Kind, takes: PriorTakes, widths: Sequence[float], seed: int) -
 
 
 def _automatic(takes: PriorTakes, seed: int) -> list[float]:
-    together = torch.cat(takes.weights)
+    together = _some(takes, seed)
     return [automatic_bandwidth(together[:, list(group)], seed=seed) for group in face_halves(takes.names)]
 
 
+def _some(takes: PriorTakes, seed: int) -> Tensor:
+    """The frames that a Parzen window is made of, (F,N): all, or of very many some that are drawn."""
+    return SeenFrames(takes.weights, len(takes.names)).some(seed=seed)
+
+
 def _gaussian(takes: PriorTakes, group: Sequence[int]) -> GaussianMixture:
-    return GaussianMixture.fit(torch.cat(takes.weights)[:, list(group)], 1).double()
+    return GaussianMixture.single(SeenFrames(takes.weights, len(takes.names), tuple(group))).double()
+
+
+def _mean_log_density(prior: ShapePrior, takes: PriorTakes) -> float:
+    total = sum(float(prior.log_density(take).sum()) for take in takes.weights)
+    return total / sum(takes.frames)
 
 
 def _densities(prior: ShapePrior) -> dict[str, float]:
@@ -314,9 +338,13 @@ def _densities(prior: ShapePrior) -> dict[str, float]:
     return found
 
 
-def _limits(settings: Settings, material: Material) -> str:
-    """What the card says about whom the takes show."""
+def _limits(settings: Settings, material: Material, at_once: str = "") -> str:
+    """What the card says about whom the takes show, and what was learned from some of the frames alone."""
     silent = f" The takes say nothing of {', '.join(material.silent)}: these stay at 0." if material.silent else ""
+    if at_once and sum(material.learn.frames) > MOST_FRAMES:
+        silent += f" {at_once} was learned from {MOST_FRAMES:,} frames drawn from all, which it needs at once."
+    if len(material.test.weights) > _TRIED:
+        silent += f" Solves and predictions are of {_TRIED} of the test takes, evenly spread."
     if settings.takes is None:
         return (
             "It has learned from synthetic takes only: twelve gestures with smooth ramps, blinks, glances and "
@@ -343,7 +371,7 @@ def _save(
     kind = settings.kind if settings.kind != "both" else "dynamics" if isinstance(prior, DynamicsPrior) else "shape"
     effective["kind"] = kind
     learn, test = material.learn, material.test
-    frames = sum(map(len, learn.weights))
+    frames = sum(learn.frames)
     if settings.takes is None:
         source = f"{len(learn.weights)} synthetic takes of the embedded performer, {frames} frames; no person's."
         flags = f"--performances {settings.performances} --frames {settings.frames}"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchface import BlendshapeRig, Take, save_take, zoo
-from torchface.capture import DynamicsPrior, ShapePrior
+from torchface import BlendshapeRig, Take, load_take, save_take, zoo
+from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import ReciprocalPrior
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.shape_names import mapping
@@ -17,6 +18,7 @@ from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.take import Track
+from train import prior_takes
 from train.prior_takes import read_takes, renamed, split, synthetic_takes
 from train.priors import Settings, train
 
@@ -91,11 +93,11 @@ def test_the_papers_form_with_a_bandwidth(folder: Path, tmp_path: Path) -> None:
     assert found["bandwidth, lower"] == pytest.approx(0.4)
 
 
-def test_names_of_another_rig(folder: Path) -> None:
-    takes, silent = renamed(read_takes(folder), ICT_LIKE)
+def test_names_of_another_rig(folder: Path, tmp_path: Path) -> None:
+    takes, silent = renamed(read_takes(folder, tmp_path), ICT_LIKE)
     assert takes.names == ICT_LIKE
     assert silent == ("cheekRaiser_L",)
-    own = read_takes(folder)
+    own = read_takes(folder, tmp_path)
     brow = own.weights[0][:, [name.lower() for name in own.names].index("browinnerup")]
     for column in (0, 1):
         torch.testing.assert_close(takes.weights[0][:, column], brow)
@@ -110,14 +112,14 @@ def test_marker_takes_are_solved(tmp_path: Path) -> None:
     truth = shapes(take, rig)
     markers = attachment.on(rig.neutral.faces, rig(truth))
     save_take(Take(60.0, markers=Track(attachment.labels or (), markers)), tmp_path / "take.csv")
-    found = read_takes(tmp_path, rig=rig, attachment=attachment)
+    found = read_takes(tmp_path, tmp_path / "work", rig=rig, attachment=attachment)
     assert found.solved == 1
     assert found.names == rig.names
     seen = [name for name in rig.names if not name.startswith("eyeLook")]
     rows = [rig.names.index(name) for name in seen]
     assert float((found.weights[0][:, rows] - truth[:, rows]).abs().mean()) < 0.03
     with pytest.raises(NameMismatchError, match="found markers, expected weights, or the rig"):
-        read_takes(tmp_path)
+        read_takes(tmp_path, tmp_path / "work")
 
 
 def shapes(take: Take, rig: BlendshapeRig) -> Tensor:
@@ -128,20 +130,57 @@ def shapes(take: Take, rig: BlendshapeRig) -> Tensor:
 def test_takes_at_another_rate_are_brought_to_the_first(tmp_path: Path) -> None:
     saved(tmp_path, "a", 120, fps=60.0)
     saved(tmp_path, "b", 120, seed=1, fps=30.0)
-    found = read_takes(tmp_path)
+    found = read_takes(tmp_path, tmp_path / "work")
     assert found.fps == pytest.approx(60.0, rel=1e-3)
     assert len(found.weights[1]) == pytest.approx(239, abs=2)
+
+
+def test_a_run_that_was_killed_takes_up_the_takes_it_has_read(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_takes(folder, tmp_path)
+    changed, damaged = tmp_path / "take_000001.safetensors", tmp_path / "take_000003.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-4] + b"\0\0\0\1")
+    changed.unlink()
+    again: list[str] = []
+    monkeypatch.setattr(prior_takes, "load_take", lambda path: again.append(path.stem) or load_take(path))
+    with pytest.warns(UserWarning, match="damaged checkpoint"):
+        found = read_takes(folder, tmp_path)
+    assert again == ["take_1", "take_3"]
+    assert torch.equal(found.weights[3], read_takes(folder, tmp_path / "anew").weights[3])
+    assert found.frames == (160,) * 4
+    again.clear()
+    saved(folder_of(folder, tmp_path / "others"), "take_2", 90, seed=8)
+    assert read_takes(tmp_path / "others", tmp_path).frames == (160, 160, 90, 160)
+    assert again == ["take_2"]
+
+
+def folder_of(takes: Path, copy: Path) -> Path:
+    return Path(shutil.copytree(takes, copy))
+
+
+def test_takes_on_disk_give_the_priors_that_takes_in_memory_give(folder: Path, tmp_path: Path) -> None:
+    kept = read_takes(folder, tmp_path)
+    held, quick = list(kept.weights), DynamicsSettings(inducing=20, subset=200, iterations=2)
+    assert not isinstance(kept.weights, list)
+    for learn in (
+        lambda takes: ShapePrior.fit(takes, kept.names),
+        lambda takes: ReciprocalPrior.fit(takes, kept.names),
+        lambda takes: DynamicsPrior.fit(takes, kept.names, 3, input_noise=0.01, settings=quick),
+    ):
+        for name, value in learn(held).state_dict().items():
+            torch.testing.assert_close(learn(kept.weights).state_dict()[name], value, rtol=0, atol=0, msg=name)
 
 
 def test_bad_input(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueRangeError, match="a folder of takes, or a number of performances"):
         train(Settings())
     with pytest.raises(FileFormatError, match="found no such folder"):
-        read_takes(tmp_path / "none")
+        read_takes(tmp_path / "none", tmp_path / "work")
     with pytest.raises(FileFormatError, match="found no take"):
-        read_takes(tmp_path)
+        read_takes(tmp_path, tmp_path / "work")
     with pytest.raises(ShapeError, match="expected at least one to learn from"):
-        split(synthetic_takes(2, 30, 0), 2)
+        split(synthetic_takes(2, 30, 0, tmp_path / "work"), 2)
     with pytest.raises(TorchfaceError, match="for a window of 40"):
         train(Settings(performances=2, frames=30, kind="dynamics", window=40, out=tmp_path / "own"))
     take = saved(tmp_path, "a", 20)
@@ -149,10 +188,10 @@ def test_bad_input(folder: Path, tmp_path: Path) -> None:
     other = Track(("jawWide", *take.weights.names[1:]), take.weights.values)
     save_take(Take(60.0, weights=other), tmp_path / "b.csv")
     with pytest.raises(NameMismatchError, match=r"b\.csv: found other shapes than in a\.csv \(jawWide"):
-        read_takes(tmp_path)
+        read_takes(tmp_path, tmp_path / "work")
     broken = take.weights.values.clone()
     broken[7, 3] = torch.nan
     save_take(Take(60.0, weights=Track(("x", *take.weights.names[1:]), broken)), tmp_path / "b.csv")
     with pytest.raises(ValueRangeError, match=r"b\.csv: found NaN or infinity in 1 of 20 frames \(the first is 7\)"):
-        read_takes(tmp_path)
+        read_takes(tmp_path, tmp_path / "work")
     assert not (tmp_path / "own").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -49,7 +49,7 @@ class GaussianMixture(nn.Module):
 
     @classmethod
     def fit(cls, samples: Tensor, components: int = 1, floor: float = 1e-4, seed: int = 0) -> GaussianMixture:
-        """Fits by scikit-learn's expectation maximisation from k-means, in float64.
+        """Fits by scikit-learn's expectation maximisation from k-means, in float64; of all samples at once.
 
         Args:
             samples: weights, (T,D).
@@ -78,6 +78,27 @@ class GaussianMixture(nn.Module):
         fitted.fit(samples.detach().cpu().double().numpy())
         means, precisions, weights = map(torch.from_numpy, (fitted.means_, fitted.precisions_, fitted.weights_))
         return cls(means, torch.linalg.cholesky(precisions), weights.log())
+
+    @classmethod
+    def single(cls, parts: Iterable[Tensor], floor: float = 1e-4) -> GaussianMixture:
+        """One Gaussian, as :meth:`fit` finds it, of samples that come in parts (T,D); they are gone through twice.
+
+        Raises:
+            ShapeError: there is no sample.
+        """
+        count, total = 0, torch.zeros(())
+        for part in parts:
+            count, total = count + len(part), total + part.double().sum(0)
+        if not count:
+            raise ShapeError("samples: found none, expected parts (T,D)")
+        mean, scatter = total / count, torch.zeros(())
+        for part in parts:
+            away = part.double() - mean
+            scatter = scatter + away.T @ away
+        covariance = scatter / count
+        covariance.diagonal().add_(floor)
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+        return cls(mean[None], torch.linalg.cholesky(precision)[None], torch.zeros(1))
 
     def log_density(self, samples: Tensor) -> Tensor:
         """:math:`\\log p` of samples (B,D), (B,)."""

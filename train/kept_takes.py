@@ -1,0 +1,135 @@
+"""Weights of takes on disk, a file a take, so that a prior can learn from more of them than memory holds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import torch
+from torch import Tensor
+
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.shards import Shards
+from torchface.files.whole_files import make_folder
+
+
+@dataclass(frozen=True, eq=False)
+class KeptTake:
+    """A take as it is kept.
+
+    Args:
+        names: of the N shapes.
+        fps: frames a second.
+        weights: (T,N).
+        solved: whether they were solved from markers.
+    """
+
+    names: tuple[str, ...]
+    fps: float
+    weights: Tensor
+    solved: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TakesRead(Sequence[Tensor]):
+    """Some takes of others, each read, and changed, when it is asked for.
+
+    Args:
+        takes: weights of each, (T,N).
+        rows: which of them.
+        change: what is done with each; nothing if absent.
+    """
+
+    takes: Sequence[Tensor]
+    rows: tuple[int, ...]
+    change: Callable[[Tensor], Tensor] | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, number: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, number: slice) -> TakesRead: ...
+    def __getitem__(self, number: int | slice) -> Tensor | TakesRead:
+        if isinstance(number, slice):
+            return TakesRead(self.takes, self.rows[number], self.change)
+        take = self.takes[self.rows[number]]
+        return take if self.change is None else self.change(take)
+
+
+class TakesOnDisk(Sequence[Tensor]):
+    """Takes of files, (T,N) float64 each; one that is asked for is read.
+
+    Args:
+        paths: of the files.
+
+    Raises:
+        FileFormatError: a file is missing or damaged.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._shards = Shards(paths, ["weights"])
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """T of each."""
+        return self._shards.counts
+
+    def __len__(self) -> int:
+        return len(self._shards.counts)
+
+    @overload
+    def __getitem__(self, number: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, number: slice) -> TakesRead: ...
+    def __getitem__(self, number: int | slice) -> Tensor | TakesRead:
+        if isinstance(number, slice):
+            return TakesRead(self, tuple(range(len(self)))[number])
+        return self._shards.shard(range(len(self))[number])["weights"].double()
+
+
+class TakeStore:
+    """Writes takes one after the other; those that an earlier run has written of the same are read instead.
+
+    Args:
+        folder: for the files.
+        count: of the takes.
+    """
+
+    def __init__(self, folder: Path, count: int) -> None:
+        make_folder(folder)
+        self._paths = [folder / f"take_{number:06}.safetensors" for number in range(count)]
+        self._done = 0
+        self.solved = 0
+        """How many takes so far were solved from markers."""
+
+    def kept(self, key: str, make: Callable[[], KeptTake]) -> KeptTake:
+        """The next take; it is made where there is none of this key, or a damaged one."""
+        path = self._paths[self._done]
+        found = _unpacked(read_checkpoint(path, key))
+        if found is None:
+            found = make()
+            write_checkpoint(path, _packed(found), key)
+        self._done += 1
+        self.solved += found.solved
+        return found
+
+    def takes(self) -> TakesOnDisk:
+        """All that were written."""
+        return TakesOnDisk(self._paths[: self._done])
+
+
+def _packed(take: KeptTake) -> dict[str, Tensor]:
+    told = json.dumps({"names": take.names, "fps": take.fps, "solved": take.solved}).encode()
+    return {"weights": take.weights.float(), "told": torch.frombuffer(bytearray(told), dtype=torch.uint8)}
+
+
+def _unpacked(found: dict[str, Tensor] | None) -> KeptTake | None:
+    if found is None:
+        return None
+    told = json.loads(bytes(found["told"].tolist()))
+    return KeptTake(tuple(told["names"]), float(told["fps"]), found["weights"].double(), bool(told["solved"]))
