@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError
 
 _ITERATIONS = 60
+_ROWS = 4096
 _PRIOR_MEAN = -2.5  # of the logarithm of a coefficient
 
 
@@ -84,19 +85,25 @@ class MotionNoise(nn.Module):
             average[rows[:, None], rows] = 1 / len(group)
         squared = motion.square()
         group_energy = (squared / scale.square()) @ average.T * scale.square()
-        energies = torch.cat([squared, group_energy], dim=1)
+        energies = torch.cat([squared, group_energy], dim=1).permute(2, 0, 1).contiguous()  # (N,B,2K)
+        del squared, group_energy
         squared_errors = errors.square()
         log_rest = (0.3 * squared_errors.mean(0)).clamp(min=floor**2).log().requires_grad_()
-        log_coefficients = torch.full(energies.shape[1:], _PRIOR_MEAN, dtype=torch.float64).requires_grad_()
+        log_coefficients = torch.full((energies.shape[2], count), _PRIOR_MEAN, dtype=torch.float64).requires_grad_()
         optimizer = torch.optim.LBFGS([log_rest, log_coefficients], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
         def loss() -> Tensor:
             optimizer.zero_grad()
-            variance = model_variance + floor**2 + log_rest.exp() + (energies * log_coefficients.exp()).sum(1)
-            value = 0.5 * (squared_errors / variance + variance.log()).mean(0).sum()
-            value = value + 1e-4 * (log_coefficients - _PRIOR_MEAN).square().sum()
-            value.backward()
-            return value
+            total = 1e-4 * (log_coefficients - _PRIOR_MEAN).square().sum()
+            total.backward()
+            for rows in torch.arange(len(errors)).split(_ROWS):  # what is kept for a gradient is ten times the errors
+                part = slice(int(rows[0]), int(rows[-1]) + 1)
+                moved = (energies[:, part] @ log_coefficients.exp().T[..., None])[..., 0].T
+                variance = model_variance[part] + floor**2 + log_rest.exp() + moved
+                value = 0.5 * (squared_errors[part] / variance + variance.log()).sum() / len(errors)
+                value.backward()
+                total = total.detach() + value.detach()
+            return total
 
         optimizer.step(loss)
         own, shared = log_coefficients.detach().exp().chunk(2)
