@@ -269,9 +269,7 @@ def _material(settings: Settings, work: Path, progress: Progress) -> Material:
     """The takes, on disk, under the names that the priors are for; what cannot work is refused before learning."""
     rig = None if settings.rig is None else load_rig(settings.rig, part=settings.part)
     if settings.takes is None:
-        takes = synthetic_takes(
-            settings.performances, settings.frames, settings.seed, work, settings.fps, progress
-        )
+        takes = synthetic_takes(settings.performances, settings.frames, settings.seed, work, settings.fps, progress)
     else:
         attachment = None if settings.attachment is None else Attachment.load(settings.attachment)
         takes = read_takes(settings.takes, work, settings.fps, rig, attachment, progress)

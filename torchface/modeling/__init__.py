@@ -19,10 +19,14 @@ from torchface.modeling.rigging.deformation_transfer import (
 )
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.modeling.rigging.expression_regression import ExpressionRegression, rig_from_neutral
+from torchface.modeling.rigging.expression_training import fit_expression_samples, fit_expressions
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
+
+# Training knows its model; a model knows of its training only here.
+ExpressionRegression.fit = staticmethod(fit_expressions)
 
 __all__ = [
     "BakeStatistics",
@@ -48,6 +52,8 @@ __all__ = [
     "color_casts",
     "detail_maps",
     "fit_colors",
+    "fit_expression_samples",
+    "fit_expressions",
     "fit_images",
     "fit_sequence",
     "inner_parts",

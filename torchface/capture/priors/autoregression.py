@@ -37,9 +37,7 @@ class Autoregression:
     def coefficients(self) -> tuple[Tensor, list[Tensor]]:
         """Those of frames, (J,N), from all parts, and from all but each fold."""
         square, product = self._squares.sum(0), self._products.sum(0)
-        left_out = [
-            _from_steps(square - a, product - b) for a, b in zip(self._squares, self._products, strict=True)
-        ]
+        left_out = [_from_steps(square - a, product - b) for a, b in zip(self._squares, self._products, strict=True)]
         return _from_steps(square, product), left_out
 
 

@@ -21,7 +21,7 @@ class PrincipalComponents:
 
     Args:
         mean: (D,) float64.
-        components: orthonormal rows (K,D) float32, the one that varies most first.
+        components: orthonormal rows (K,D) floats, the one that varies most first.
         standard_deviations: of the samples along them, (K,) float64.
         total_variance: of the samples, all D dimensions summed, kept or not.
         rank: how many components the samples have.

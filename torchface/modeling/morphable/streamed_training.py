@@ -16,7 +16,13 @@ from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.morphable.principal_components import check_count, check_rank, gram_spectrum, signs
+from torchface.modeling.morphable.principal_components import (
+    PrincipalComponents,
+    check_count,
+    check_rank,
+    gram_spectrum,
+    signs,
+)
 from torchface.modeling.morphable.subspace_iteration import SUBSPACE, leading_components
 from torchface.progress import Progress, silent
 
@@ -66,11 +72,36 @@ def fit_sequence(
         >>> torch.allclose(streamed.standard_deviations, at_once.standard_deviations, rtol=1e-4)
         True
     """
-    report = progress or silent
     count, vertices, channels = samples.shape
     check_count(count, components)
+    found = sequence_components(samples, components, checkpoint, progress)
+    check_rank(count, len(found.components), components)
+    return MorphableModel(
+        found.mean.reshape(vertices, channels),
+        found.components.reshape(-1, vertices, channels),
+        found.standard_deviations,
+        found.total_variance,
+        count,
+    )
+
+
+def sequence_components(
+    samples: Samples,
+    most: int | None = None,
+    checkpoint: str | Path | None = None,
+    progress: Progress | None = None,
+) -> PrincipalComponents:
+    """The principal components behind :func:`fit_sequence`, float64; fewer than ``most`` where there are no more.
+
+    Args, Raises: as :func:`fit_sequence`; but more components than the samples hold may be asked for.
+    """
+    report, components = progress or silent, most
+    count, vertices, channels = samples.shape
+    check_count(count, None)
     if components is None and count > _WHOLE_SPECTRUM:
         components = _MAX_COMPONENTS
+    if components is not None:
+        components = min(components, count - 1)
     parts = list(blocks(samples, _BLOCK_BYTES))
     if components is not None and count > max(_GRAM_SAMPLES, 8 * components):
         return _by_passes(samples, parts, components, None if checkpoint is None else Path(checkpoint), report)
@@ -104,18 +135,12 @@ def fit_sequence(
         step()
     learned.mul_(signs(learned)[:, None])
     rows.remove()
-    return MorphableModel(
-        mean.reshape(vertices, channels),
-        learned.reshape(len(values), vertices, channels),
-        (values / (count - 1)).sqrt(),
-        trace / (count - 1),
-        count,
-    )
+    return PrincipalComponents(mean, learned, (values / (count - 1)).sqrt(), trace / (count - 1), len(values))
 
 
 def _by_passes(
     samples: Samples, parts: list[tuple[int, int]], components: int, checkpoint: Path | None, report: Progress
-) -> MorphableModel:
+) -> PrincipalComponents:
     count, vertices, channels = samples.shape
     mean, floor, contents = _mean(samples, parts, lambda: None, keyed=checkpoint is not None)
     if checkpoint is not None:
@@ -129,20 +154,15 @@ def _by_passes(
         content_key(_METHOD, samples=contents, parts=parts, components=components),
         lambda done, total: report("fitting principal components", done, total),
     )
-    values, vectors = found.values, found.vectors
-    check_rank(count, int((values > max(floor, 1e-12 * float(values.max()))).sum()), components)
+    rank = int((found.values > max(floor, 1e-12 * float(found.values.max()))).sum())
+    check_rank(count, rank, None)
+    values, vectors = found.values[:rank], found.vectors[:rank]
     vectors = vectors * signs(vectors)[:, None]
     if checkpoint is not None:
         (checkpoint / SUBSPACE).unlink(missing_ok=True)
         if not any(checkpoint.iterdir()):
             checkpoint.rmdir()
-    return MorphableModel(
-        mean.reshape(vertices, channels),
-        vectors.reshape(components, vertices, channels),
-        (values / (count - 1)).sqrt(),
-        found.trace / (count - 1),
-        count,
-    )
+    return PrincipalComponents(mean, vectors, (values / (count - 1)).sqrt(), found.trace / (count - 1), rank)
 
 
 def _mean(
@@ -172,14 +192,14 @@ def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
 
 
 def _leading(gram: Tensor, floor: float, count: int | None) -> tuple[Tensor, Tensor, float]:
-    """The leading eigenpairs of a matrix whose lower triangle is filled, and its trace."""
+    """The leading eigenpairs, those above rounding, of a matrix whose lower triangle is filled, and its trace."""
     size = len(gram)
     if count is None or size <= _WHOLE_SPECTRUM or count > size // 4:
-        spectrum = gram_spectrum(gram, floor, count)
-        return spectrum.values, spectrum.vectors, spectrum.trace
+        spectrum = gram_spectrum(gram, floor)
+        return spectrum.values[:count], spectrum.vectors[:, :count], spectrum.trace
     trace = float(gram.diagonal().sum())
     if trace <= floor:
-        check_rank(size, 0, count)
+        check_rank(size, 0, None)
     for begin in range(0, size, 1024):  # in strips: a transpose of the whole would be a second matrix
         end = begin + 1024
         gram[begin:end, end:] = gram[end:, begin:end].T
@@ -189,8 +209,10 @@ def _leading(gram: Tensor, floor: float, count: int | None) -> tuple[Tensor, Ten
     start = np.cos(np.arange(size, dtype=np.float64))
     values, vectors = eigsh(apply, count, which="LA", v0=start)
     order = np.argsort(values)[::-1]
-    check_rank(size, int((values > max(floor, 1e-12 * values.max())).sum()), count)
-    return torch.from_numpy(values[order].copy()), torch.from_numpy(vectors[:, order].copy()), trace
+    rank = int((values > max(floor, 1e-12 * values.max())).sum())
+    check_rank(size, rank, None)
+    kept = order[:rank]
+    return torch.from_numpy(values[kept].copy()), torch.from_numpy(vectors[:, kept].copy()), trace
 
 
 class _Rows:

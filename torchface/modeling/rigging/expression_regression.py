@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
-from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
-from torchface.modeling.rigging.component_choice import choose_components
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
-NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 Form = Literal["offsets", "expressions"]
 
-_STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
-# Of the vertex that moves most. The form of ears and neck predicts little of a smile, and would fill the components.
-_MOVES = 0.05
+STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
 
 
 class ExpressionRegression(nn.Module):
@@ -58,6 +53,9 @@ class ExpressionRegression(nn.Module):
         >>> bool(open_jaw[head.landmarks[8], 1] < head.vertices[head.landmarks[8], 1] - 10)
         True
     """
+
+    fit: ClassVar[Callable[..., ExpressionRegression]]
+    """:func:`fit_expressions`, bound where ``torchface.modeling`` begins."""
 
     neutral_mean: Tensor
     region: Tensor
@@ -112,80 +110,6 @@ class ExpressionRegression(nn.Module):
     def from_config(cls, config: Mapping[str, Any]) -> ExpressionRegression:
         """A regression of zeros for the state to be loaded into."""
         return cls(**config)
-
-    @classmethod
-    def fit(
-        cls,
-        neutrals: Tensor,
-        expressions: Tensor,
-        neutral_components: int | None = NEUTRAL_COMPONENTS,
-        offset_components: int | None = OFFSET_COMPONENTS,
-        ridge: float | None = 0.0,
-        names: Sequence[str] | None = None,
-        topology: str | None = None,
-        form: Form = "offsets",
-        region: Tensor | None = None,
-    ) -> ExpressionRegression:
-        """Learns from people in correspondence, each with a neutral face and the same expressions.
-
-        Args:
-            neutrals: (M,V,3), millimetres, in any pose.
-            expressions: (M,N,V,3), each person's in the space of his or her own neutral.
-            neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
-                has them chosen by leaving out one person after the other.
-            ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
-            names: of the expressions; ``expression0``, ... if absent.
-            topology: ``Mesh.fingerprint()`` of the faces.
-            form: "offsets" (equation 32) or "expressions" (equation 31).
-            region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
-                most in some expression, if absent; all of them for the form "expressions", as in the thesis.
-
-        Raises:
-            ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
-            ValueRangeError: NaN or infinity, neutrals that are all the same, or a negative ridge.
-            NameMismatchError: not one name an expression, or one twice.
-        """
-        names = [f"expression{i}" for i in range(expressions.shape[1])] if names is None else list(names)
-        _check_examples(neutrals, expressions, names)
-        for what, found in (("neutral_components", neutral_components), ("offset_components", offset_components)):
-            if found is not None and found < 1:
-                raise ValueRangeError(f"{what}: found {found}, expected 1 at least")
-        if ridge is not None and not 0 <= ridge < float("inf"):
-            raise ValueRangeError(f"ridge: found {ridge}, expected a finite number of at least 0")
-        laid, poses = _laid_together(neutrals)
-        predicted = expressions.double() - (neutrals.double()[:, None] if form == "offsets" else 0)
-        if form == "offsets":
-            predicted = predicted @ poses.rotation.double().transpose(-1, -2)[:, None]
-            places = (predicted.abs().amax((0, -1)) > _STILL).flatten().nonzero()[:, 0]
-            considered = _moving(predicted) if region is None else region
-        else:
-            predicted = poses.apply(predicted.flatten(1, 2)).view_as(predicted)
-            places = torch.arange(predicted.shape[1] * predicted.shape[2])
-            considered = torch.ones(laid.shape[1], dtype=torch.bool) if region is None else region
-        if considered.dtype != torch.bool or considered.shape != laid.shape[1:2] or not bool(considered.any()):
-            raise ShapeError(
-                f"region: found {considered.dtype} {tuple(considered.shape)}, expected a mask (V,), not empty"
-            )
-        moving = predicted.flatten(1, 2)[:, places].flatten(1).float()
-        flat = laid[:, considered].flatten(1).float()
-        if neutral_components is None or offset_components is None or ridge is None:
-            choice = choose_components(flat, moving, neutral_components, offset_components, ridge)
-            neutral_components, offset_components, ridge = choice.inputs, choice.outputs, choice.ridge
-        neutral, offset = principal_components(flat), _components_or_mean(moving)
-        kept = min(neutral_components, len(neutral.components)), min(offset_components, len(offset.components))
-        self = cls(laid.shape[1], names, int(considered.sum()), len(places), *kept, topology, form)
-        self.neutral_mean.copy_(laid.mean(0))
-        self.region.copy_(considered.nonzero()[:, 0])
-        self.neutral_components.copy_(neutral.components[: kept[0]].unflatten(1, (-1, 3)))
-        self.offset_mean.copy_(offset.mean.view(-1, 3))
-        self.offset_components.copy_(offset.components[: kept[1]].reshape(kept[1], len(places), 3))
-        X = (flat.double() - neutral.mean) @ self.neutral_components.flatten(1).double().T
-        Y = (moving.double() - offset.mean) @ self.offset_components.flatten(1).double().T
-        gram = X.T @ X
-        gram.diagonal().add_(ridge * gram.diagonal().mean())
-        self.coefficients.copy_(torch.linalg.solve(gram, X.T @ Y))
-        self.places.copy_(places)
-        return self
 
     def forward(self, neutrals: Tensor) -> Tensor:
         """Expressions (B,N,V,3) of neutral faces (B,V,3), millimetres, in their own poses.
@@ -298,44 +222,5 @@ def _shares_of_the_whole(transferred: Tensor, split: Tensor) -> Tensor:
     shares = torch.ones_like(size)
     for column in split.any(0).nonzero()[:, 0]:  # one or two shapes of a rig are split
         rows = split[:, column].nonzero()[:, 0]
-        shares[rows] = (size[rows] + _STILL) / (size[rows] + _STILL).sum(0)
+        shares[rows] = (size[rows] + STILL) / (size[rows] + STILL).sum(0)
     return shares[..., None]
-
-
-def _laid_together(neutrals: Tensor) -> tuple[Tensor, Similarity]:
-    """Neutrals (M,V,3) on their mean, rotation and translation only, float64, and what moved them there."""
-    points = neutrals.double()
-    mean = points[0] - points[0].mean(0)
-    for _ in range(4):
-        poses = similarity_transform(points, mean.expand_as(points), scale=False)
-        mean = poses.apply(points).mean(0)
-    return poses.apply(points), poses
-
-
-def _moving(offsets: Tensor) -> Tensor:
-    """Which vertices (V,) move in some expression, of offsets (M,N,V,3); all of them where none does."""
-    moved = offsets.square().sum(-1).mean(0).sqrt()
-    moves = (moved > _MOVES * moved.amax(1, keepdim=True)).any(0)
-    return moves if bool(moves.any()) else torch.ones_like(moves)
-
-
-def _components_or_mean(samples: Tensor) -> PrincipalComponents:
-    """Principal components; none where all people make the same offsets."""
-    if bool((samples - samples[0]).abs().max() > _STILL) if samples.numel() else False:
-        return principal_components(samples)
-    none = samples.new_zeros(0, samples.shape[1])
-    return PrincipalComponents(samples.double().mean(0), none, none.new_zeros(0), 0.0, 0)
-
-
-def _check_examples(neutrals: Tensor, expressions: Tensor, names: Sequence[str]) -> None:
-    if neutrals.ndim != 3 or neutrals.shape[-1] != 3 or len(neutrals) < 2:
-        raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (M,V,3) of at least two people")
-    wanted = (len(neutrals), len(names), *neutrals.shape[1:])
-    if expressions.ndim != 4 or expressions.shape[:1] + expressions.shape[2:] != wanted[:1] + wanted[2:]:
-        raise ShapeError(f"expressions: found {tuple(expressions.shape)}, expected ({wanted[0]},N,{wanted[2]},3)")
-    if expressions.shape[1] != len(names):
-        raise NameMismatchError(f"names: found {len(names)}, expected one for each of {expressions.shape[1]}")
-    for what, tensor in (("neutrals", neutrals), ("expressions", expressions)):
-        bad = int((~torch.isfinite(tensor)).flatten(1).any(1).sum())
-        if bad:
-            raise ValueRangeError(f"{what}: {bad} of {len(tensor)} hold NaN or infinity; expected none")
