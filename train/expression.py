@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -12,15 +13,19 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
-from torchface.modeling import ExpressionRegression
+from torchface.modeling import ExpressionRegression, fit_expression_samples
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
-from train.expression_table import Comparison, People, compare, picture
+from train.expression_table import Comparison, compare, picture
+from train.people_samples import People
+from train.people_samples import gather as gather_people
 from train.runner import run
 
+_METHOD = "a person's expressions/1"
 # Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
 _HALF, _NOTHING = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
 
@@ -42,8 +47,8 @@ class Settings:
         align: Lay each expression onto its neutral by what does not move, rotation and translation only.
         seed: Draws performers.
         licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
-        compared: Leave one out for the table of errors.
-        pictured: How many people, the first, are shown with what each method makes of them.
+        compared: Leave one out for the table of errors; of more than a hundred people the last fifty together.
+        pictured: How many of those left out, the first, are shown with what each method makes of them.
     """
 
     pairs: Path | None = None
@@ -70,64 +75,63 @@ class Trained:
 
 
 def train(settings: Settings, progress: Progress | None = None) -> Trained:
-    """Loads, aligns, leaves one out after the other, fits, saves.
+    """Gathers on disk, aligned, leaves one out after the other, fits, saves.
 
     Raises:
         TorchfaceError: there is neither a folder nor a number of performers, or people do not fit each other.
     """
     progress = progress or silent
-    people = gather(settings, progress)
+    work = settings.out.parent / f".{settings.out.name}.training"
+    people = gather(settings, work, progress)
     progress(f"{len(people.who)} people, {len(people.names)} expressions")
     comparison = None
     if settings.compared:
         template = None if settings.template is None else load_rig(settings.template)
-        comparison = compare(people, lambda rest: fit(rest, settings), template, settings.pictured, progress)
-    model = fit(people, settings)
+        comparison = compare(people, lambda rest: fit(rest, settings, progress), template, settings.pictured, progress)
+    model = fit(people, settings, progress)
     save(model, people, comparison, settings)
+    shutil.rmtree(work, ignore_errors=True)
     return Trained(model, comparison)
 
 
-def fit(people: People, settings: Settings) -> ExpressionRegression:
+def fit(people: People, settings: Settings, progress: Progress | None = None) -> ExpressionRegression:
     """The regression of these people."""
-    return ExpressionRegression.fit(
+    return fit_expression_samples(
         people.neutrals,
-        people.neutrals[:, None] + people.offsets,
+        people.expressions,
+        people.names,
         settings.neutral_components,
         settings.offset_components,
         settings.ridge,
-        people.names,
         people.template.fingerprint(),
+        progress=progress,
     )
 
 
-def gather(settings: Settings, progress: Progress) -> People:
-    """The people of a folder, or performers."""
+def gather(settings: Settings, work: Path, progress: Progress) -> People:
+    """The people of a folder, or performers, kept in a folder; one is in memory at a time, or all if they are few."""
     if (settings.pairs is None) == (settings.performers == 0):
         raise TorchfaceError("train.expression: expected either --pairs DIR or --performers COUNT")
     if settings.pairs is None:
         identities = draw_identities(settings.performers, torch.Generator().manual_seed(settings.seed))
-        rigs = {}
-        for number, identity in enumerate(identities):
-            rigs[f"performer{number:03d}"] = selected(performer(identity, texture=False), settings.expressions)
-            progress("making performers", number + 1, settings.performers)
-    else:
-        rigs = {path.name: read(path, settings) for path in entries(settings.pairs)}
-    first = next(iter(rigs.values()))
-    names = tuple(name for name in first.names if all(name in rig.names for rig in rigs.values()))
-    if not names:
-        raise TorchfaceError(f"{settings.pairs}: found no expression that all {len(rigs)} people have, expected one")
-    for who, rig in rigs.items():
-        if rig.neutral.fingerprint() != first.neutral.fingerprint():
-            raise TorchfaceError(
-                f"{settings.pairs}: found {who} of topology {rig.neutral.fingerprint()}, expected that of "
-                f"{next(iter(rigs))}, {first.neutral.fingerprint()}"
-            )
-    return People(
-        tuple(rigs),
-        first.neutral,
-        torch.stack([rig.vertices for rig in rigs.values()]),
-        torch.stack([rig.deltas[rig.index(names)] for rig in rigs.values()]),
-        names,
+        return gather_people(
+            [f"performer{number:03d}" for number in range(settings.performers)],
+            lambda number: selected(performer(identities[number], texture=False), settings.expressions),
+            lambda number: content_key(_METHOD, identity=identities[number], expressions=settings.expressions),
+            work,
+            "performers",
+            progress,
+        )
+    paths = entries(settings.pairs)
+    return gather_people(
+        [path.name for path in paths],
+        lambda number: read(paths[number], settings),
+        lambda number: content_key(
+            _METHOD, files=paths[number], expressions=settings.expressions, align=settings.align
+        ),
+        work,
+        str(settings.pairs),
+        progress,
     )
 
 
@@ -135,7 +139,8 @@ def entries(folder: Path) -> list[Path]:
     """An entry a person, sorted by name."""
     if not folder.is_dir():
         raise TorchfaceError(f"{folder}: found no such folder, expected one with an entry a person")
-    found = sorted(path for path in folder.iterdir() if path.is_dir() or path.suffix in (".glb", ".gltf"))
+    shown = (path for path in folder.iterdir() if path.name[0] != ".")
+    found = sorted(path for path in shown if path.is_dir() or path.suffix in (".glb", ".gltf"))
     if len(found) < 3:
         raise TorchfaceError(f"{folder}: found {len(found)} people, expected at least three: a .glb or a folder each")
     return found
@@ -196,9 +201,7 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
             f"Predicts {', '.join(people.names)} from a neutral face of the same topology: linear, "
             f"{len(model.neutral_components)} components of the part that moves to {len(model.offset_components)} of "
             "the offsets. Good for a first rig of a person of whom there is one scan; where there are scans of "
-            "expressions, learn from those. Measured by leaving out one person after the other, against deformation "
-            "transfer and the mean offset of the others: in how many cases each has the lowest error, and the "
-            "squared error summed over the vertices. It knows only people like those it has learned from."
+            f"expressions, learn from those. {_tested(comparison)}It knows only people like those it has learned from."
         ),
         settings=effective,
         half=("neutral_components", "offset_mean", "offset_components"),
@@ -208,6 +211,18 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
         make_folder(folder)
         for row, name in enumerate(people.names[:3]):
             save_rendered_image(picture(people, comparison, row), folder / f"{name}.png")
+
+
+def _tested(comparison: Comparison | None) -> str:
+    """How the card's figures were measured."""
+    if comparison is None:
+        return ""
+    tested = len(comparison.squared)
+    who = "one person after the other" if comparison.learned < tested else f"the last {tested} people together"
+    return (
+        f"Measured by leaving out {who}, against deformation transfer and the mean offset of the others: in how many "
+        "cases each has the lowest error, and the squared error summed over the vertices. "
+    )
 
 
 if __name__ == "__main__":

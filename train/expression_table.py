@@ -1,4 +1,4 @@
-"""Leave one person out: which of three methods comes nearest to his or her true expressions."""
+"""People left out: which of three methods comes nearest to their true expressions."""
 
 from __future__ import annotations
 
@@ -8,44 +8,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface import BlendshapeRig, Mesh
+from torchface import BlendshapeRig
 from torchface.modeling import ExpressionRegression, transfer_deformation
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
 from torchface.viz.figures.face_views import clay_colors, frame_face
+from train.people_samples import People
 
 METHODS = ("deformation transfer", "mean offset", "regression")
-
-
-@dataclass(frozen=True, eq=False)
-class People:
-    """Who is learned from.
-
-    Args:
-        who: M names.
-        template: the topology, and what is annotated on it.
-        neutrals: (M,V,3), millimetres.
-        offsets: of the expressions, (M,N,V,3).
-        names: of the expressions.
-    """
-
-    who: tuple[str, ...]
-    template: Mesh
-    neutrals: Tensor
-    offsets: Tensor
-    names: tuple[str, ...]
-
-    def without(self, left_out: int) -> People:
-        """All but one."""
-        rest = torch.arange(len(self.who)) != left_out
-        who = tuple(name for name, kept in zip(self.who, rest.tolist(), strict=True) if kept)
-        return People(who, self.template, self.neutrals[rest], self.offsets[rest], self.names)
-
-    def mean_rig(self) -> BlendshapeRig:
-        """The mean neutral with the mean offsets."""
-        neutral = self.template.with_vertices(self.neutrals.mean(0))
-        return BlendshapeRig(neutral, self.offsets.mean(0), self.names)
+_MANY, _TESTED = 100, 50
+"""People: of more than the first, so many are left out together, once, so that time grows with their number only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +28,14 @@ class Comparison:
     Args:
         squared: (M,N,3), summed over the vertices.
         names: of the expressions.
-        predicted: offsets (M,3,N,V,3) of those people who are kept for pictures, else None.
+        predicted: offsets (3,N,V,3) of those people who are kept for pictures, by their number.
+        learned: how many people each was predicted from.
     """
 
     squared: Tensor
     names: tuple[str, ...]
     predicted: dict[int, Tensor]
+    learned: int
 
     @property
     def counts(self) -> list[int]:
@@ -103,6 +78,8 @@ def compare(
 ) -> Comparison:
     """Table 1 of the thesis: each person is predicted from the others.
 
+    Of more than a hundred people the last fifty are predicted, all from the others.
+
     Args:
         people: three at least.
         fit: learns from those who are left.
@@ -113,42 +90,58 @@ def compare(
     Source: thesis 3.3.4, table 1.
     """
     progress = progress or silent
-    squared = torch.zeros(len(people.who), len(people.names), len(METHODS), dtype=torch.float64)
+    count = len(people.who)
+    tested = range(count) if count <= _MANY else range(count - _TESTED, count)
+    squared = torch.zeros(len(tested), len(people.names), len(METHODS), dtype=torch.float64)
     predicted = {}
-    for i in range(len(people.who)):
-        rest = people.without(i)
-        source = rest.mean_rig() if template is None else template.select(people.names)
-        neutral = people.template.with_vertices(people.neutrals[i])
+    learned: _Learned | None = None
+    for row, i in enumerate(tested):
+        if learned is None or count <= _MANY:
+            learned = _learned(people.without(i) if count <= _MANY else people.first(tested.start), fit)
+        source = learned.mean if template is None else template.select(people.names)
+        neutral, offsets = people.neutral(i), people.offsets_of(i)
         predictions = torch.stack(
             [
-                transfer_deformation(source, neutral).deltas,
-                rest.offsets.mean(0),
-                fit(rest).offsets(people.neutrals[i : i + 1])[0],
+                transfer_deformation(source, people.template.with_vertices(neutral)).deltas,
+                learned.mean.deltas,
+                learned.model.offsets(neutral[None])[0],
             ]
         )
-        squared[i] = (predictions - people.offsets[i]).double().square().sum((-1, -2)).T
-        if i < keep:
+        squared[row] = (predictions - offsets).double().square().sum((-1, -2)).T
+        if row < keep:
             predicted[i] = predictions
-        progress("predicting each person from the others", i + 1, len(people.who))
-    return Comparison(squared, people.names, predicted)
+        progress("predicting people from the others", row + 1, len(tested))
+    return Comparison(squared, people.names, predicted, count - (1 if count <= _MANY else _TESTED))
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """What those who are left tell: their mean and a regression."""
+
+    mean: BlendshapeRig
+    model: ExpressionRegression
+
+
+def _learned(people: People, fit: Callable[[People], ExpressionRegression]) -> _Learned:
+    return _Learned(people.mean_rig(), fit(people))
 
 
 def picture(people: People, comparison: Comparison, expression: int = 0) -> Tensor:
     """Figure 49: a row a person: what each method makes of the neutral, painted with the distance to the truth."""
     rows = []
     worst = max(
-        float((predictions[:2, expression] - people.offsets[i, expression]).norm(dim=-1).max())
+        float((predictions[:2, expression] - people.offsets_of(i)[expression]).norm(dim=-1).max())
         for i, predictions in comparison.predicted.items()
     )
     for i, predictions in comparison.predicted.items():
-        neutral = people.template.with_vertices(people.neutrals[i])
+        neutral = people.template.with_vertices(people.neutral(i))
         camera = frame_face(neutral, 20.0, width=300, height=360)
         for method, offsets in zip(METHODS, predictions[:, expression], strict=True):
-            residual = (offsets - people.offsets[i, expression]).norm(dim=-1)
+            residual = (offsets - people.offsets_of(i)[expression]).norm(dim=-1)
             face = neutral.with_vertices(neutral.vertices + offsets)
             shown = render(face, camera, heat_colors(residual, worst), samples=2)
             rows.append(caption(shown, f"{method}: worst {residual.max():.2f} mm"))
-        truth = neutral.with_vertices(neutral.vertices + people.offsets[i, expression])
+        truth = neutral.with_vertices(neutral.vertices + people.offsets_of(i)[expression])
         rows.append(caption(render(truth, camera, clay_colors(truth), samples=2), "truth"))
         rows.append(caption(render(neutral, camera, clay_colors(neutral), samples=2), "neutral"))
     return headed(sheet(rows, 5), f"{people.names[expression]}: distance to the truth, red is {worst:.1f} mm")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, ShapeError
 from torchface.files.shards import Shards
 
 COUNTS = (3, 1, 4)
@@ -55,6 +55,8 @@ def test_files_that_do_not_fit_are_named(paths: list[Path]) -> None:
     with pytest.raises(FileFormatError, match=r"0\.safetensors.*expected one number of rows"):
         Shards(paths, ["values", "more"])
     shards = Shards(paths, ["values"])
+    with pytest.raises(ShapeError, match="rows 6 to 9, expected some of 8"):
+        shards.read(6, 9)
     whole = paths[2].read_bytes()
     for size in (0, 7, 60, len(whole) - 1):
         paths[2].write_bytes(whole[:size])

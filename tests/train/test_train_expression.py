@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface import BlendshapeRig, TorchfaceError, save_mesh, save_rig, zoo
+from torchface import BlendshapeRig, TorchfaceError, load_rig, save_mesh, save_rig, zoo
 from torchface.errors import NameMismatchError
+from torchface.modeling import ExpressionRegression
 from torchface.progress import silent
+from train import expression as recipe
+from train import expression_table, people_samples
 from train.expression import Settings, Trained, fit, gather, settle, train
 from train.expression_table import METHODS
 
@@ -79,8 +82,8 @@ def test_expressions_are_laid_onto_neutrals(dome_rig: BlendshapeRig) -> None:
     assert torch.equal(settle(dome_rig.vertices, dome_rig.vertices), dome_rig.vertices)
 
 
-def test_more_components_than_people_are_cut(pairs: Path) -> None:
-    people = gather(Settings(pairs), silent)
+def test_more_components_than_people_are_cut(pairs: Path, tmp_path: Path) -> None:
+    people = gather(Settings(pairs), tmp_path, silent)
     model = fit(people, Settings(pairs, neutral_components=50))
     assert len(model.neutral_components) <= 7
     chosen = fit(people, Settings(pairs, neutral_components=None, offset_components=None, ridge=None))
@@ -91,13 +94,54 @@ def test_people_who_do_not_fit_are_named(pairs: Path, dome_rig: BlendshapeRig, t
     with pytest.raises(TorchfaceError, match="either --pairs DIR or --performers"):
         train(Settings())
     with pytest.raises(TorchfaceError, match="found 0 people, expected at least three"):
-        train(Settings(tmp_path))
+        train(Settings(tmp_path, out=tmp_path.parent / "own"))
     with pytest.raises(NameMismatchError, match="tongueOut"):
-        train(Settings(pairs, expressions=("tongueOut",)))
+        train(Settings(pairs, expressions=("tongueOut",), out=tmp_path / "own"))
     for i in range(3):
         neutral = dome_rig.neutral
         if i == 2:
             neutral = replace(neutral, faces=neutral.faces[:-2], polygons=None)
         save_rig(BlendshapeRig(neutral, dome_rig.deltas, dome_rig.names), tmp_path / f"{i}.glb")
     with pytest.raises(TorchfaceError, match=r"found 2\.glb of topology"):
-        train(Settings(tmp_path))
+        train(Settings(tmp_path, out=tmp_path.parent / "own"))
+
+
+def test_people_on_disk_give_what_people_in_memory_give(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = gather(Settings(pairs), tmp_path, silent)
+    monkeypatch.setattr(people_samples, "_HELD_BYTES", 0)
+    read_again: list[str] = []
+    monkeypatch.setattr(recipe, "load_rig", lambda path: read_again.append(path.name) or load_rig(path))
+    (tmp_path / "person_000005.safetensors").write_bytes(b"cut")
+    with pytest.warns(UserWarning, match="damaged checkpoint"):
+        kept = gather(Settings(pairs), tmp_path, silent)
+    assert read_again == ["person0", "person5"]  # the first is every run's template
+    assert not isinstance(kept.offsets, type(held.offsets))
+    for i in range(8):
+        assert torch.equal(kept.offsets_of(i), held.offsets_of(i))
+        assert torch.equal(kept.without(i).offsets.read(0, 7), held.without(i).offsets.read(0, 7))
+        assert torch.equal(kept.without(i).neutrals.read(2, 6), held.without(i).neutrals.read(2, 6))
+    asked = Settings(pairs, neutral_components=None, offset_components=None, ridge=None)
+    faces = held.expressions.read(0, 8).unflatten(1, (len(held.names), -1))
+    whole = ExpressionRegression.fit(held.neutrals.read(0, 8), faces, None, None, None)
+    for people in (held, kept):
+        for name, value in fit(people, asked).state_dict().items():
+            torch.testing.assert_close(value, whole.state_dict()[name], msg=name)
+
+
+def test_of_many_people_the_last_are_left_out_together(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(expression_table, "_MANY", 7)
+    monkeypatch.setattr(expression_table, "_TESTED", 2)
+    found = train(Settings(pairs, out=tmp_path / "own", pictured=0)).comparison
+    assert found is not None
+    assert (len(found.squared), found.learned) == (2, 6)
+    rest = gather(Settings(pairs), tmp_path / "work", silent).first(6)
+    assert rest.who[-1] == "person5"
+    mean = found.squared[:, :, METHODS.index("mean offset")]
+    people = gather(Settings(pairs), tmp_path / "work", silent)
+    truth = (people.offsets_of(7) - rest.mean_rig().deltas).double().square().sum((-1, -2))
+    torch.testing.assert_close(mean[1], truth)
+    assert "leaving out the last 2 people together" in (tmp_path / "own" / "CARD.md").read_text()

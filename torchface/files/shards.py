@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, ShapeError
 
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "U8": torch.uint8, "BOOL": torch.bool}
 
@@ -82,7 +82,13 @@ class Shards:
         return found
 
     def read(self, begin: int, end: int) -> dict[str, Tensor]:
-        """Rows ``begin`` to ``end``, without the last, by name."""
+        """Rows ``begin`` to ``end``, without the last, by name.
+
+        Raises:
+            ShapeError: there are no such rows.
+        """
+        if not 0 <= begin < end <= len(self):
+            raise ShapeError(f"shards: found rows {begin} to {end}, expected some of {len(self)}")
         first, last = torch.searchsorted(self._ends, torch.tensor([begin, end - 1]), right=True).tolist()
         parts = []
         for number in range(first, last + 1):

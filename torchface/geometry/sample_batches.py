@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from torchface.geometry.similarity import Similarity
@@ -76,6 +77,25 @@ class SampleRange:
     def read(self, begin: int, end: int) -> Tensor:
         """See :class:`Samples`."""
         return self.samples.read(self.begin + begin, self.begin + end)
+
+
+@dataclass(frozen=True, eq=False)
+class SamplesWithout:
+    """All samples but one."""
+
+    samples: Samples
+    left_out: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """M, V, C."""
+        return (self.samples.shape[0] - 1, *self.samples.shape[1:])
+
+    def read(self, begin: int, end: int) -> Tensor:
+        """See :class:`Samples`."""
+        parts = [(begin, min(end, self.left_out)), (max(begin, self.left_out) + 1, end + 1)]
+        read = [self.samples.read(first, last) for first, last in parts if first < last]
+        return read[0] if len(read) == 1 else torch.cat(read)
 
 
 def blocks(samples: Samples, largest: int = _BLOCK_BYTES) -> Iterator[tuple[int, int]]:
