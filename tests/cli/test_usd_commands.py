@@ -10,8 +10,8 @@ import torch
 from reading_here import same_process  # noqa: F401
 
 from torchface.cli import main
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io import load_animation, load_rig, save_animation, save_mesh, save_rig
+from torchface.errors import ValueRangeError
+from torchface.io import load_animation, load_rig, save_animation, save_mesh
 from torchface.mesh import Annotations
 from torchface.registration.landmark_files import load_scan_landmarks
 from torchface.rig import BlendshapeRig
@@ -20,7 +20,6 @@ from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS
 from torchface.workflows.posed_mesh import load_posed
 from torchface.workflows.register.register_scans import load_template
-from torchface.workflows.rig.actor_rig import check_out
 
 pytestmark = pytest.mark.usefixtures("same_process")
 
@@ -84,11 +83,3 @@ def test_points_beside_a_usd_scan_need_their_unit(dome_rig: BlendshapeRig, tmp_p
         load_scan_landmarks(tmp_path / "scan.pts", template, tmp_path / "scan.usdc")
     _, points = load_scan_landmarks(tmp_path / "scan.pts", template, tmp_path / "scan.usdc", "cm")
     assert points[0].tolist() == [0, 0, 10]
-
-
-def test_wrinkles_for_usd_are_refused_before_any_work(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    check_out(tmp_path / "actor.usdc")
-    with pytest.raises(FileFormatError, match="wrinkle maps for a USD file"):
-        check_out(tmp_path / "actor.usdc", has_detail=True)
-    save_rig(dome_rig, tmp_path / "actor.usd")
-    assert load_rig(tmp_path / "actor.usd").names == dome_rig.names

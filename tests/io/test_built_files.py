@@ -23,7 +23,7 @@ from torchface.io import (
     load_take,
 )
 from torchface.io.action_labels import load_action_labels
-from torchface.io.gltf import load_detail_maps, read_gltf_rig
+from torchface.io.gltf import read_gltf_detail, read_gltf_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks.scans.scan_annotations import load_annotations
@@ -43,7 +43,7 @@ READERS: list[tuple[Callable[[Path], object], str, str]] = [
     (load_mesh, "built_meshes", "gltf_files"),
     (read_gltf_rig, "built_meshes", "gltf_files"),
     (read_gltf_weights, "built_meshes", "gltf_files"),
-    (load_detail_maps, "built_meshes", "gltf_files"),
+    (read_gltf_detail, "built_meshes", "gltf_files"),
     (load_rig, "built_meshes", "rig_folders"),
     (load_take, "built_takes", "c3d_files"),
     (load_take, "built_takes", "trc_files"),

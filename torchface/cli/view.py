@@ -32,6 +32,7 @@ def view(
         quiet: Show no progress.
     """
     from torchface.io import load_detail_maps, load_rig, load_take
+    from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, import_viser
     from torchface.viz.browser.free_port import free_port
     from torchface.viz.browser.rig_viewer import RigViewer
@@ -43,7 +44,7 @@ def view(
     with progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded = load_rig(rig, part=part)
-        detail = load_detail_maps(rig) if rig.suffix.lower() == ".glb" else None
+        detail = load_detail_maps(rig) if rig.suffix.lower() in SCENE_ENDINGS else None
         take = None
         if weights is not None:
             progress("reading the take")

@@ -2,7 +2,8 @@
 
 from torchface.io.animation_files import load_animation, save_animation
 from torchface.io.camera_files import load_calibration, save_calibration
-from torchface.io.gltf import load_detail_maps, load_region_maps
+from torchface.io.detail_files import load_detail_maps
+from torchface.io.gltf import load_region_maps
 from torchface.io.images.image_files import load_image, save_image, save_image16
 from torchface.io.images.normal_map_files import load_normal_map, save_normal_map
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts

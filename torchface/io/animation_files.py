@@ -26,7 +26,7 @@ def save_animation(
         rig: the rig.
         take: with ``weights``; names are matched by ``shape_names.mapping``.
         path: a ``.glb``, or ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``; it appears only when it is complete.
-        detail: wrinkle maps of the rig's shapes or regions, for ``.glb`` alone.
+        detail: wrinkle maps of the rig's shapes, or of its regions, for ``.glb`` alone.
 
     Returns:
         ``ShapeMatch(driven, missing, unused)``.

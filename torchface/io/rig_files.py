@@ -77,7 +77,7 @@ def save_rig(rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMa
         path: a ``.glb``, see ``torchface.io.gltf``; a ``.usda``, ``.usdc``, ``.usd`` or ``.usdz``, see
             ``torchface.io.usd``; or a name without an ending, for a folder of ``neutral.obj`` and an OBJ a shape, see
             ``save_obj_folder``. It appears only when it is complete.
-        detail: wrinkle maps of its shapes, which USD has no place for, or of its regions, for ``.glb`` alone.
+        detail: wrinkle maps of its shapes, or of its regions, for ``.glb`` alone.
 
     Raises:
         FileFormatError: another ending, a folder that holds another rig, or one that cannot be written to.
@@ -98,23 +98,24 @@ def write_rig(
     rig: BlendshapeRig, path: str | Path, detail: DetailMaps | RegionMaps | None, keys: WeightKeys | None
 ) -> None:
     """Writes a rig, with ``keys`` as the animation of its shapes; see :func:`save_rig`."""
-    check_rig_ending(path, detail is not None)
+    check_rig_ending(path)
     suffix = Path(path).suffix.lower()
     if suffix == ".glb":
         write_gltf_rig(rig, path, detail, keys)
-    elif suffix in USD_ENDINGS:
-        write_usd_rig(rig, path, keys)
     elif isinstance(detail, RegionMaps):
-        raise FileFormatError(f"{path}: found wrinkle maps by region for a folder of OBJ files, expected .glb for them")
+        kind = "a USD file" if suffix in USD_ENDINGS else "a folder of OBJ files"
+        raise FileFormatError(f"{path}: found wrinkle maps by region for {kind}, expected .glb for them")
+    elif suffix in USD_ENDINGS:
+        write_usd_rig(rig, path, keys, detail)
     else:
         save_obj_folder(rig, path, detail)
 
 
-def check_rig_ending(path: str | Path, has_detail: bool = False) -> None:
+def check_rig_ending(path: str | Path) -> None:
     """Refuses what no rig can be written to.
 
     Raises:
-        FileFormatError: another ending; or USD, and there are wrinkle maps.
+        FileFormatError: another ending.
         MissingExtraError: USD, and usd-core is not installed.
     """
     suffix = Path(path).suffix.lower()
@@ -124,5 +125,3 @@ def check_rig_ending(path: str | Path, has_detail: bool = False) -> None:
         )
     if suffix in USD_ENDINGS:
         require_usd()
-        if has_detail:
-            raise FileFormatError(f"{path}: found wrinkle maps for a USD file, expected .glb or a folder for them")

@@ -11,7 +11,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.rig_files import GLTF_ENDINGS, SCENE_ENDINGS, check_rig_ending, write_rig
+from torchface.io.rig_files import SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
 from torchface.io.usd import require_usd
@@ -81,7 +81,7 @@ def convert_file(
         save_mesh(found.mesh, out)
         return found
     rig = renamed(found.rig, names)
-    detail = load_detail_maps(source) if source.suffix.lower() in GLTF_ENDINGS and part is None else None
+    detail = load_detail_maps(source) if source.suffix.lower() in SCENE_ENDINGS and part is None else None
     notes = _write(rig, found.take, renamed_detail(detail, found.rig, names), out)
     return Converted(rig.neutral, rig, found.take, (*naming_lines(found.rig, names), *notes))
 
@@ -114,7 +114,7 @@ def _write(rig: BlendshapeRig, take: Take | None, detail: DetailMaps | None, out
     if take is not None and not suffix:
         notes.append("a folder of OBJ files has no place for the animation, which is left out")
         take = None
-    if detail is not None and suffix not in ("", ".glb"):
+    if detail is not None and suffix in BLENDER_ENDINGS:
         notes.append(f"{suffix} has no place for the wrinkle maps of {len(detail.names)} shapes, which are left out")
         detail = None
     keys = None if take is None else weight_keys(rig, take)[0]

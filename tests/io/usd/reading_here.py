@@ -18,7 +18,8 @@ pytest.importorskip("pxr")
 def read_here(command: Sequence[str], path: Path, reader: str, seconds: float) -> Scene:
     """What ``read_scene`` gives, by the same functions in this process."""
     try:
-        record, arrays = stage_process.extract(path.absolute(), lambda size: None)
+        extract = stage_process.extract_maps if "--maps" in command else stage_process.extract
+        record, arrays = extract(path.absolute(), lambda size: None)
     except stage_process.Refused as refused:
         raise FileFormatError(f"{path}: found {refused.found}, expected {refused.expected}") from None
     scene = Scene(path, json.loads(json.dumps(record)), arrays)

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from mutation import mutated
 from rig_samples import sheet_rig, sheet_take
 from test_usd_scenes import ANIMATION, QUAD, SHAPES, head, mesh_prim, usda
 
 from torchface.errors import FileFormatError, MissingExtraError, TorchfaceError
-from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_animation, load_mesh, load_rig, save_animation, save_rig
 from torchface.io.usd import stage_process
 
@@ -242,12 +240,6 @@ def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path
     for attempt in (lambda: load_rig(tmp_path / "a.usdc"), lambda: save_rig(sheet_rig(), tmp_path / "a.usdc")):
         with pytest.raises(MissingExtraError, match=r"usd-core is not installed.*pip install '\.\[usd\]'"):
             attempt()
-
-
-def test_wrinkle_maps_have_no_place_in_usd(tmp_path: Path) -> None:
-    detail = DetailMaps(("jawOpen",), torch.zeros(1, 3, 4, 4))
-    with pytest.raises(FileFormatError, match=r"found wrinkle maps for a USD file, expected \.glb or a folder"):
-        save_rig(sheet_rig(), tmp_path / "a.usdc", detail)
 
 
 @pytest.mark.parametrize("ending", [".usda", ".usdz"])

@@ -41,11 +41,7 @@ def write_detail(
         TopologyError: the mesh has no texture coordinates.
         NameMismatchError: a map belongs to no shape.
     """
-    if mesh.uvs is None:
-        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
-    missing = [name for name in detail.names if name not in names]
-    if missing:
-        raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
+    check_detail(detail, mesh, names)
     if detail.neutral is not None:
         image = encode_png(encode_normals(detail.neutral))
         root["materials"][0]["normalTexture"] = {"index": buffers.texture(root, image, name="neutral_normals")}
@@ -57,6 +53,20 @@ def write_detail(
         for name, normals in zip(detail.names, detail.maps, strict=True)
     ]
     root["meshes"][0]["extras"]["torchface"][_LIST] = listed
+
+
+def check_detail(detail: DetailMaps, mesh: Mesh, names: Sequence[str]) -> None:
+    """Checks that a rig's file can hold maps.
+
+    Raises:
+        TopologyError: the mesh has no texture coordinates.
+        NameMismatchError: a map belongs to no shape.
+    """
+    if mesh.uvs is None:
+        raise TopologyError("detail: found wrinkle maps for a mesh without texture coordinates, expected uvs")
+    missing = [name for name in detail.names if name not in names]
+    if missing:
+        raise NameMismatchError(f"detail: the rig has no shape {', '.join(map(repr, missing[:5]))}")
 
 
 def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
@@ -74,7 +84,7 @@ def corner_tangents(mesh: Mesh) -> NDArray[np.float32]:
     return rows.float().numpy()
 
 
-def load_detail_maps(path: str | Path) -> DetailMaps | None:
+def read_gltf_detail(path: str | Path) -> DetailMaps | None:
     """The wrinkle maps of a ``.glb``; none where it has neither such maps nor a normal texture.
 
     Raises:
@@ -84,7 +94,7 @@ def load_detail_maps(path: str | Path) -> DetailMaps | None:
         >>> from torchface.io import save_mesh
         >>> from torchface.synthetic import neutral_head
         >>> save_mesh(neutral_head(texture=False), "smooth.glb")
-        >>> load_detail_maps("smooth.glb") is None
+        >>> read_gltf_detail("smooth.glb") is None
         True
     """
     document = read_document(path)

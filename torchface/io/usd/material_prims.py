@@ -39,7 +39,7 @@ class _Look:
     painted: bool = False
 
 
-def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem: str) -> dict[str, bytes]:
+def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem: str) -> tuple[dict[str, bytes], str]:
     """Binds materials to a mesh prim; parts that regions name are ``GeomSubset``s of its polygons.
 
     Args:
@@ -51,7 +51,7 @@ def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem
         stem: what names of image files begin with.
 
     Returns:
-        PNG files by name, which belong beside the layer.
+        PNG files by name, which belong beside the layer, and the path of the first material, the face's.
     """
     scope = usd.UsdGeom.Scope.Define(stage, f"{root}/materials").GetPath()
     looks = _polygons_by_look(mesh, stem)
@@ -67,7 +67,7 @@ def write_materials(usd: Any, stage: Any, prim: Any, mesh: Mesh, root: str, stem
     if len(looks) > 1:
         binding.SetMaterialBindSubsetsFamilyType(usd.UsdGeom.Tokens.partition)
     images = dict(look.image for look in looks if look.image is not None)
-    return {name: encode_png(image) for name, image in images.items()}
+    return {name: encode_png(image) for name, image in images.items()}, f"{scope}/{next(iter(looks)).name}"
 
 
 def _polygons_by_look(mesh: Mesh, stem: str) -> dict[_Look, NDArray[np.int64]]:
@@ -138,16 +138,20 @@ def _material(usd: Any, stage: Any, path: str, look: _Look) -> Any:
 
 def _texture(usd: Any, stage: Any, path: str, image: str) -> Any:
     types = usd.Sdf.ValueTypeNames
-    coordinates = _reader(usd, stage, f"{path}/coordinates", "UsdPrimvarReader_float2", "st")
     texture = usd.UsdShade.Shader.Define(stage, f"{path}/texture")
     texture.CreateIdAttr("UsdUVTexture")
     texture.CreateInput("file", types.Asset).Set(f"./{image}")
     texture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
     for side in ("wrapS", "wrapT"):
         texture.CreateInput(side, types.Token).Set("repeat")
-    result = coordinates.CreateOutput("result", types.Float2)
-    texture.CreateInput("st", types.Float2).ConnectToSource(result)
+    texture.CreateInput("st", types.Float2).ConnectToSource(coordinate_reader(usd, stage, path))
     return texture
+
+
+def coordinate_reader(usd: Any, stage: Any, material: str) -> Any:
+    """What gives the textures of the material at a path the mesh's texture coordinates; one a material."""
+    reader = _reader(usd, stage, f"{material}/coordinates", "UsdPrimvarReader_float2", "st")
+    return reader.CreateOutput("result", usd.Sdf.ValueTypeNames.Float2)
 
 
 def _reader(usd: Any, stage: Any, path: str, kind: str, primvar: str) -> Any:

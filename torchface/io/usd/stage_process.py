@@ -2,8 +2,8 @@
 
 ``python stage_process.py FILE FOLDER`` writes ``scene.json`` and ``arrays.npz`` (see
 ``torchface.io.scene_processes.scene_arrays``) into the folder, or ``refused.json``, a list of what was found and what
-was expected. OpenUSD is C++ that trusts its files: here a crash, a count of gigabytes or an endless composition ends a
-process that has nothing to lose.
+was expected; with ``--maps`` before FILE those of its wrinkle maps (see ``extract_maps``). OpenUSD is C++ that trusts
+its files: here a crash, a count of gigabytes or an endless composition ends a process that has nothing to lose.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import posixpath
 import re
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ _OUTPUT_ALWAYS, _OUTPUT_A_BYTE = 2**27, 8
 _SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 5, 2
 _MAX_LAYERS, _MAX_PRIMS, _MAX_MESHES = 256, 200_000, 4096
 _LARGEST_FILE = 2**31
-_NOTES, _PAINTED = "torchface", "torchface_painted"
+_NOTES, _PAINTED, _WRINKLE_MAPS = "torchface", "torchface_painted", "wrinkleMaps"
 _UV_NAMES = ("st", "UVMap", "st0", "map1", "uv", "uvs")
 _COORDINATES = "UsdPrimvarReader_float2"
 
@@ -49,13 +50,10 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
     Raises:
         Refused: the file is broken, names layers outside its folder, has no mesh, or its topology is animated.
     """
-    from pxr import Sdf, Tf, Usd, UsdGeom
+    from pxr import Usd, UsdGeom
 
-    try:
-        layers = _Layers(path, limit)
-        layers.open_all()
-        stage = Usd.Stage.Open(Sdf.Layer.FindOrOpen(str(path)), Usd.Stage.LoadAll)
-        layers.check(stage)
+    with _refusals():
+        layers, stage = _opened(path, limit)
         scene: dict[str, Any] = {
             "metres_per_unit": float(UsdGeom.GetStageMetersPerUnit(stage)),
             "up": str(UsdGeom.GetStageUpAxis(stage)),
@@ -85,6 +83,41 @@ def extract(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], d
             layers.leave(f"{len(layers.images)} textures ({shown}), of which a mesh has one: the first is taken")
         scene["left_out"] = layers.left_out
         return scene, arrays
+
+
+def extract_maps(path: Path, limit: Callable[[int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The wrinkle maps of the first mesh that has some: names of ``shapes``, and images, encoded.
+
+    Images are named ``0``, ``1`` and so on by the shape that they belong to, and ``neutral``. Arguments and errors as
+    of :func:`extract`.
+    """
+    with _refusals():
+        layers, stage = _opened(path, limit)
+        found: tuple[list[str], dict[str, Any]] = [], {}
+        for number, prim in enumerate(_mesh_prims(stage)):
+            if found[1] or number == _MAX_MESHES:
+                break
+            found = _MeshReader(stage, prim, layers).maps()
+        return {"shapes": found[0], "bytes": layers.size, "left_out": layers.left_out}, found[1]
+
+
+def _opened(path: Path, limit: Callable[[int], None]) -> tuple[_Layers, Any]:
+    from pxr import Sdf, Usd
+
+    layers = _Layers(path, limit)
+    layers.open_all()
+    stage = Usd.Stage.Open(Sdf.Layer.FindOrOpen(str(path)), Usd.Stage.LoadAll)
+    layers.check(stage)
+    return layers, stage
+
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Refuses what OpenUSD raises."""
+    from pxr import Tf
+
+    try:
+        yield
     except Tf.ErrorException as error:
         raise Refused(_shown(_said(error), 300), "a whole USD file") from error
     except (RuntimeError, ValueError, TypeError) as error:  # prims that are gone, text that is no UTF-8, other types
@@ -364,6 +397,38 @@ class _MeshReader:
                 found = image, str(primvar) if primvar else None
         return found
 
+    def maps(self) -> tuple[list[str], dict[str, Any]]:
+        """The shapes that have wrinkle maps, and the images, encoded, by their numbers and ``neutral``."""
+        from pxr import Sdf, UsdShade
+
+        listed = self._noted_maps()
+        subsets = UsdShade.MaterialBindingAPI(self.prim).GetMaterialBindSubsets()
+        for prim in [*(subset.GetPrim() for subset in subsets), self.prim]:
+            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+            surface = material.ComputeSurfaceSource()[0] if material else None
+            named = {"neutral": _source(surface, "normal")}
+            for number, (_, name) in enumerate(listed):
+                if surface and Sdf.Path.IsValidIdentifier(name):
+                    named[f"{number}"] = UsdShade.Shader.Get(self.stage, material.GetPath().AppendChild(name))
+            images = {key: self._image(texture, read=True) for key, texture in named.items() if texture}
+            found = {key: np.frombuffer(image, np.uint8) for key, image in images.items() if image is not None}
+            if found:
+                missing = [name for number, (_, name) in enumerate(listed) if f"{number}" not in found]
+                if missing:
+                    raise Refused(f"{self.place}: no texture {_shown(missing[0])}", "one for each wrinkle map noted")
+                return [shape for shape, _ in listed], found
+        return [], {}
+
+    def _noted_maps(self) -> list[tuple[str, str]]:
+        """Shapes and names of textures that torchface noted."""
+        notes = self.prim.GetCustomDataByKey(_NOTES)
+        try:
+            listed = json.loads(notes)[_WRINKLE_MAPS] if isinstance(notes, str) else []
+            found = [(one["shape"], one["texture"]) for one in listed]
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return []
+        return found if all(isinstance(name, str) for one in found for name in one) else []
+
     def _image(self, texture: Any, read: bool) -> bytes | None:
         """The image of a texture, encoded; none where there is none, or it is not to be read."""
         from pxr import Ar
@@ -524,13 +589,13 @@ def _addresses() -> int:
     return int(status.read_text().split()[0]) * os.sysconf("SC_PAGESIZE") if status.exists() else 2**40
 
 
-def main(path: Path, folder: Path) -> None:
+def main(path: Path, folder: Path, what: Callable[..., tuple[dict[str, Any], dict[str, Any]]]) -> None:
     """Reads ``path`` and writes what came of it into ``folder``."""
     from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel  # noqa: F401  all of them before the limits hold
 
     start = _addresses()
     try:
-        scene, arrays = extract(path, lambda size: limit_growth(start, size))
+        scene, arrays = what(path, lambda size: limit_growth(start, size))
     except Refused as refused:
         (folder / "refused.json").write_text(json.dumps([refused.found, refused.expected]))
         return
@@ -542,4 +607,4 @@ def main(path: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[-2]), Path(sys.argv[-1]), extract_maps if "--maps" in sys.argv[1:-2] else extract)

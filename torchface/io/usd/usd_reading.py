@@ -42,7 +42,7 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
         >>> read_usd_rig("actor.usda").names
         ('jawOpen',)
     """
-    rig = scene_rig(_scene(path), unit)
+    rig = scene_rig(read_stage(path), unit)
     if rig is None:
         raise FileFormatError(f"{path}: found no blend shape on its meshes, expected at least one for a rig")
     return rig
@@ -57,7 +57,7 @@ def read_usd_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         >>> read_usd_mesh("triangle.usda").faces.tolist()
         [[0, 1, 2]]
     """
-    return scene_mesh(_scene(path), unit)
+    return scene_mesh(read_stage(path), unit)
 
 
 def read_usd_weights(path: str | Path) -> Take | None:
@@ -73,16 +73,17 @@ def read_usd_weights(path: str | Path) -> Take | None:
         >>> read_usd_weights("still.usda") is None
         True
     """
-    return scene_weights(_scene(path))
+    return scene_weights(read_stage(path))
 
 
-def _scene(path: str | Path) -> Scene:
+def read_stage(path: str | Path, *options: str) -> Scene:
+    """What the process finds in a file, see ``stage_process``; errors as of :func:`read_usd_rig`."""
     require_usd()
     path = Path(path)
     size = checked_size(path)
     script = str(Path(stage_process.__file__).resolve())
     seconds = _SECONDS_ALWAYS + _SECONDS_A_MEGABYTE * size / 2**20
-    return read_scene([sys.executable, "-P", script], path, "OpenUSD", seconds)
+    return read_scene([sys.executable, "-P", script, *options], path, "OpenUSD", seconds)
 
 
 def checked_size(path: Path) -> int:

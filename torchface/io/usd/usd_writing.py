@@ -21,13 +21,16 @@ from torchface.color_space import to_linear
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import all_or_none, replaced_file, write_file
 from torchface.files.write_errors import unwritten
+from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io.gltf.corrective_extras import write_correctives
 from torchface.io.gltf.mesh_extras import write_extras
 from torchface.io.gltf.primitive_writing import MIN_MOVE, MIN_ROTATION, metres, shading_normals
+from torchface.io.gltf.wrinkle_maps import check_detail
 from torchface.io.meshes.polygons import corners_of_polygons
 from torchface.io.scenes.weight_keys import WeightKeys
 from torchface.io.usd.material_prims import write_materials
 from torchface.io.usd.usd_library import usd_library
+from torchface.io.usd.wrinkle_prims import write_wrinkles
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
@@ -38,7 +41,9 @@ NOTES = "torchface"
 _ROOT, _MESH, _SKELETON, _ANIMATION = "/rig", "/rig/face", "/rig/skeleton", "/rig/performance"
 
 
-def write_usd_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None = None) -> None:
+def write_usd_rig(
+    rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None = None, detail: DetailMaps | None = None
+) -> None:
     """Writes a rig as USD in metres: one mesh in the rig's order of vertices and polygons, a ``BlendShape`` a shape.
 
     The mesh lies with a skeleton without joints, through which UsdSkel finds the animation, under one ``SkelRoot``.
@@ -55,11 +60,13 @@ def write_usd_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None 
             them, and images of eyes and lashes that no texture shows; ``.usdz`` holds all. It appears only when it is
             complete.
         keys: an animation of its shapes, by way of ``skel:animationSource``; a frame is a time code.
+        detail: wrinkle maps of its shapes; see ``wrinkle_prims``.
 
     Raises:
         MissingExtraError: usd-core is not installed.
         FileFormatError: the folder cannot be written to.
-        TopologyError: the mesh has no triangle.
+        TopologyError: the mesh has no triangle, or wrinkle maps and no texture coordinates.
+        NameMismatchError: a wrinkle map belongs to no shape of the rig.
 
     Example:
         >>> from pathlib import Path
@@ -68,7 +75,9 @@ def write_usd_rig(rig: BlendshapeRig, path: str | Path, keys: WeightKeys | None 
         >>> 'skel:blendShapes = ["jawOpen"]' in Path("actor.usda").read_text()
         True
     """
-    _write(path, rig.neutral, rig, keys)
+    if detail is not None:
+        check_detail(detail, rig.neutral, rig.names)
+    _write(path, rig.neutral, rig, keys, detail)
 
 
 def write_usd_mesh(mesh: Mesh, path: str | Path) -> None:
@@ -80,10 +89,12 @@ def write_usd_mesh(mesh: Mesh, path: str | Path) -> None:
         >>> "metersPerUnit = 1" in Path("triangle.usda").read_text()
         True
     """
-    _write(path, mesh, None, None)
+    _write(path, mesh, None, None, None)
 
 
-def _write(path: str | Path, mesh: Mesh, rig: BlendshapeRig | None, keys: WeightKeys | None) -> None:
+def _write(
+    path: str | Path, mesh: Mesh, rig: BlendshapeRig | None, keys: WeightKeys | None, detail: DetailMaps | None
+) -> None:
     path, usd = Path(path), usd_library()
     if len(mesh.faces) == 0:
         raise TopologyError(f"{path}: the mesh has no triangle; USD's readers need one")
@@ -93,7 +104,7 @@ def _write(path: str | Path, mesh: Mesh, rig: BlendshapeRig | None, keys: Weight
     with _usd_errors(path, usd), tempfile.TemporaryDirectory(prefix="torchface-usd-") as folder:
         layer = Path(folder, stem + (".usda" if path.suffix.lower() == ".usda" else ".usdc"))
         stage = usd.Usd.Stage.CreateInMemory()
-        images = _fill(usd, stage, mesh, rig, keys, stem)
+        images = _fill(usd, stage, mesh, rig, keys, detail, stem)
         if not stage.GetRootLayer().Export(str(layer)):
             raise FileFormatError(f"{path}: cannot be written (USD could not export it to {folder})")
         if packed:
@@ -129,7 +140,13 @@ def _usd_errors(path: Path, usd: Any) -> Iterator[None]:
 
 
 def _fill(
-    usd: Any, stage: Any, mesh: Mesh, rig: BlendshapeRig | None, keys: WeightKeys | None, stem: str
+    usd: Any,
+    stage: Any,
+    mesh: Mesh,
+    rig: BlendshapeRig | None,
+    keys: WeightKeys | None,
+    detail: DetailMaps | None,
+    stem: str,
 ) -> dict[str, bytes]:
     """Puts all into a stage; the images that belong beside it, by name."""
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -139,8 +156,11 @@ def _fill(
     usd.Usd.ModelAPI(root).SetKind("component")
     stage.SetDefaultPrim(root)
     prim = _mesh(usd, stage, mesh)
-    images = write_materials(usd, stage, prim, mesh, _ROOT, stem)
+    images, face = write_materials(usd, stage, prim, mesh, _ROOT, stem)
     notes = write_extras(mesh)
+    if detail is not None:
+        maps, listed = write_wrinkles(usd, stage, face, detail, stem)
+        images, notes = images | maps, notes | listed
     notes.pop("polygons", None)  # the mesh has them
     if rig is not None:
         targets = _targets(rig)

@@ -169,7 +169,7 @@ def rig_actor(
         AlignmentError: not one example, or not one scan of details, could be used.
         TorchfaceError: neutral scan, template or an option is of no use.
     """
-    check_out(out, detail is not None)
+    check_out(out)
     with file_lock(out):
         return _rig_actor(scan, template, out, landmarks, examples, detail, options or RigOptions(), progress or silent)
 
@@ -349,9 +349,9 @@ def _detail(maps: dict[str, tuple[tuple[str, ...], NormalMap]]) -> DetailMaps | 
     return detail_maps([shape for shape, _ in named], [baked for _, baked in named], neutral)
 
 
-def check_out(out: Path, has_detail: bool = False) -> None:
-    """Refuses what a rig, with wrinkle maps or without, cannot be written to, before any work is done."""
-    check_rig_ending(out, has_detail)
+def check_out(out: Path) -> None:
+    """Refuses what a rig cannot be written to, before any work is done."""
+    check_rig_ending(out)
     if out.suffix:
         check_writable(out)
     else:
