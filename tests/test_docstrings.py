@@ -19,12 +19,14 @@ MODULES = sorted(
     for path in LIBRARY.rglob("*.py")
     if ">>> " in path.read_text(encoding="utf-8")
 )
-# What always holds float32: pictures and their figures, graphs, a trained classifier.
+# What holds float32 whatever numbers become: files, pictures and their figures, graphs, the sculpted performer.
 FLOAT32 = (
     "torchface.capture.action_units.classifier_training",
+    "torchface.io.",
     "torchface.landmarks.images.network_detector",
     "torchface.onnx.",
     "torchface.rendering.clay_shading",
+    "torchface.synthetic.",
     "torchface.viz.",
 )
 

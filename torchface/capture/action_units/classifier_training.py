@@ -40,7 +40,7 @@ class TrainingSettings:
         seed: of k-means and the warps.
 
     Example:
-        >>> TrainingSettings(levels=3).levels
+        >>> TrainingSettings(levels=3).levels  # rest, and two intensities
         3
     """
 

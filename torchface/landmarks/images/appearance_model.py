@@ -43,8 +43,8 @@ class AppearanceSettings:
         mirror: learn from every image's mirror image too.
 
     Example:
-        >>> AppearanceSettings(resolutions=(16.0,), iterations=5).features
-        'oriented_gradients'
+        >>> AppearanceSettings.of({"resolutions": [16.0]}) == AppearanceSettings(resolutions=(16.0,))  # as in files
+        True
     """
 
     features: Features = "oriented_gradients"

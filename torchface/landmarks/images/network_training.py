@@ -33,8 +33,8 @@ class NetworkSettings(DescentSettings):
         augmentation: how widely crops are drawn.
 
     Example:
-        >>> NetworkSettings(steps=100, batch=8).steps
-        100
+        >>> NetworkSettings().steps * NetworkSettings().batch  # crops that a network sees
+        512000
     """
 
     workers: int = 1

@@ -39,8 +39,12 @@ class TraceSettings:
         end_tolerance: a corner is only known to within so many pixels up or down.
 
     Example:
-        >>> TraceSettings(border=20).border
-        20
+        >>> image = torch.ones(1, 100, 100)
+        >>> image[0, 60] = 0.0  # a dark line, ten pixels below the corners
+        >>> corners = torch.tensor([20.0, 50.0]), torch.tensor([80.0, 50.0])
+        >>> wide, narrow = (trace_contour(image, *corners, TraceSettings(border=rows)) for rows in (50, 2))
+        >>> wide.points[30, 1].item() > 55, narrow.points[30, 1].item() > 55  # the line is out of reach
+        (True, False)
     """
 
     border: int = 50

@@ -22,7 +22,7 @@ class DetectorSettings:
         bandwidth: of the mean shift.
 
     Example:
-        >>> DetectorSettings(responses=160).matches
+        >>> DetectorSettings(responses=160).matches  # each stands for sixteen pixels
         10
     """
 

@@ -84,8 +84,9 @@ def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int 
     Example:
         >>> from torchface.synthetic import neutral_head
         >>> head = neutral_head(texture=False)
-        >>> heat_map(head, head.vertices[:, 2].clamp(min=0), 100.0, "depth (mm)", width=32, height=40).shape[0]
-        3
+        >>> picture = heat_map(head, head.vertices[:, 2].clamp(min=0), 100.0, "depth (mm)", width=32, height=40)
+        >>> picture.shape[2] > 3 * 32  # three views and the scale
+        True
     """
     row = face_views(mesh, colors=heat_colors(values, maximum), width=width, height=height)
     return sheet([row, color_bar(maximum, label, row.shape[1])], 2)

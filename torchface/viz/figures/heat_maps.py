@@ -53,8 +53,10 @@ def error_views(mesh: Mesh, errors: Tensor, maximum: float, title: str, height: 
     Example:
         >>> from torchface.synthetic import neutral_head
         >>> head = neutral_head(texture=False)
-        >>> error_views(head, torch.zeros(len(head.vertices)), 1.0, "no error", height=60).shape[0]
-        3
+        >>> picture = error_views(head, torch.zeros(len(head.vertices)), 1.0, "no error", height=60)
+        >>> middle = picture[:, picture.shape[1] // 2]
+        >>> bool((middle[1] > middle[0] + 0.1).any())  # a green face
+        True
     """
     row = face_views(mesh, colors=error_colors(errors, maximum), width=height * 4 // 5, height=height)
     return headed(sheet([row, _scale(maximum, row.shape[1])], 2), title)
@@ -75,8 +77,9 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
     Example:
         >>> from torchface.synthetic import neutral_head
         >>> head = neutral_head(texture=False)
-        >>> compared_views(head, head, torch.zeros(len(head.vertices)), 1.0, "the same", height=60).shape[0]
-        3
+        >>> picture = compared_views(head, head, torch.zeros(len(head.vertices)), 1.0, "the same", height=60)
+        >>> picture.shape[1] > 3 * 60  # three rows
+        True
     """
     width = height * 4 // 5
     rows = [
