@@ -53,6 +53,14 @@ def fit_expressions(
         ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
         ValueRangeError: NaN or infinity, neutrals that are all the same, or a negative ridge.
         NameMismatchError: not one name an expression, or one twice.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> faces = 50 * torch.randn(1, 40, 3, generator=generator) + torch.randn(8, 40, 3, generator=generator)
+        >>> smiles = faces[:, None] + torch.tensor([0.0, 5.0, 0.0])  # everybody's goes up by as much
+        >>> regression = fit_expressions(faces, smiles, names=["smile"])
+        >>> bool((regression(faces[:1]) - smiles[:1]).abs().max() < 0.1)
+        True
     """
     names = [f"expression{i}" for i in range(expressions.shape[1])] if names is None else list(names)
     _check_examples(neutrals, expressions, names)
@@ -95,6 +103,15 @@ def fit_expression_samples(
         progress: called with each step and how far it is.
 
     All others, Raises: as :func:`fit_expressions`.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> faces = 50 * torch.randn(1, 40, 3, generator=generator) + torch.randn(8, 40, 3, generator=generator)
+        >>> smiles = faces + torch.tensor([0.0, 5.0, 0.0])
+        >>> in_blocks = fit_expression_samples(SamplesInMemory(faces), SamplesInMemory(smiles), ["smile"])
+        >>> at_once = fit_expressions(faces, smiles[:, None], names=["smile"])
+        >>> torch.allclose(in_blocks(faces), at_once(faces), atol=1e-3)
+        True
     """
     progress = progress or silent
     for what, found in (("neutral_components", neutral_components), ("offset_components", offset_components)):
