@@ -41,6 +41,7 @@ test-cluster: $(VENV)/.installed-cluster
 bench: $(VENV)/.installed-bench
 	$(RUN) -m pytest tests/benchmarks -s
 	$(RUN) -m pytest -m bench
+	$(RUN) docs/quote_figures.py
 
 fuzz: $(VENV)/.installed-test
 	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k 'mutated or built'

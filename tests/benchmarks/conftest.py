@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_limits
 
+FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures.json"
 # Of every comparison, as PyPI names them.
 PEERS = (
     "numpy",
@@ -54,6 +56,18 @@ def one_thread() -> Iterator[None]:
 def print_machine() -> Callable[..., None]:
     """Prints processor, cores, threads, and the versions of the packages (names on PyPI) that are compared."""
     return lambda *packages: print("", *machine(*packages), sep="\n")
+
+
+@pytest.fixture
+def keep_figures(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Keeps figures by name, as texts, for the README; ``docs/quote_figures.py`` puts them there."""
+
+    def keep(**figures: str) -> None:
+        kept = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+        kept[request.path.stem] = {"machine": machine()[0], **figures}
+        FIGURES.write_text(json.dumps(kept, indent=2, sort_keys=True, ensure_ascii=False) + "\n")
+
+    return keep
 
 
 def machine(*packages: str) -> list[str]:

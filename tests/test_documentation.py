@@ -1,0 +1,53 @@
+"""What README, CONTRIBUTING and the pages under docs/ point to is there, and the README's figures are those that were kept."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+DOCS = REPOSITORY / "docs"
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+_LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+_BENCH = re.compile(r"\b(test_\w+\.py)\b")
+
+
+@pytest.fixture(scope="module")
+def quote_figures() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("quote_figures", DOCS / "quote_figures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_lead_to_files(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    lost = [link for link in _LINK.findall(text) if "://" not in link and not (page.parent / link).exists()]
+    assert not lost
+
+
+def test_benchmarks_that_pages_name_are_there() -> None:
+    named = {name for page in PAGES for name in _BENCH.findall(page.read_text())}
+    lost = [name for name in named if not any((REPOSITORY / "tests").rglob(name))]
+    assert not lost
+
+
+def test_readme_quotes_the_figures_that_were_kept(quote_figures: ModuleType) -> None:
+    readme = (REPOSITORY / "README.md").read_text()
+    assert quote_figures.quoted(readme, json.loads((DOCS / "figures.json").read_text())) == readme
+
+
+def test_a_figure_is_quoted_between_its_marks(quote_figures: ModuleType) -> None:
+    text = "takes <!-- bench time -->9 s<!-- / --> and <!-- bench size -->1 MB<!-- / -->"
+    told = quote_figures.quoted(text, {"bench": {"time": "2 s", "size": "3 MB"}})
+    assert told == "takes <!-- bench time -->2 s<!-- / --> and <!-- bench size -->3 MB<!-- / -->"
+    with pytest.raises(KeyError):
+        quote_figures.quoted(text, {"bench": {"time": "2 s"}})
