@@ -1,4 +1,4 @@
-"""What README, CONTRIBUTING and the pages under docs/ point to is there, and the README's figures are those that were kept."""
+"""What README, CONTRIBUTING and docs/ point to is there, and the README's figures are those that were kept."""
 
 from __future__ import annotations
 

@@ -269,13 +269,6 @@ def test_one_frame_at_a_time(
     show(f"{len(f)} real frames of one take, one at a time from the frame before", rows)
 
     found = {row.name: row for row in rows}
-    if "DAQP, one by one" in found:
-        keep_figures(
-            frames=f"{len(f):,}",
-            batch=f"{rows[0].milliseconds:.3f} ms",
-            daqp=f"{found['DAQP, one by one'].milliseconds:.3f} ms",
-            gap=f"{rows[0].gap:.0e}".replace("e-0", "e-"),
-        )
     assert rows[0].gap <= 1e-5
     assert rows[1].gap <= 1e-12
     assert rows[2].gap <= 1e-12
