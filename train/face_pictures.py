@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -10,6 +11,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from torchface.errors import FileFormatError
+from torchface.files.shards import Shards
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
@@ -18,6 +21,7 @@ from train.rendered_files import Rendering, rendered_files
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""
+_TENSORS = ("rgba", "landmarks", "visible")
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
@@ -39,10 +43,40 @@ class FacePictures:
         return len(self.rgba)
 
 
-def render_pictures(
+class StoredPictures:
+    """Pictures of files, of which none is in memory but those that are asked for.
+
+    Args:
+        paths: of the files, in their order.
+        count: how many of the pictures, the first; all if absent.
+
+    Raises:
+        FileFormatError: a file is missing or holds something else.
+    """
+
+    def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
+        self._shards = Shards(paths, _TENSORS)
+        forms = [self._shards.forms[name] for name in _TENSORS]
+        right = [(torch.uint8, (4, *forms[0][1][1:])), (torch.float32, (68, 2)), (torch.bool, (68,))]
+        if forms != right or len(forms[0][1]) != 3:
+            raise FileFormatError(
+                f"{paths[0]}: found {self._shards.forms}, expected {dict(zip(_TENSORS, right, strict=True))}"
+            )
+        self._count = len(self._shards) if count is None else count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pictures, landmarks and which are visible; see ``network_training.LabelledPictures``."""
+        found = self._shards.rows(numbers)
+        return found["rgba"], found["landmarks"], found["visible"]
+
+
+def picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> FacePictures:
-    """Renders what a folder does not hold yet, and reads all; how many processes render does not change them.
+) -> list[Path]:
+    """Renders what a folder does not hold yet; how many processes render does not change the pictures.
 
     Args:
         folder: for the files; pictures of another seed or other heads lie beside each other there.
@@ -51,10 +85,19 @@ def render_pictures(
         ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
         workers: processes.
         progress: called with each step and how far it is.
+
+    Returns:
+        The files, in order, of :data:`PART` pictures each.
     """
     rendering = Rendering(_render, "face pictures/3", "pictures", "faces", PART)
-    paths = rendered_files(rendering, folder, count, seed, ict, workers, progress)
-    return read_pictures(paths)
+    return rendered_files(rendering, folder, count, seed, ict, workers, progress)
+
+
+def render_pictures(
+    folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
+) -> FacePictures:
+    """The pictures of :func:`picture_files`, in memory."""
+    return read_pictures(picture_files(folder, count, seed, ict, workers, progress))
 
 
 def read_pictures(paths: list[Path]) -> FacePictures:
@@ -68,14 +111,14 @@ def read_pictures(paths: list[Path]) -> FacePictures:
     )
     for number, path in enumerate(paths):  # one at a time: together they take gigabytes twice
         part, rows = load_file(path), slice(PART * number, PART * (number + 1))
-        for name in ("rgba", "landmarks", "visible"):
+        for name in _TENSORS:
             getattr(found, name)[rows] = part[name]
     return found
 
 
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_pictures(*head_kinds(ict), first, count, seed)
-    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in ("rgba", "landmarks", "visible")}
+    return {name: torch.stack([getattr(one, name) for one in pictures]) for name in _TENSORS}
 
 
 @lru_cache(maxsize=2)

@@ -1,8 +1,8 @@
 """``python -m train.landmark_network --out models/NAME``: a network that finds 68 landmarks in pictures of faces.
 
 Learns from rendered people alone: ``--ict FaceXModel`` takes ICT-FaceKit's heads of real people beside the embedded
-performers. 15,000 pictures take about 50 minutes of one core, 8,000 steps two hours; a GPU is used if there is one.
-Killed and started again it goes on.
+performers. Pictures stay in files, of which a batch is read at a time. 15,000 pictures take about 50 minutes of one
+core, 8,000 steps two hours; a GPU is used if there is one. Killed and started again it goes on.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder, write_file
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import INNER
-from torchface.landmarks.images.network_training import fit_network
+from torchface.landmarks.images.network_training import LabelledPictures, fit_network_rows
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
 from torchface.progress import Progress, silent
-from train.face_pictures import PART, FacePictures, render_pictures
+from train.face_pictures import PART, StoredPictures, picture_files
 from train.runner import metric_lines, run
 
 _TEST_BATCH = 64
@@ -64,9 +64,8 @@ def train(settings: Settings, progress: Progress | None = None) -> LandmarkNetwo
         raise ValueRangeError(
             f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
         )
-    pictures = render_pictures(
-        settings.folder, settings.pictures, settings.seed, settings.ict, settings.renderers, progress
-    )
+    files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.renderers, progress)
+    pictures = StoredPictures(files)
     count = len(pictures) - settings.held_out
     make_folder(settings.out)
     checkpoint = settings.out / "checkpoint.safetensors"
@@ -78,10 +77,7 @@ def train(settings: Settings, progress: Progress | None = None) -> LandmarkNetwo
             curve.append(f"{done},{step.split(', ')[1].split()[0]}")
         progress(step, done, total)
 
-    model = fit_network(
-        pictures.rgba[:count], pictures.landmarks[:count], pictures.visible[:count], None, settings.network, shown,
-        checkpoint, device,
-    )  # fmt: skip
+    model = fit_network_rows(StoredPictures(files, count), None, settings.network, shown, checkpoint, device)
     save(model, settings, evaluate(model, pictures, count))
     write_file(settings.out / "curve.csv", ("\n".join(curve) + "\n").encode())
     checkpoint.unlink(missing_ok=True)
@@ -89,17 +85,14 @@ def train(settings: Settings, progress: Progress | None = None) -> LandmarkNetwo
 
 
 @torch.no_grad()
-def evaluate(model: LandmarkNetwork, pictures: FacePictures, first: int) -> dict[str, float]:
+def evaluate(model: LandmarkNetwork, pictures: LabelledPictures, first: int) -> dict[str, float]:
     """What the model does on pictures from a number on, augmented as in training, but none hidden or absent."""
     plain = AugmentationSettings(turn=8.0, hidden=0.0, absent=0.0)
     generator = torch.Generator().manual_seed(0)
     found, truth, visible = [], [], []
     for start in range(first, len(pictures), _TEST_BATCH):
-        rows = slice(start, start + _TEST_BATCH)
-        crops = augmented(
-            pictures.rgba[rows], pictures.landmarks[rows], pictures.visible[rows], model.size, model.margin, generator,
-            plain,
-        )  # fmt: skip
+        numbers = torch.arange(start, min(start + _TEST_BATCH, len(pictures)))
+        crops = augmented(*pictures.rows(numbers), model.size, model.margin, generator, plain)
         found.append(model(crops.images).landmarks)
         truth.append(crops.landmarks)
         visible.append(crops.visible)

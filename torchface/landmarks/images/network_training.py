@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -41,6 +42,31 @@ class NetworkSettings(DescentSettings):
     pair: float = 1.0
     heat: float = 0.5
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+
+
+class LabelledPictures(Protocol):
+    """Cut-out faces with their landmarks, read some at a time: of a tensor or of files."""
+
+    def __len__(self) -> int: ...
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pictures uint8 (B,4,H,W), landmarks (B,68,2) and which of them are visible (B,68) bool, of numbers (B,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _InMemory:
+    """Pictures (M,4,H,W), landmarks (M,68,2), visible (M,68)."""
+
+    rgba: Tensor
+    landmarks: Tensor
+    visible: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rgba)
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.rgba[numbers], self.landmarks[numbers], self.visible[numbers]
 
 
 def fit_network(
@@ -81,7 +107,6 @@ def fit_network(
 
     Source: Feng et al. 2018 (a loss that is steep near zero); Kumar et al. 2020 (likelihood with visibility).
     """
-    settings, progress = settings or NetworkSettings(), progress or silent
     if rgba.ndim != 4 or rgba.shape[1] != 4 or rgba.dtype != torch.uint8 or not len(rgba):
         raise ShapeError(f"rgba: found {rgba.dtype} {tuple(rgba.shape)}, expected uint8 (M,4,H,W) with a picture")
     if landmarks.shape != (len(rgba), 68, 2) or visible.shape != (len(rgba), 68):
@@ -89,6 +114,25 @@ def fit_network(
             f"landmarks: found {tuple(landmarks.shape)} and {tuple(visible.shape)}, expected ({len(rgba)},68,2) and "
             f"({len(rgba)},68)"
         )
+    return fit_network_rows(_InMemory(rgba, landmarks, visible), network, settings, progress, checkpoint, device)
+
+
+def fit_network_rows(
+    pictures: LabelledPictures,
+    network: LandmarkNetwork | None = None,
+    settings: NetworkSettings | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+    device: str | torch.device = "cpu",
+) -> LandmarkNetwork:
+    """What :func:`fit_network` learns, from pictures that a ``DataLoader``'s workers read a batch at a time.
+
+    Args:
+        pictures: at least one; those of a batch are asked for by their numbers.
+
+    All others: as :func:`fit_network`.
+    """
+    settings, progress = settings or NetworkSettings(), progress or silent
     if network is None:
         torch.manual_seed(settings.seed)
         network = LandmarkNetwork()
@@ -98,21 +142,15 @@ def fit_network(
         return _loss(chosen, crops, settings, share, device)
 
     key = content_key(_METHOD, settings=settings, config=network.config)
-    draw = partial(_crops, rgba, landmarks, visible, network.size, network.margin, settings)
+    draw = partial(_crops, pictures, network.size, network.margin, settings)
     return descend(network, draw, loss, settings, key, "training the network", progress, checkpoint, device)
 
 
 def _crops(
-    rgba: Tensor,
-    landmarks: Tensor,
-    visible: Tensor,
-    size: int,
-    margin: float,
-    settings: NetworkSettings,
-    generator: torch.Generator,
+    pictures: LabelledPictures, size: int, margin: float, settings: NetworkSettings, generator: torch.Generator
 ) -> Crops:
-    rows = torch.randint(len(rgba), (settings.batch,), generator=generator)
-    return augmented(rgba[rows], landmarks[rows], visible[rows], size, margin, generator, settings.augmentation)
+    numbers = torch.randint(len(pictures), (settings.batch,), generator=generator)
+    return augmented(*pictures.rows(numbers), size, margin, generator, settings.augmentation)
 
 
 def _loss(

@@ -1,0 +1,72 @@
+"""The recipe for the landmark network: pictures that stay in files give what pictures in memory give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from torchface import zoo
+from torchface.errors import FileFormatError
+from torchface.landmarks import LandmarkNetwork, NetworkSettings
+from torchface.landmarks.images.network_training import fit_network, fit_network_rows
+from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
+from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
+from train import landmark_network as recipe
+from train.face_pictures import StoredPictures
+
+SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}
+QUICK = NetworkSettings(steps=3, batch=4)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("pictures")
+    paths = [folder / f"{number}.safetensors" for number in range(2)]
+    for number, path in enumerate(paths):
+        drawn = draw_pictures((performer_kind(),), (1.0,), 3 * number, 3, seed=2)
+        names = ("rgba", "landmarks", "visible")
+        save_file({name: torch.stack([getattr(one, name) for one in drawn]) for name in names}, path)
+    return paths
+
+
+def small() -> LandmarkNetwork:
+    torch.manual_seed(3)
+    return LandmarkNetwork(**SMALL)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_files_give_what_memory_gives(files: list[Path], workers: int) -> None:
+    settings = NetworkSettings(steps=3, batch=4, workers=workers)
+    parts = [load_file(path) for path in files]
+    held = (torch.cat([part[name] for part in parts])[:5] for name in ("rgba", "landmarks", "visible"))
+    expected = fit_network(*held, small(), settings).state_dict()
+    found = fit_network_rows(StoredPictures(files, 5), small(), settings).state_dict()
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
+
+
+def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recipe, "PART", 3)
+    monkeypatch.setattr(recipe, "picture_files", lambda *_: files)
+    settings = recipe.Settings(tmp_path / "own", 6, 2, network=QUICK)
+    model = recipe.train(settings)
+    again = zoo.get_model(tmp_path / "own")
+    assert isinstance(again, LandmarkNetwork)
+    assert again.config == model.config
+    assert len((tmp_path / "own" / "curve.csv").read_text().splitlines()) > 0
+    assert not (tmp_path / "own" / "checkpoint.safetensors").exists()
+
+
+def test_files_of_something_else_are_refused(files: list[Path], tmp_path: Path) -> None:
+    odd = tmp_path / "odd.safetensors"
+    save_file({**load_file(files[0]), "landmarks": torch.zeros(3, 5, 2)}, odd)
+    with pytest.raises(FileFormatError, match=r"odd\.safetensors: found"):
+        StoredPictures([odd])
+    with pytest.raises(FileFormatError, match=r"odd\.safetensors: found .* as in 0\.safetensors"):
+        StoredPictures([files[0], odd])
+    odd.write_bytes(files[0].read_bytes()[:-9])
+    with pytest.raises(FileFormatError, match=r"odd\.safetensors: cannot be read"):
+        StoredPictures([odd])
