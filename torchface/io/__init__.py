@@ -22,6 +22,8 @@ from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_
 from torchface.io.rigs.rig_folder import load_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch
 from torchface.io.take_files import load_take, save_take
+from torchface.io.weights.live_link_csv import load_live_link, save_live_link
+from torchface.io.weights.weight_senders import WeightSender, open_sender
 
 __all__ = [
     "Correspondences",
@@ -30,6 +32,7 @@ __all__ = [
     "MeshSequence",
     "MeshSequenceWriter",
     "ShapeMatch",
+    "WeightSender",
     "load_animation",
     "load_calibration",
     "load_correspondences",
@@ -39,18 +42,21 @@ __all__ = [
     "load_image",
     "load_landmark_points",
     "load_landmarks",
+    "load_live_link",
     "load_mesh",
     "load_normal_map",
     "load_obj_folder",
     "load_region_maps",
     "load_rig",
     "load_take",
+    "open_sender",
     "save_animation",
     "save_calibration",
     "save_correspondences",
     "save_image",
     "save_image16",
     "save_landmarks",
+    "save_live_link",
     "save_mesh",
     "save_normal_map",
     "save_pts",

@@ -1,1 +1,33 @@
-"""Figures, reports that open from disk, pages in a browser."""
+"""What people look at: images and curves of faces; reports and the browser are rooms of their own."""
+
+from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet, to_pillow
+from torchface.viz.figures.curves import error_curve, named_bars, weight_curves
+from torchface.viz.figures.face_views import face_views, frame_face, heat_map
+from torchface.viz.figures.heat_maps import compared_views, error_colors, error_views
+from torchface.viz.figures.marker_maps import marker_map
+from torchface.viz.figures.model_figures import modes_figure, quality_figure, random_figure
+from torchface.viz.figures.registration_views import registration_sheet
+from torchface.viz.figures.site_views import site_views
+
+__all__ = [
+    "caption",
+    "compared_views",
+    "error_colors",
+    "error_curve",
+    "error_views",
+    "face_views",
+    "frame_face",
+    "headed",
+    "heat_map",
+    "marker_map",
+    "modes_figure",
+    "named_bars",
+    "quality_figure",
+    "random_figure",
+    "registration_sheet",
+    "save_rendered_image",
+    "sheet",
+    "site_views",
+    "to_pillow",
+    "weight_curves",
+]

@@ -19,9 +19,9 @@ from torchface.io import load_detail_maps, load_rig, save_mesh, save_rig
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel
+from torchface.registration import dressed_as, hidden_parts
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.neutral_head import neutral_head
-from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -189,7 +189,7 @@ def test_mistakes_are_told(actor: Actor, tmp_path: Path) -> None:
         rig_actor(scan, template, out, tmp_path / "other.json")
 
 
-def test_hidden_eyeballs_keep_the_templates_skin_and_nothing_else_does() -> None:
+def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_does() -> None:
     template = neutral_head(texture=False)
     assert template.uvs is not None
     count = len(template.vertices)
@@ -200,6 +200,8 @@ def test_hidden_eyeballs_keep_the_templates_skin_and_nothing_else_does() -> None
     hidden = hidden_parts(template, ~everything)
     assert 0 < int(hidden.sum()) < count / 2
     assert not hidden[template.landmarks].any()
+    assert template.annotations is not None
+    assert hidden[template.annotations.regions["mouth_interior"]].all()
     worn = dressed_as(black, white, hidden)
     assert worn.colors is not None
     assert worn.texture is not None

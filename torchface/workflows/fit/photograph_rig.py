@@ -19,6 +19,7 @@ from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
 from torchface.progress import Progress, silent
+from torchface.registration import dressed_as, hidden_parts
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.workflows.fit.fit_checks import eyes_distances, landmark_lines, one_person_lines
@@ -26,7 +27,6 @@ from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.fit_overlay import overlay
 from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, PhotographLandmarks, find_in_photographs
 from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
-from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
 

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from torchface.files.content_keys import content_key
-from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, save_mesh
 from torchface.io.meshes.named_files import named_files
 from torchface.landmarks.scans.detector_files import load_detector
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
 from torchface.mesh import Annotations, Mesh
+from torchface.registration.in_place import in_place_of
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
@@ -160,19 +160,6 @@ class ScanJob:
         settings = (self.schedule, self.texture_size, self.landmarks, self.unit, self.detector)
         model = None if self.model is None else (self.model.mean.numpy(), self.model.modes.numpy())
         return _arrived, (_packed(self.template), model, *settings)
-
-
-def in_place_of(mesh: Mesh, template: Mesh, weights: Tensor | None = None) -> Mesh:
-    """A mesh rotated and translated, without scaling, to where a template of the same topology is.
-
-    Args:
-        mesh: V vertices.
-        template: V vertices.
-        weights: how much each vertex counts, (V,); equal if absent.
-    """
-    own, other = mesh.vertices.double(), template.vertices.double()
-    pose = similarity_transform(own[None], other[None], None if weights is None else weights[None], scale=False)
-    return mesh.with_vertices(pose.apply(own[None])[0].to(mesh.vertices))
 
 
 def _by_name(folder: Path) -> dict[str, list[Path]]:

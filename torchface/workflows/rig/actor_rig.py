@@ -35,14 +35,12 @@ from torchface.modeling import (
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.scanned_examples import seen_example
 from torchface.progress import Progress, silent
-from torchface.registration import Registration, register
+from torchface.registration import Registration, dressed_as, hidden_parts, in_place_of, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.viz.figures.registration_views import registration_sheet
-from torchface.workflows.hidden_parts import dressed_as, hidden_parts
 from torchface.workflows.register.register_scans import load_shape_model
-from torchface.workflows.register.scan_job import in_place_of
 from torchface.workflows.rig.expression_scans import LAYOUT, Expression, expressions_in, neutral_in, weights_row
 from torchface.workflows.rig.expression_side import check_side
 from torchface.workflows.rig.penetration_report import Penetration, penetration

@@ -1,4 +1,4 @@
-"""The skin of a registered face where the scan has shown none: eyeballs behind lids, teeth behind lips."""
+"""The skin of a registered face where the scan has shown none: eyeballs behind lids, the mouth behind lips."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.meshes.uv_raster import rasterise_uvs
+from torchface.io.gltf.region_materials import part_material
 from torchface.mesh import Mesh
 
 _SEEN = 0.05
@@ -16,18 +17,32 @@ _SEAM = 4
 
 
 def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
-    """The vertices of parts that share no vertex with the largest and that the scan has not shown, (V,) bool.
+    """The vertices inside a head that the scan has not shown, (V,) bool.
+
+    They are those of parts that share no vertex with the largest, such as eyeballs, and of regions that by their names
+    are no skin, such as ``mouth_interior``.
 
     Args:
         mesh: V vertices.
         matched: vertices that the scan shows, (V,) bool.
+
+    Example:
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> hidden = hidden_parts(head, head.annotations.regions["face"])  # of a scan of closed eyes and lips
+        >>> bool(hidden[head.annotations.regions["eyeball_left"]].all())
+        True
     """
     label = components(mesh.faces.cpu(), len(mesh.vertices))
     size = label.bincount().double()
     shown = torch.zeros_like(size).index_add_(0, label, matched.cpu().double()) / size.clamp(min=1)
     hidden = shown < _SEEN
     hidden[size.argmax()] = False
-    return hidden[label]
+    result = hidden[label]
+    for name, region in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+        if part_material(name) is not None:  # a scan that looks into the mouth has its colours
+            result |= region.cpu() & ~matched.cpu()
+    return result
 
 
 def dressed_as(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
@@ -37,6 +52,15 @@ def dressed_as(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
         mesh: registered, with the template's topology and texture coordinates.
         template: with a texture or vertex colours.
         hidden: vertices (V,) bool.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from torchface.synthetic import neutral_head
+        >>> head = neutral_head(texture=False)
+        >>> black, white = (replace(head, colors=torch.full_like(head.vertices, grey)) for grey in (0.0, 1.0))
+        >>> eyeball = head.annotations.regions["eyeball_left"]
+        >>> bool((dressed_as(black, white, eyeball).colors[:, 0] == eyeball).all())
+        True
     """
     if not hidden.any():
         return mesh
