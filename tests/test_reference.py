@@ -53,6 +53,15 @@ UNSHOWN = {
         "onnx.export_dynamics_prior",
         "onnx.export_wrinkle_weights",
         "onnx.export_video_solver",
+        "synthetic.stages.RawScan",
+        "synthetic.stages.scan_head",
+        "synthetic.stages.webcam.WebcamFrame",
+        "synthetic.stages.webcam.draw_sitter",
+        "synthetic.stages.webcam.webcam_frames",
+        "viz.modes_figure",
+        "viz.random_figure",
+        "viz.registration_sheet",
+        "viz.site_views",
     ),
 }
 """Names without an example, by why."""

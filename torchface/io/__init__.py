@@ -22,7 +22,7 @@ from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_
 from torchface.io.rigs.rig_folder import load_obj_folder
 from torchface.io.scenes.weight_keys import ShapeMatch
 from torchface.io.take_files import load_take, save_take
-from torchface.io.weights.live_link_csv import load_live_link, save_live_link
+from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_senders import WeightSender, open_sender
 
 __all__ = [
@@ -42,7 +42,6 @@ __all__ = [
     "load_image",
     "load_landmark_points",
     "load_landmarks",
-    "load_live_link",
     "load_mesh",
     "load_normal_map",
     "load_obj_folder",

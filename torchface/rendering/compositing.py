@@ -47,7 +47,12 @@ def caption(image: Tensor, text: str, size: int = 16) -> Tensor:
 
 
 def headed(image: Tensor, text: str, size: int = 16) -> Tensor:
-    """The image (3,H,W) with a line of text over it."""
+    """The image (3,H,W) with a line of text over it.
+
+    Example:
+        >>> tuple(headed(torch.zeros(3, 40, 60), "black").shape)
+        (3, 66, 60)
+    """
     return torch.cat([_line(image.shape[2], text, size), image], dim=1)
 
 
@@ -77,7 +82,12 @@ def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:
 
 
 def to_pillow(image: Tensor) -> Image.Image:
-    """An 8-bit Pillow image of (3,H,W) in [0,1]."""
+    """An 8-bit Pillow image of (3,H,W) in [0,1], which a notebook shows.
+
+    Example:
+        >>> to_pillow(torch.zeros(3, 40, 60)).size
+        (60, 40)
+    """
     return Image.fromarray((image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
 
 

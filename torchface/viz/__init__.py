@@ -5,7 +5,7 @@ from torchface.viz.figures.curves import error_curve, named_bars, weight_curves
 from torchface.viz.figures.face_views import face_views, frame_face, heat_map
 from torchface.viz.figures.heat_maps import compared_views, error_colors, error_views
 from torchface.viz.figures.marker_maps import marker_map
-from torchface.viz.figures.model_figures import modes_figure, quality_figure, random_figure
+from torchface.viz.figures.model_figures import modes_figure, random_figure
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.viz.figures.site_views import site_views
 
@@ -22,7 +22,6 @@ __all__ = [
     "marker_map",
     "modes_figure",
     "named_bars",
-    "quality_figure",
     "random_figure",
     "registration_sheet",
     "save_rendered_image",

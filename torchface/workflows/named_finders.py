@@ -20,6 +20,8 @@ from torchface.landmarks.images.landmark_finder import LandmarkFinder
 from torchface.onnx.eye_network_graph import eye_network_model
 from torchface.onnx.landmark_network_graph import landmark_network_model
 
+__all__ = ["NamedFinder", "load_finder"]
+
 DEFAULT_LANDMARKS = "landmark_network"
 """The model of the zoo that finds landmarks where none is named."""
 
@@ -54,6 +56,10 @@ def load_finder(
         ValueRangeError: it finds other landmarks than iBUG's 68.
         FileFormatError: it is damaged, or a graph of other inputs and outputs.
         MissingExtraError: MediaPipe is asked for and not installed.
+
+    Example:
+        >>> load_finder("face_landmarks").finder.name
+        'face_landmarks'
     """
     if Path(name_or_path).suffix.lower() == ".csv":
         raise NameMismatchError(f"{option}: found {name_or_path}, a table of landmarks, expected what finds them")

@@ -1,18 +1,7 @@
 """Blendshape weights as files and as packets: plain CSV, Live Link Face, OSC."""
 
-from torchface.io.weights.live_link_csv import load_live_link, save_live_link
+from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.live_link_stream import LiveLinkFrame, decode_frame, encode_frame
-from torchface.io.weights.weight_csv import load_weights_csv, save_weights_csv
 from torchface.io.weights.weight_senders import WeightSender, open_sender
 
-__all__ = [
-    "LiveLinkFrame",
-    "WeightSender",
-    "decode_frame",
-    "encode_frame",
-    "load_live_link",
-    "load_weights_csv",
-    "open_sender",
-    "save_live_link",
-    "save_weights_csv",
-]
+__all__ = ["LiveLinkFrame", "WeightSender", "decode_frame", "encode_frame", "open_sender", "save_live_link"]

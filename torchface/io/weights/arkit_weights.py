@@ -21,7 +21,7 @@ class ArkitWeights:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._matrix = mapping(names, ARKIT)
+        self._matrix = mapping(names, ARKIT).float()
         if not self._matrix.any():
             raise NameMismatchError(f"stream: found the shapes {', '.join(names[:5])}, expected some of ARKit's")
 

@@ -137,6 +137,12 @@ def save_live_link(take: Take, path: str | Path) -> None:
         ShapeError: a kept column has another length than the take.
 
     Source: Epic Games, "Recording Face Animation on iOS Device", CSV of Live Link Face.
+
+    Example:
+        >>> from torchface import Track, load_take
+        >>> save_live_link(Take(60.0, weights=Track(("jawOpen",), torch.full((3, 1, 1), 0.25))), "take.csv")
+        >>> load_take("take.csv").weights.select(["JawOpen"]).values.flatten().tolist()
+        [0.25, 0.25, 0.25]
     """
     path = Path(path)
     names, values = values_to_write(take.weights, "weights", 1, path)

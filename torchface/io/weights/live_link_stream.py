@@ -57,6 +57,12 @@ def encode_frame(frame: LiveLinkFrame) -> bytes:
     Raises:
         ShapeError: not 52 weights and 9 rotations.
         ValueRangeError: a number is not finite or a text is too long.
+
+    Example:
+        >>> half = torch.full((52,), 0.5)
+        >>> packet = encode_frame(LiveLinkFrame("iPhone", "actor", frame=1, subframe=0.0, rate=(60, 1), weights=half))
+        >>> decode_frame(packet).subject
+        'actor'
     """
     if frame.weights.shape != (len(ARKIT),) or frame.rotations.shape != (len(ROTATIONS),):
         raise ShapeError(
@@ -76,6 +82,11 @@ def decode_frame(packet: bytes) -> LiveLinkFrame:
 
     Raises:
         FileFormatError: it is no such packet, is cut short, or too long.
+
+    Example:
+        >>> still = LiveLinkFrame("iPhone", "actor", frame=7, subframe=0.0, rate=(60, 1), weights=torch.zeros(52))
+        >>> decode_frame(encode_frame(still)).frame
+        7
     """
     if packet[:1] != bytes([_VERSION]):
         raise FileFormatError(f"live link packet: found version {packet[:1].hex() or 'none'}, expected {_VERSION:02x}")

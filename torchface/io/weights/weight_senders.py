@@ -34,6 +34,11 @@ def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
     Raises:
         ValueRangeError: the address is none, or its host is not known or not reached.
         NameMismatchError: the protocol cannot carry weights by these names.
+
+    Example:
+        >>> sender = open_sender("vmc://127.0.0.1:39539", ["jawOpen", "browInnerUp"], fps=60.0)
+        >>> nobody_refused = sender.send(torch.tensor([0.5, 0.0]))
+        >>> sender.close()
     """
     scheme = parse_address(address).scheme
     if scheme == "vmc":

@@ -2,7 +2,7 @@
 
 from torchface.synthetic.stages.makeup_layout import MakeupLayout, makeup_layout
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
-from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head, write_scan, write_scans
+from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
 from torchface.synthetic.stages.weight_curves import perform
 
 __all__ = [
@@ -17,6 +17,4 @@ __all__ = [
     "place_markers",
     "record",
     "scan_head",
-    "write_scan",
-    "write_scans",
 ]

@@ -150,6 +150,12 @@ def makeup_layout(rig: BlendshapeRig) -> MakeupLayout:
         ValueRangeError: the rig has neither landmarks nor enough of ARKit's shapes.
 
     Source: Ekman, Friesen 1978 for the action units; thesis 4.1.1.
+
+    Example:
+        >>> from torchface.synthetic import performer
+        >>> layout = makeup_layout(performer(texture=False))
+        >>> sum(layout.counts().values()) == len(layout.attachment.labels)
+        True
     """
     points = _landmarks(rig)
     names, regions, sites, partner = [], [], [], []

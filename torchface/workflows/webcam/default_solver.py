@@ -9,6 +9,8 @@ from torchface.modeling import HeadModel
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.track.track_models import DEFAULT_PRIOR, load_priors
 
+__all__ = ["default_webcam_solver"]
+
 HEADS = "head"
 """The model of the zoo that says which heads there are."""
 
@@ -18,6 +20,10 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
 
     Raises:
         NameMismatchError: the zoo's model of heads is another kind of model.
+
+    Example:
+        >>> default_webcam_solver().names[:2]
+        ('eyeBlinkLeft', 'eyeLookDownLeft')
     """
     rig = performer(texture=False)
     heads = zoo.get_model(HEADS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,9 +23,7 @@ from torchface.onnx.webcam.webcam_session import WebcamFrame, WebcamSession
 from torchface.onnx.webcam.webcam_solver_graph import READING
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
-from torchface.synthetic.stages.face_pictures.looks import draw_looks
-from torchface.synthetic.stages.face_pictures.people import Person
+from torchface.synthetic.stages.webcam.sitter import draw_sitter
 from torchface.synthetic.stages.webcam.webcam_performance import SittingSettings, sitting
 from torchface.synthetic.stages.webcam.webcam_video import WebcamSettings, webcam_frames
 from torchface.workflows.webcam.default_solver import default_webcam_solver
@@ -111,8 +109,7 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
 def rendered_frames(count: int) -> list[np.ndarray]:
     """An embedded performer before a webcam who talks, smiles and blinks, uint8 (240,320,3) each."""
     generator = torch.Generator().manual_seed(_SEED)
-    kind, looks = performer_kind(), draw_looks(generator)
-    person = Person(kind, kind.draw(generator), replace(looks, glasses=None, hairdo=replace(looks.hairdo, curtain=0.0)))
+    person = draw_sitter(generator)
     weights = torch.zeros(count, len(ARKIT))
     phase = torch.arange(count) / max(count - 1, 1) * torch.pi
     for row, name in enumerate(_MOVED):

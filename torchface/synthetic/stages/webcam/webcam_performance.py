@@ -34,6 +34,10 @@ class SittingSettings:
         roll: of the camera, degrees.
         yaw, pitch, tilt: standard deviations of the head's motion, degrees.
         drift: of its place, millimetres.
+
+    Example:
+        >>> SittingSettings(distance=420.0).yaw
+        9.0
     """
 
     distance: float = 560.0
@@ -91,6 +95,11 @@ def sitting(
 
     Raises:
         ShapeError: the weights are not (T,52).
+
+    Example:
+        >>> still = sitting(torch.zeros(30, 52), 30.0, torch.Generator().manual_seed(0), SittingSettings(yaw=0.0))
+        >>> len(still), tuple(still.rotation.shape)
+        (30, (30, 3, 3))
     """
     if weights.ndim != 2 or weights.shape[1] != len(ARKIT):
         raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (T,{len(ARKIT)})")
@@ -141,7 +150,12 @@ def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: 
 
 
 def with_blinks(weights: Tensor, fps: float, seconds: tuple[float, ...]) -> Tensor:
-    """Weights (T,52) with full blinks that begin at some seconds."""
+    """Weights (T,52) with full blinks that begin at some seconds.
+
+    Example:
+        >>> with_blinks(torch.zeros(30, 52), 30.0, (0.5,)).amax(1).nonzero()[0].item() > 15
+        True
+    """
     time = torch.arange(len(weights), dtype=torch.float64) / fps
     lids = [ARKIT.index(f"eyeBlink{side}") for side in ("Left", "Right")]
     blinking = weights.clone()
