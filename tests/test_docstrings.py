@@ -23,7 +23,6 @@ MODULES = sorted(
 FLOAT32 = (
     "torchface.capture.action_units.classifier_training",
     "torchface.io.",
-    "torchface.landmarks.images.network_detector",
     "torchface.onnx.",
     "torchface.rendering.clay_shading",
     "torchface.synthetic.",
@@ -34,6 +33,8 @@ FLOAT32 = (
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     """What numbers become tensors of: examples show facts, which hold in both."""
+    for name in MODULES:  # constants of a module have the format of its first import
+        importlib.import_module(name)
     usual = torch.get_default_dtype()
     torch.set_default_dtype(request.param)
     yield request.param

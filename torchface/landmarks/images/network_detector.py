@@ -47,7 +47,7 @@ class NetworkDetector:
             )
         self.network = network
         self.least_score, self.longest = least_score, longest
-        self._fused = without_normalisation(network)
+        self._fused = without_normalisation(network).float()  # images are
 
     @torch.inference_mode()
     def __call__(self, image: Tensor) -> FaceBoxes:
