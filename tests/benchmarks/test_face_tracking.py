@@ -22,7 +22,7 @@ from torchface.landmarks.images.face_box import overlaps
 from torchface.landmarks.images.finders.tree_finder import TreeFinder
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.landmark_consensus import ConsensusSettings
-from torchface.landmarks.images.tracking import track_landmarks
+from torchface.landmarks.images.video_landmarks import track_landmarks
 
 
 @pytest.fixture(scope="module")

@@ -21,17 +21,15 @@ from torchface.landmarks.images.landmark_measures import (
     lid_openings,
     mouth_gap,
 )
+from torchface.landmarks.images.landmark_tracker import LandmarkTracker
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.network_detector import NetworkDetector
 from torchface.landmarks.images.network_training import NetworkSettings
-from torchface.landmarks.images.tracking import (
-    LandmarkTracker,
-    TrackedFace,
-    find_landmarks,
-    track_landmarks,
-)
+from torchface.landmarks.images.photograph_landmarks import find_landmarks
+from torchface.landmarks.images.tracked_face import TrackedFace
 from torchface.landmarks.images.tree_training import TreeSettings
+from torchface.landmarks.images.video_landmarks import track_landmarks
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap

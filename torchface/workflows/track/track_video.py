@@ -32,7 +32,8 @@ from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.face_box import find_faces
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, trust_of
-from torchface.landmarks.images.tracking import LandmarkTracker, naming_the_frame
+from torchface.landmarks.images.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.video_landmarks import naming_the_frame
 from torchface.number_checks import check_rate
 from torchface.progress import Progress, silent
 from torchface.rendering.point_light import PointLight

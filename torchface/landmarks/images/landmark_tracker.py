@@ -1,48 +1,34 @@
-"""Landmarks of one face through a video, frame by frame; a face that is lost is NaN and is found again."""
+"""Follows one face through a video, frame by frame; a face that is lost is NaN and is found again."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.io.video import VideoFile, open_video
 from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.appearance_refinement import appearance_landmarks
 from torchface.landmarks.images.face_box import (
     FaceBoxes,
     FaceDetector,
     HaarDetector,
-    NoFaceError,
     check_image,
     find_faces,
-    find_some_faces,
-    grey_pixels,
     overlaps,
 )
+from torchface.landmarks.images.face_place import box_relation, face_place, upright_box, upright_turn
 from torchface.landmarks.images.face_signature import LOOK_SIZE, face_signature, updated_signature
-from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
+from torchface.landmarks.images.finders.tree_finder import TreeFinder
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around
-from torchface.landmarks.images.landmark_finder import COUNT, FoundLandmarks, LandmarkFinder, find_in_box
+from torchface.landmarks.images.landmark_finder import COUNT, LandmarkFinder, find_in_box
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.turned_search import find_faces_of_any_turn, find_turned_faces
-from torchface.progress import Progress, silent
-from torchface.take import Track
+from torchface.landmarks.images.tracked_face import SeenFace, TrackedFace, refined_face, settled_face
+from torchface.landmarks.images.turned_search import find_turned_faces
 
-# Presence under which a photograph shows no face: boxes in pictures without one had 0.27 to 0.57.
-_PHOTOGRAPHED = 0.6
 _NEAR, _STILL, _OTHER = 0.75, 0.5, 0.3
 _MOST_OTHERS = 4
 _LEARNED = 0.1  # of how a face looks now that is taken up by what is known of its look
-
-LANDMARK_NAMES = tuple(str(number) for number in range(COUNT))
-"""The channels of a track of landmarks: iBUG's numbers from 0."""
 
 
 @dataclass(frozen=True)
@@ -73,50 +59,6 @@ class TrackingSettings:
     turned: int = 4
     alike: float = 0.6
     closer: float = 0.15
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedFace:
-    """One face in one frame.
-
-    Args:
-        landmarks: iBUG's 68, (68,2) float32 pixels; NaN where the face is lost.
-        box: x, y, width, height round it as a detector draws it, (4,) pixels; NaN where it is lost.
-        confidence: (68,) in [0,1]; one half where a landmark may be off by 0.02 of the box's side, 0 where the face is
-            lost.
-        visibility: (68,) in [0,1]: how likely nothing stands before the landmark; 1 where the finder does not say, 0
-            where the face is lost.
-        presence: in [0,1]: how likely it is a face; 0 where it is lost.
-
-    Example:
-        >>> lost = TrackedFace.lost()
-        >>> lost.found, lost.confidence.max().item()
-        (False, 0.0)
-    """
-
-    landmarks: Tensor
-    box: Tensor
-    confidence: Tensor
-    visibility: Tensor = field(default_factory=lambda: torch.ones(COUNT))
-    presence: float = 1.0
-
-    @property
-    def found(self) -> bool:
-        """Whether there is a face."""
-        return bool(torch.isfinite(self.landmarks).all())
-
-    @classmethod
-    def lost(cls) -> TrackedFace:
-        """No face."""
-        nothing = torch.zeros(COUNT)
-        return cls(torch.full((COUNT, 2), torch.nan), torch.full((4,), torch.nan), nothing, nothing, 0.0)
-
-
-class _Seen(NamedTuple):
-    """What was found, and the box (4,) that it was looked for in."""
-
-    found: FoundLandmarks
-    box: Tensor
 
 
 class LandmarkTracker:
@@ -194,7 +136,7 @@ class LandmarkTracker:
         self.reset()
         if bool(torch.isfinite(landmarks).all()):
             self._last = TrackedFace(landmarks.float(), box_around(landmarks.float()), confidence.float())
-            self._place = _placed(self._last.landmarks)
+            self._place = face_place(self._last.landmarks)
         if memory is not None:
             if memory.shape != (LOOK_SIZE + 12,):
                 raise ShapeError(f"resume: found a memory of {tuple(memory.shape)}, expected ({LOOK_SIZE + 12},)")
@@ -228,20 +170,20 @@ class LandmarkTracker:
             self._last, self._anchor = TrackedFace.lost(), None
             return self._last
         self._missed = 0
-        self._last = _refined_face(seen.found, frame, self.appearance)
-        self._place = _placed(self._last.landmarks)
+        self._last = refined_face(seen.found, frame, self.appearance)
+        self._place = face_place(self._last.landmarks)
         if seen is not followed:
-            self._anchor = _relation(self._place[:4], seen.box, self._place[4])
+            self._anchor = box_relation(self._place[:4], seen.box, self._place[4])
         look = face_signature(frame, self._last.landmarks)
         if self._look is None or not self._crowded or float(self._look @ look) >= self.settings.alike:
             self._look = updated_signature(self._look, look, _LEARNED)
         return self._last
 
-    def _likeness(self, frame: Tensor, seen: _Seen) -> float:
+    def _likeness(self, frame: Tensor, seen: SeenFace) -> float:
         """How much a face looks like the one that is followed; 1 where nothing is known of that."""
         return 1.0 if self._look is None else float(self._look @ face_signature(frame, seen.found.landmarks))
 
-    def _same_person(self, frame: Tensor, seen: _Seen) -> _Seen | None:
+    def _same_person(self, frame: Tensor, seen: SeenFace) -> SeenFace | None:
         """What was followed, if it still looks as it did or nobody else is about; else another face near that does;
         None where none does: it is hidden behind somebody."""
         alike = self._likeness(frame, seen)
@@ -250,16 +192,16 @@ class LandmarkTracker:
         best = self._most_alike(frame, find_faces(frame, self.detector))
         return best if best is not None and self._likeness(frame, best) >= alike + self.settings.closer else None
 
-    def _most_alike(self, frame: Tensor, faces: FaceBoxes) -> _Seen | None:
+    def _most_alike(self, frame: Tensor, faces: FaceBoxes) -> SeenFace | None:
         """Of the faces about where the person was the one that looks most like it, if any looks like it at all."""
         seen = [self._looked_at(frame, faces, number) for number in self._near(faces.boxes)]
         alike = [(self._likeness(frame, one), one) for one in seen if one is not None]
         best = max(alike, key=lambda pair: pair[0], default=(-1.0, None))
         return best[1] if best[0] >= self.settings.alike else None
 
-    def _looked_at(self, frame: Tensor, faces: FaceBoxes, number: int) -> _Seen | None:
+    def _looked_at(self, frame: Tensor, faces: FaceBoxes, number: int) -> SeenFace | None:
         """Landmarks of one of the detector's faces, if it is one."""
-        seen = _settled(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
+        seen = settled_face(self.finder, frame, faces.boxes[number], float(faces.tilts[number]))
         there = self._plausible(box_around(seen.found.landmarks), frame)
         return seen if there and seen.found.presence >= self.settings.doubtful else None
 
@@ -271,14 +213,14 @@ class LandmarkTracker:
         others = [find_in_box(self.finder, frame, faces.boxes[i], float(faces.tilts[i])) for i in apart]
         self._crowded = any(one.presence >= self.settings.sure for one in others)
 
-    def _follow(self, frame: Tensor) -> _Seen | None:
+    def _follow(self, frame: Tensor) -> SeenFace | None:
         """The face from where it was a frame ago; None where it is not there."""
-        before, tilt = _upright_box(self._last.landmarks), tilt_around(self._last.landmarks)
+        before, tilt = upright_box(self._last.landmarks), tilt_around(self._last.landmarks)
         box = self._sought(before, tilt)
         if not self._plausible(box, frame):
             return None
         seen = find_in_box(self.finder, frame, box, float(tilt))
-        moved = _upright_box(seen.landmarks)
+        moved = upright_box(seen.landmarks)
         if not self._plausible(moved, frame) or not 0.6 < float(moved[2] / before[2]) < 1.6:
             return None
         if float(overlaps(before[None], moved[None])) < 0.75:  # it moved far: once more from where it is now
@@ -287,15 +229,15 @@ class LandmarkTracker:
             seen = find_in_box(self.finder, frame, box, float(tilt))
         settings = self.settings
         if seen.presence >= settings.sure and self._frames % settings.check:
-            return _Seen(seen, box)
+            return SeenFace(seen, box)
         if self._confirmed(frame, box_around(seen.landmarks)):
             self._unseen = 0
-            return _Seen(seen, box) if seen.presence >= settings.doubtful else None
+            return SeenFace(seen, box) if seen.presence >= settings.doubtful else None
         self._unseen += 1
         vague = float(seen.confidence.mean()) < settings.vague
         if seen.presence < settings.sure or (self._unseen >= settings.checks and vague):
             return None
-        return _Seen(seen, box)  # turned faces are none to the detector
+        return SeenFace(seen, box)  # turned faces are none to the detector
 
     def _confirmed(self, frame: Tensor, box: Tensor) -> bool:
         """Whether the detector sees a face where the landmarks are; it is shown no more than their surroundings."""
@@ -311,7 +253,7 @@ class LandmarkTracker:
         self._note_others(frame, faces, box)
         return len(faces) > 0 and bool((overlaps(faces.boxes, box[None]) > 0.4).any())
 
-    def _search(self, frame: Tensor) -> _Seen | None:
+    def _search(self, frame: Tensor) -> SeenFace | None:
         """The face wherever it is now; None where it is nowhere."""
         seen = self._chosen(frame, find_faces(frame, self.detector))
         if seen is None and self._place is not None and 0 < self._missed < self.settings.patience:
@@ -323,18 +265,18 @@ class LandmarkTracker:
             self._unseen = 0
         return seen
 
-    def _is_clear(self, seen: _Seen | None) -> bool:
+    def _is_clear(self, seen: SeenFace | None) -> bool:
         """Whether a face is one beyond doubt."""
         sure = seen is not None and seen.found.presence >= self.settings.sure
         return sure and seen is not None and float(seen.found.confidence.mean()) >= self.settings.vague
 
-    def _is_clearer(self, seen: _Seen, other: _Seen | None) -> bool:
+    def _is_clearer(self, seen: SeenFace, other: SeenFace | None) -> bool:
         """Whether a face that was found turned is one, rather than what was found upright."""
         confidence = float(seen.found.confidence.mean())
         better = other is None or confidence > float(other.found.confidence.mean())
         return seen.found.presence >= self.settings.sure and better
 
-    def _chosen(self, frame: Tensor, faces: FaceBoxes) -> _Seen | None:
+    def _chosen(self, frame: Tensor, faces: FaceBoxes) -> SeenFace | None:
         """The one of these faces that is meant, if it is one."""
         near = self._near(faces.boxes)
         if near and self._crowded:
@@ -349,11 +291,11 @@ class LandmarkTracker:
             self._note_others(frame, faces, faces.boxes[number])
         return seen
 
-    def _still_there(self, frame: Tensor, place: Tensor) -> _Seen | None:
+    def _still_there(self, frame: Tensor, place: Tensor) -> SeenFace | None:
         """The face where it was lost (5,), though the detector sees none: turned or half hidden."""
         box = place[:4]
-        seen = _settled(self.finder, frame, box, float(place[4]))
-        moved = _upright_box(seen.found.landmarks)
+        seen = settled_face(self.finder, frame, box, float(place[4]))
+        moved = upright_box(seen.found.landmarks)
         if seen.found.presence < self.settings.sure or not self._plausible(moved, frame):
             return None
         near = float(overlaps(box[None], moved[None])) > _STILL
@@ -365,7 +307,7 @@ class LandmarkTracker:
         if anchor is None:
             return box
         side = box[2] * anchor[2]
-        middle = box[:2] + box[2:] / 2 + box[2] * (_turn(tilt) @ anchor[:2])
+        middle = box[:2] + box[2:] / 2 + box[2] * (upright_turn(tilt) @ anchor[:2])
         return torch.cat([middle - side / 2, side.expand(2)])
 
     def _near(self, boxes: Tensor) -> list[int]:
@@ -387,141 +329,3 @@ class LandmarkTracker:
         height, width = frame.shape[-2:]
         inside = 0 <= x < width and 0 <= y < height
         return inside and self.settings.smallest <= float(box[2]) <= 1.5 * max(height, width)
-
-
-@contextmanager
-def naming_the_frame(number: int) -> Iterator[None]:
-    """Has errors of a step say which frame they are of, counted from 0."""
-    try:
-        yield
-    except (ShapeError, ValueRangeError) as error:
-        raise type(error)(f"frame {number}: {error}") from error
-
-
-def track_landmarks(
-    video: VideoFile | str | Path | Iterable[Tensor],
-    tracker: LandmarkTracker,
-    progress: Progress | None = None,
-) -> Track:
-    """Landmarks of one face in all frames.
-
-    Args:
-        video: a file, or frames, uint8 (H,W) or (3,H,W) each.
-        tracker: what finds them; it goes on from its last frame.
-        progress: called with each step and how far it is.
-
-    Returns:
-        Names ``"0"`` to ``"67"``, values (T,68,2) in pixels, NaN where the face is lost, confidence (T,68).
-
-    Raises:
-        FileFormatError: the video cannot be decoded, changes size, or has a variable frame rate.
-        ShapeError: frames of another kind.
-
-    Example:
-        >>> from torchface import zoo
-        >>> blank = torch.full((120, 160), 128, dtype=torch.uint8)
-        >>> track = track_landmarks([blank, blank], LandmarkTracker(zoo.get_model("face_landmarks")))
-        >>> len(track.names), bool(track.values.isnan().all())
-        (68, True)
-    """
-    progress = progress or silent
-    if isinstance(video, str | Path):
-        video = open_video(video)
-    frames = video.color_frames() if isinstance(video, VideoFile) else video
-    total = video.count if isinstance(video, VideoFile) else len(video) if isinstance(video, Sized) else 0
-    found: list[TrackedFace] = []
-    for frame in frames:  # a frame's box is the one before's
-        with naming_the_frame(len(found)):
-            found.append(tracker.step(frame))
-        progress("tracking landmarks", len(found), max(total, len(found)) if total else 0)
-    if not found:
-        return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
-    return Track(
-        LANDMARK_NAMES, torch.stack([one.landmarks for one in found]), torch.stack([one.confidence for one in found])
-    )
-
-
-def find_landmarks(
-    image: Tensor,
-    finder: LandmarkFinder | LandmarkTrees,
-    face: int = 0,
-    detector: FaceDetector | None = None,
-    appearance: AppearanceModel | None = None,
-) -> TrackedFace:
-    """Landmarks of one face in a photograph.
-
-    Args:
-        image: uint8 (H,W), or (3,H,W) red first.
-        finder: finds 68 landmarks in a box; landmark trees do so from 48 starts.
-        face: which one, from 0, the largest first.
-        detector: finds boxes; the shipped cascades if absent.
-        appearance: of this person; refines what the finder finds.
-
-    Raises:
-        NoFaceError: there are not so many faces, or the finder says that the box shows none.
-        ShapeError: no such image, or a finder that gives other landmarks than the 68.
-        ValueRangeError: trees that find other landmarks than the 68, or a finder that gives some that are not finite.
-
-    Example:
-        >>> from torchface import zoo
-        >>> blank = torch.full((120, 160), 128, dtype=torch.uint8)
-        >>> find_landmarks(blank, zoo.get_model("face_landmarks"))
-        Traceback (most recent call last):
-            ...
-        torchface.landmarks.images.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
-    """
-    finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
-    faces = find_some_faces(image, face, detector or find_faces_of_any_turn)
-    seen = _settled(finder, image, faces.boxes[face], float(faces.tilts[face]))
-    if seen.found.presence < _PHOTOGRAPHED:
-        x, y, wide = (round(float(value)) for value in seen.box[:3])
-        raise NoFaceError(
-            f"image of {image.shape[-1]} x {image.shape[-2]}: found something at ({x}, {y}), {wide} pixels wide, that "
-            f"is a face with a probability of {seen.found.presence:.2f}, expected a face"
-        )
-    return _refined_face(seen.found, image, appearance)
-
-
-def _refined_face(found: FoundLandmarks, image: Tensor, appearance: AppearanceModel | None) -> TrackedFace:
-    """What was found, refined as the person looks."""
-    landmarks = found.landmarks.float()
-    if appearance is not None:
-        landmarks = appearance_landmarks(appearance, torch.from_numpy(grey_pixels(image)), landmarks)
-    return TrackedFace(
-        landmarks, box_around(landmarks), found.confidence.float(), found.visibility.float(), found.presence
-    )
-
-
-def _settled(finder: LandmarkFinder, image: Tensor, box: Tensor, tilt: float) -> _Seen:
-    """Landmarks from a detector's box, then from the box round what was found: detectors' boxes fit loosely.
-
-    Once, not until it stands still: where a finder errs, it errs more from a box that follows it.
-    """
-    first = find_in_box(finder, image, box, tilt)
-    again = _upright_box(first.landmarks)
-    if float(overlaps(box[None], again[None])) < 0.25 or not float(again[2]) >= 1:
-        return _Seen(first, box)
-    return _Seen(find_in_box(finder, image, again, float(tilt_around(first.landmarks))), again)
-
-
-def _placed(landmarks: Tensor) -> Tensor:
-    """Where a face is: its upright box and its tilt, (5,)."""
-    return torch.cat([_upright_box(landmarks), tilt_around(landmarks)[None]])
-
-
-def _upright_box(landmarks: Tensor) -> Tensor:
-    """The box (4,) round landmarks (68,2) as if the face were turned upright."""
-    return box_around(landmarks, float(tilt_around(landmarks)))
-
-
-def _relation(box: Tensor, other: Tensor, tilt: Tensor) -> Tensor:
-    """Where another box (4,) lies, as a face with this tilt sees it: its middle from the box's (2,) in sides of that,
-    and its size by that's; (3,)."""
-    offset = (other[:2] + other[2:] / 2 - box[:2] - box[2:] / 2) / box[2]
-    return torch.cat([(_turn(tilt).T @ offset).clamp(-0.3, 0.3), (other[2:3] / box[2:3]).clamp(0.7, 1.4)])
-
-
-def _turn(tilt: Tensor) -> Tensor:
-    """The rotation (2,2) of a face with a tilt, clockwise as the image is seen."""
-    cos, sin = tilt.cos(), tilt.sin()
-    return torch.stack([cos, -sin, sin, cos]).view(2, 2)
