@@ -16,7 +16,8 @@ from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings, evaluate
-from torchface.workflows.track.track_video import TrackSettings, track_video
+from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_video import track_video
 
 FRAMES, FPS = 150, 60.0
 WIDTH, HEIGHT = 320, 240

@@ -16,7 +16,8 @@ from torchface.capture.video import VideoSettings
 from torchface.cli import main
 from torchface.io.camera_files import save_calibration
 from torchface.workflows.track.track_result import Tracked
-from torchface.workflows.track.track_video import TrackSettings, track_video
+from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.real
 

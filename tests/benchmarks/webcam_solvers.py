@@ -41,8 +41,8 @@ from torchface.onnx.webcam.webcam_solver_graph import READING, webcam_solver_mod
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
+from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
-from torchface.workflows.track.track_video import solver_for
 from torchface.workflows.webcam.default_solver import default_webcam_solver
 from torchface.workflows.webcam.webcam_graph import webcam_networks
 

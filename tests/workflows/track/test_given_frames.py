@@ -21,7 +21,8 @@ from torchface.synthetic.head.performer import performer
 from torchface.take import Take, Track
 from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track.given_frames import given_frames
-from torchface.workflows.track.track_video import TrackSettings, track_video
+from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 

@@ -32,14 +32,17 @@ from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.workflows.live.live_track import track_live
 from torchface.workflows.named_finders import load_finder
-from torchface.workflows.track import track_video as workflow
+from torchface.workflows.track import frame_landmarks
 from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.side_by_side import head_window
+from torchface.workflows.track.track_inputs import check_length
 from torchface.workflows.track.track_models import TrackModels, load_track_models
 from torchface.workflows.track.track_overlay import mesh_drawer, paint_drawer, undistorted
 from torchface.workflows.track.track_page import write_track_page
+from torchface.workflows.track.track_result import Tracked
+from torchface.workflows.track.track_settings import TrackSettings
 from torchface.workflows.track.track_state import FOLDER, TrackedFrames, TrackState
-from torchface.workflows.track.track_video import Tracked, TrackSettings, check_length, track_video
+from torchface.workflows.track.track_video import track_video
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
@@ -117,7 +120,7 @@ def done(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Done:
         return step(self, frame)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "PIECE", PIECE)
+        patch.setattr(frame_landmarks, "PIECE", PIECE)
         with pytest.raises(KeyboardInterrupt):
             track_video(filmed.video, filmed.rig, out, settings, killed)
         left = tuple(path.name for path in out.iterdir())
@@ -213,7 +216,7 @@ def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) 
 def test_damaged_files_are_told_and_made_anew(
     done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workflow, "PIECE", PIECE)
+    monkeypatch.setattr(frame_landmarks, "PIECE", PIECE)
     out = tmp_path / "out"
     shutil.copytree(done.out, out)
     names = {path.relative_to(done.out) for path in done.out.rglob("*") if path.is_file()}

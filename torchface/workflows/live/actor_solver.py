@@ -17,8 +17,8 @@ from torchface.landmarks.images.landmark_tracker import LandmarkTracker
 from torchface.rig import BlendshapeRig
 from torchface.workflows.live.live_frames import planes
 from torchface.workflows.live.solved_frames import LiveFrame
+from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import TrackModels
-from torchface.workflows.track.track_video import solver_for
 
 _MIN_LANDMARKS = 6
 

@@ -18,9 +18,11 @@ from torchface.workflows.live.live_figures import LiveFigures, LiveReport
 from torchface.workflows.live.live_frames import open_source
 from torchface.workflows.live.solved_frames import solved_frames
 from torchface.workflows.live.weight_streams import WeightStreams
+from torchface.workflows.track.take_offsets import offsets_of
 from torchface.workflows.track.track_files import OFFSETS, save_curves
+from torchface.workflows.track.track_inputs import camera_of, load_actor
 from torchface.workflows.track.track_models import load_track_models
-from torchface.workflows.track.track_video import TrackSettings, camera_of, load_actor, offsets_of
+from torchface.workflows.track.track_settings import TrackSettings
 
 _DEFAULT = TrackSettings()
 

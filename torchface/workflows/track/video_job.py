@@ -13,7 +13,8 @@ from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.track.track_page import write_track_page
-from torchface.workflows.track.track_video import TrackSettings, track_video
+from torchface.workflows.track.track_settings import TrackSettings
+from torchface.workflows.track.track_video import track_video
 
 VIDEOS = ItemKind("video", "tracked", VIDEO_ENDINGS)
 _METHOD = "track batch/1"
