@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.correctives import Corrective, CorrectiveActivation, Correctives
+from torchface.correctives import Corrective, Correctives
+from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig

@@ -31,7 +31,7 @@ __all__ = [*_HOMES, "__version__"]
 
 if TYPE_CHECKING:
     from torchface.attachment import Attachment
-    from torchface.correctives import Corrective, Correctives
+    from torchface.correctives.definitions import Corrective, Correctives
     from torchface.errors import TorchfaceError
     from torchface.io import (
         load_mesh,

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchface.correctives import CorrectiveActivation, Correctives, merged_correctives
+from torchface.correctives.activation import CorrectiveActivation
+from torchface.correctives.definitions import Correctives
+from torchface.correctives.merging import merged_correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
 from torchface.shape_names import arkit_sources, mapping

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.energy import Quadratic
-from torchface.correctives import CorrectiveActivation, RoundedActivation
+from torchface.correctives.activation import CorrectiveActivation, RoundedActivation
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.fixed_point_gradient import attach_gradients

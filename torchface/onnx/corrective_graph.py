@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
-from torchface.correctives import RoundedActivation
+from torchface.correctives.activation import RoundedActivation
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.onnx.solver_graph import NEWTON_SCALE
 from torchface.optim.operator_splitting import RELAXATION, RHO

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface import __version__
-from torchface.correctives import ROUNDED, CorrectiveActivation
+from torchface.correctives.activation import ROUNDED, CorrectiveActivation
 from torchface.onnx.corrective_graph import (
     LENGTHS,
     LINEAR_SPLITTING,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchface.correctives import CorrectiveActivation
+from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves, outermost
 from torchface.rig import BlendshapeRig

@@ -16,7 +16,8 @@ from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
 from torchface.capture.video.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.video.video_settings import VideoSettings
 from torchface.capture.video.weight_walk import relative_trust
-from torchface.correctives import CorrectiveActivation, definitions_from_records
+from torchface.correctives.activation import CorrectiveActivation
+from torchface.correctives.definitions import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.rig import BlendshapeRig

@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchface.color_space import to_srgb
-from torchface.correctives import Corrective
+from torchface.correctives.definitions import Corrective
 from torchface.errors import FileFormatError
 from torchface.files.documents import parse_json
 from torchface.io.gltf.container import Document

@@ -10,7 +10,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torchface.correctives import Correctives
+from torchface.correctives.definitions import Correctives
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.contact import ContactPairs
 from torchface.geometry.meshes.deformation import degenerate_triangles, triangle_frames
