@@ -6,7 +6,6 @@ import tyro
 
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
-from torchface.errors import FileFormatError
 from torchface.onnx import export_action_units
 
 
@@ -17,9 +16,7 @@ def action_units(model: str, out: str) -> None:
         model: Its name in the zoo, or a folder.
         out: The .onnx file to write.
     """
-    classifier = zoo.get_model(model)
-    if not isinstance(classifier, ActionUnitClassifier):
-        raise FileFormatError(f"{model}: found a {type(classifier).__name__}, expected a classifier of action units")
+    classifier = zoo.get_model(model, ActionUnitClassifier)
     print(export_action_units(classifier, out))
 
 

@@ -31,7 +31,7 @@ from torchface.files.models import CARD, DESCRIPTION, STATE, read_record, write_
 from torchface.files.state_renames import CONFIG_RENAMES, STATE_RENAMES, current_config, current_state_keys
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-FACTS: dict[str, Any] = {"licence": "MIT", "data": "noise", "metrics": {}, "recipe": "python -m train.none"}
+ABOUT = zoo.ModelCard("MIT", "noise", {}, "python -m train.none")
 NAMES = ("jawOpen", "mouthPucker", "browInnerUp")
 
 
@@ -116,7 +116,7 @@ def outputs(model: nn.Module) -> list[Tensor]:
 @pytest.mark.parametrize("make", [action_units, shape_prior, reciprocal_prior, dynamics_prior])
 def test_a_model_saved_under_old_keys_gives_the_same_numbers(make: Any, tmp_path: Path) -> None:
     model, folder = make(), tmp_path / "model"
-    kind = zoo.save_model(model, folder, **FACTS).kind
+    kind = zoo.save_model(model, folder, ABOUT).kind
     keys = under_old_keys(folder, STATE_RENAMES[kind], CONFIG_RENAMES.get(kind))
     assert (read_record(folder).config != model.config) == (kind in CONFIG_RENAMES)
     assert keys != set(model.state_dict())
@@ -143,7 +143,7 @@ def test_keys_are_renamed_only_into_what_the_module_lacks() -> None:
 
 def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "model"
-    zoo.save_model(shape_prior(), folder, **FACTS)
+    zoo.save_model(shape_prior(), folder, ABOUT)
     state = safetensors.torch.load_file(folder / STATE)
     state["densities.1.freedom"] = state["densities.1.degrees_of_freedom"].clone()
     (folder / STATE).write_bytes(safetensors.torch.save(state))

@@ -10,6 +10,7 @@ import shutil
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-FACTS = {"licence": "MIT", "data": "nothing but noise", "metrics": {"error": 0.25}, "recipe": "python -m train.none"}
+CARD = zoo.ModelCard("MIT", "nothing but noise", {"error": 0.25}, "python -m train.none")
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -52,7 +53,7 @@ def solver(dome_rig: BlendshapeRig) -> MarkerSolver:
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A user's own folder of models, with one in it."""
     monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
-    zoo.save_model(morphable(), tmp_path / "home" / "mine", **FACTS)
+    zoo.save_model(morphable(), tmp_path / "home" / "mine", CARD)
     return tmp_path / "home"
 
 
@@ -71,7 +72,7 @@ def test_a_model_comes_back_as_it_was(home: Path) -> None:
 
 
 def test_a_solver_needs_no_rig_to_come_back(solver: MarkerSolver, tmp_path: Path) -> None:
-    zoo.save_model(solver, tmp_path / "solver", **FACTS)
+    zoo.save_model(solver, tmp_path / "solver", CARD)
     again = zoo.get_model(tmp_path / "solver")
     assert (again.names, again.labels) == (solver.names, solver.labels)
     markers = solver.rest.expand(5, -1, -1) + 0.5 * noise(5, *solver.rest.shape)
@@ -84,7 +85,7 @@ def test_a_head_with_colours_comes_back(dome_rig: BlendshapeRig, tmp_path: Path)
     shape = MorphableModel.fit(vertices + noise(5, *vertices.shape))
     color = MorphableModel.fit(torch.rand(5, *vertices.shape, generator=torch.Generator().manual_seed(1)))
     head = HeadModel.on(dome_rig.neutral, shape, color)
-    zoo.save_model(head, tmp_path / "head", **FACTS)
+    zoo.save_model(head, tmp_path / "head", CARD)
     again = zoo.get_model(tmp_path / "head")
     first, second = (one.mesh(torch.ones(4), torch.ones(4)) for one in (head, again))
     assert torch.equal(first.vertices, second.vertices)
@@ -95,7 +96,7 @@ def test_a_head_with_colours_comes_back(dome_rig: BlendshapeRig, tmp_path: Path)
 def test_a_detector_is_saved_in_the_same_format(tmp_path: Path) -> None:
     detector = UVLandmarkDetector(2, 64, ("left", "right"))
     detector.filters.copy_(noise(*detector.filters.shape))
-    zoo.save_model(detector, tmp_path / "one", **FACTS)
+    zoo.save_model(detector, tmp_path / "one", CARD)
     save_detector(detector, tmp_path / "two", {"errors": {"mean": 1.5}})
     for again in (load_detector(tmp_path / "one"), zoo.get_model(tmp_path / "two")):
         assert again.config == detector.config
@@ -105,15 +106,15 @@ def test_a_detector_is_saved_in_the_same_format(tmp_path: Path) -> None:
 
 def test_half_precision_where_it_is_asked_for(tmp_path: Path) -> None:
     model = morphable()
-    whole = zoo.save_model(model, tmp_path / "whole", **FACTS)
-    half = zoo.save_model(model, tmp_path / "half", **FACTS, half=["components"])
+    whole = zoo.save_model(model, tmp_path / "whole", CARD)
+    half = zoo.save_model(model, tmp_path / "half", CARD, half=["components"])
     assert abs(whole.size - half.size - 2 * model.components.numel()) <= 8  # padding of the header
     again = zoo.get_model(tmp_path / "half")
     assert again.components.dtype == torch.float32
     assert torch.equal(again.components, model.components.half().float())
     assert torch.equal(again.mean, model.mean)
     with pytest.raises(ValueRangeError, match="found modes"):
-        zoo.save_model(model, tmp_path / "none", **FACTS, half=["modes"])
+        zoo.save_model(model, tmp_path / "none", CARD, half=["modes"])
 
 
 def test_the_description_is_what_was_said(home: Path) -> None:
@@ -121,9 +122,14 @@ def test_the_description_is_what_was_said(home: Path) -> None:
     state = (home / "mine" / "state.safetensors").read_bytes()
     assert (found.kind, found.name, found.size) == ("morphable", "mine", len(state))
     assert found.sha256 == hashlib.sha256(state).hexdigest()
-    assert (found.licence, found.data, found.metrics, found.recipe) == tuple(FACTS.values())
+    assert (found.licence, found.data, found.metrics, found.recipe) == (
+        CARD.licence,
+        CARD.data,
+        CARD.metrics,
+        CARD.recipe,
+    )
     assert found.url == (home / "mine").resolve().as_uri()
-    zoo.save_model(morphable(), home / "other", **FACTS, url="https://example.org/m", card="Good for tests.")
+    zoo.save_model(morphable(), home / "other", replace(CARD, url="https://example.org/m", text="Good for tests."))
     assert zoo.describe("other").url == "https://example.org/m"
     card = (home / "other" / "CARD.md").read_text()
     for words in ("# other", "Good for tests.", "nothing but noise", "MIT", "| error | 0.25 |", "python -m train.none"):
@@ -135,7 +141,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     """Where models may lie, none there yet: a checkout's folder, the package's, the user's."""
     package = tmp_path / "site" / "torchface"
     package.mkdir(parents=True)
-    monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
+    monkeypatch.setattr("torchface.zoo.places.__file__", str(package / "zoo" / "places.py"))
     monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
     return {"checkout": package.parent / "models", "package": package / "_models", "home": tmp_path / "home"}
 
@@ -148,8 +154,8 @@ def test_the_checkouts_models_go_before_the_packages_before_the_users_and_each_l
     places: dict[str, Path], tmp_path: Path
 ) -> None:
     for folder in places.values():
-        zoo.save_model(morphable(), folder / "face", **FACTS)
-    zoo.save_model(morphable(), places["home"] / "own", **FACTS)
+        zoo.save_model(morphable(), folder / "face", CARD)
+    zoo.save_model(morphable(), places["home"] / "own", CARD)
     assert zoo.list_models() == ["face", "own"]
     package, home = places["package"] / "face", places["home"] / "face"
     with pytest.warns(UserWarning, match=re.escape(f"model 'face': {package} goes before {home}; ")) as told:
@@ -173,7 +179,7 @@ def test_a_project_file_beside_the_installed_package_hides_nothing_and_adopts_no
     places: dict[str, Path], tmp_path: Path, text: str
 ) -> None:
     for place in ("checkout", "package"):
-        zoo.save_model(morphable(), places[place] / place, **FACTS)
+        zoo.save_model(morphable(), places[place] / place, CARD)
     (tmp_path / "site" / "pyproject.toml").write_text(text)
     assert zoo.list_models() == ["package"]
     project(tmp_path / "site", "torchface")
@@ -249,7 +255,7 @@ def test_a_folder_beside_the_user_goes_by_its_bare_name(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    zoo.save_model(morphable(), tmp_path / "model12", **FACTS)
+    zoo.save_model(morphable(), tmp_path / "model12", CARD)
     assert zoo.find("model12").resolve() == tmp_path / "model12"
     assert torch.equal(zoo.get_model("model12").mean, morphable().mean)
     assert zoo.describe("model12").name == "model12"
@@ -282,15 +288,15 @@ def test_links_that_lead_out_are_not_followed(home: Path, tmp_path: Path) -> Non
 
 def test_what_is_no_model_cannot_be_saved(tmp_path: Path) -> None:
     with pytest.raises(NameMismatchError, match=r"found a Linear, expected one of .*HeadModel"):
-        zoo.save_model(nn.Linear(2, 2), tmp_path / "x", **FACTS)
+        zoo.save_model(nn.Linear(2, 2), tmp_path / "x", CARD)
     with pytest.raises(NameMismatchError, match="letters, digits"):
-        zoo.save_model(morphable(), tmp_path / "..", **FACTS)
+        zoo.save_model(morphable(), tmp_path / "..", CARD)
     broken = morphable()
     broken.mean[3, 1] = torch.nan
     with pytest.raises(ValueRangeError, match="mean: found NaN"):
-        zoo.save_model(broken, tmp_path / "x", **FACTS)
+        zoo.save_model(broken, tmp_path / "x", CARD)
     with pytest.raises(ValueRangeError, match="error = nan"):
-        zoo.save_model(morphable(), tmp_path / "x", **{**FACTS, "metrics": {"error": float("nan")}})
+        zoo.save_model(morphable(), tmp_path / "x", replace(CARD, metrics={"error": float("nan")}))
     assert not (tmp_path / "x").exists()
 
 
@@ -382,7 +388,7 @@ def test_a_mutated_model_is_loaded_or_refused(solver: MarkerSolver, dome_rig: Bl
     bundles = []
     for model in (morphable(), solver, HeadModel.on(dome_rig.neutral, shape), detector):
         folder = tmp_path / type(model).__name__
-        zoo.save_model(model, folder, **FACTS)
+        zoo.save_model(model, folder, CARD)
         bundles.append(tmp_path / f"{folder.name}.bundle")
         bundles[-1].write_bytes(
             (folder / "model.toml").read_bytes() + _BETWEEN + (folder / "state.safetensors").read_bytes()

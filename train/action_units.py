@@ -141,14 +141,12 @@ def save(
     }
     frames = sum(own.frames for own in labels)
     flags = f"--video {' '.join(effective['video'])} --labels {' '.join(effective['labels'])}"
-    zoo.save_model(
-        classifier,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence,
         data=f"{frames} frames of {len(labels)} head-camera videos.",
         metrics=metrics,
         recipe=f"python -m train.action_units {flags} --out models/{settings.out.name}",
-        card=(
+        text=(
             f"Action units {', '.join(classifier.units)} told from strokes of reflective paint in a head-camera video, "
             "frame by frame, each at one of a few levels of intensity. It knows no other units, and combinations only "
             "as far as they were performed. Accuracy is of unit and level together, whole repetitions left out; other "
@@ -156,6 +154,7 @@ def save(
         ),
         settings=effective,
     )
+    zoo.save_model(classifier, settings.out, card)
 
 
 def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLabels]:

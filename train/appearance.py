@@ -121,14 +121,12 @@ def save(
     effective = asdict(settings)
     effective |= {"data": settings.data.name, "out": settings.out.name}
     effective["model"] = {**effective["model"], "resolutions": list(settings.model.resolutions)}
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence,
         data=f"{len(frames)} annotated frames of {settings.data.name}.",
         metrics=metrics,
         recipe=f"python -m train.appearance --data {settings.data.name} --out models/{settings.out.name}",
-        card=(
+        text=(
             "Refines the 68 landmarks of one person, from the start that a detector gives. Errors are mean distances "
             "of landmarks in frames left out of trial models, of the distance between the eyes' outer corners; the "
             "starts lie half of the way to the person's usual face and are off by some hundredths besides. What only "
@@ -136,6 +134,7 @@ def save(
         ),
         settings=effective,
     )
+    zoo.save_model(model, settings.out, card)
 
 
 def _picture(frame: AnnotatedFrame, found: Tensor) -> Tensor:

@@ -148,9 +148,7 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
             source += f" --coarse {settings.coarse.name}"
         data = f"{frames} captured frames of {sequences} sequences."
     named = ", ".join(model.region_names)
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or ("MIT" if settings.frames is None else "that of the capture"),
         data=data,
         metrics=metrics,
@@ -158,7 +156,7 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
             f"python -m train.enhancement {source} --held-out {settings.held_out} --rank {settings.rank} "
             f"--patch {settings.patch} --regions {settings.regions} --out models/{settings.out.name}"
         ),
-        card=(
+        text=(
             f"Gives coarse animations on {len(model.neutral)} vertices the wrinkles, creases and timing of one actor: "
             "`torchface enhance INPUT --model THIS --out DIR`. Detail is what lies beyond a smooth part "
             f"({model.wavelength:.0f} mm keep half); it is looked up by region ({named}). The figures compare "
@@ -168,8 +166,8 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
             + (" Its detail is what one kind of coarse input lacks: it is for that kind." if model.keeps_input else "")
         ),
         settings=effective,
-        half=("database_features", "region_weights"),
     )
+    zoo.save_model(model, settings.out, card, half=("database_features", "region_weights"))
 
 
 if __name__ == "__main__":

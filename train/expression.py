@@ -190,22 +190,20 @@ def save(model: ExpressionRegression, people: People, comparison: Comparison | N
         flags += f" --expressions {' '.join(settings.expressions)}"
     for name in ("neutral_components", "offset_components", "ridge"):
         flags += f" --{name.replace('_', '-')} {getattr(settings, name)}"
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
         data=data,
         metrics={} if comparison is None else comparison.metrics(),
         recipe=f"python -m train.expression {flags} --out models/{settings.out.name}",
-        card=(
+        text=(
             f"Predicts {', '.join(people.names)} from a neutral face of the same topology: linear, "
             f"{len(model.neutral_components)} components of the part that moves to {len(model.offset_components)} of "
             "the offsets. Good for a first rig of a person of whom there is one scan; where there are scans of "
             f"expressions, learn from those. {_tested(comparison)}It knows only people like those it has learned from."
         ),
         settings=effective,
-        half=("neutral_components", "offset_mean", "offset_components"),
     )
+    zoo.save_model(model, settings.out, card, half=("neutral_components", "offset_mean", "offset_components"))
     if comparison is not None and comparison.predicted:
         folder = settings.out / "pictures"
         make_folder(folder)

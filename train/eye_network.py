@@ -138,9 +138,7 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
     effective |= {"out": settings.out.name, "folder": settings.folder.name}
     heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
     flags = "" if settings.ict is None else f"--ict {settings.ict.name} "
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence="MIT",
         data=f"{settings.pictures} rendered pictures of both eyes of {heads}; no person's photograph.",
         metrics=metrics,
@@ -148,7 +146,7 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
             f"python -m train.eye_network {flags}--pictures {settings.pictures} --seed {settings.seed} "
             f"--network.steps {settings.network.steps} --out models/{settings.out.name}"
         ),
-        card=(
+        text=(
             "Reads an upright crop of a right eye, or of a left one in a mirror: six landmarks of the lids and the "
             "iris's centre with the deviation to be expected of each, how far the eye is open, whether it is shut and "
             "whether something hides it. Good for faces within 50 degrees of frontal, from 50 pixels a box; below 100 "
@@ -156,7 +154,9 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
             "rendered people that it had not seen; tests/benchmarks/test_real_faces.py measures it on real ones."
         ),
         settings=effective,
-        half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1),
+    )
+    zoo.save_model(
+        model, settings.out, card, half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1)
     )
 
 

@@ -131,15 +131,13 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
     effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     heads = "ICT-FaceKit's heads (MIT) and the embedded performer" if settings.ict else "the embedded performer"
     flags = f"--people {settings.people} --seed {settings.seed} --training.pictures {settings.training.pictures}"
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence="MIT",
         data=f"Scenes of {count} rendered pictures of {heads}; no person's photograph.",
         metrics=measured,
         recipe=f"python -m train.face_boxes {'--ict FaceXModel ' if settings.ict else ''}{flags} "
         f"--out models/{settings.out.name}",
-        card=(
+        text=(
             "Faces in whole colour or grey pictures: centre, side, score and roll angle of each. Boxes are those of "
             "`torchface.landmarks.images.ibug_68.turned_box`. Good for faces from 24 pixels in pictures of 640. Tested "
             f"on {settings.tested} scenes of {_TEST_SIZE} pixels with people that it had not seen. It has seen no "
@@ -148,7 +146,9 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
             "(`torchface.landmarks.images.turned_search.find_in_quarter_turns`)."
         ),
         settings=effective,
-        half=[name for name, value in model.state_dict().items() if value.ndim == 4],
+    )
+    zoo.save_model(
+        model, settings.out, card, half=[name for name, value in model.state_dict().items() if value.ndim == 4]
     )
 
 

@@ -129,9 +129,7 @@ def save(model: LandmarkNetwork, settings: Settings, metrics: dict[str, float]) 
     effective |= {"out": settings.out.name, "folder": settings.folder.name}
     heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
     flags = "" if settings.ict is None else f"--ict {settings.ict.name} "
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence="MIT",
         data=f"{settings.pictures} rendered pictures of {heads}; no person's photograph.",
         metrics=metrics,
@@ -139,14 +137,16 @@ def save(model: LandmarkNetwork, settings: Settings, metrics: dict[str, float]) 
             f"python -m train.landmark_network {flags}--pictures {settings.pictures} --seed {settings.seed} "
             f"--network.steps {settings.network.steps} --out models/{settings.out.name}"
         ),
-        card=(
+        text=(
             "iBUG's 68 landmarks of a face in a crop of a colour or grey image, with the deviation to be expected of "
             "each, whether something hides it, and whether there is a face at all. Good for faces within 60 degrees of "
             "frontal, from 24 pixels a box, at any roll that the crop is turned by. The figures are of rendered people "
             "that it had not seen; tests/benchmarks/test_real_faces.py measures it on photographs."
         ),
         settings=effective,
-        half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1),
+    )
+    zoo.save_model(
+        model, settings.out, card, half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1)
     )
 
 

@@ -249,14 +249,12 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
             "median error, %": 100 * float(errors.median()),
             "share of faces with more than 10 %, %": 100 * float((errors > 0.1).float().mean()),
         }
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or ("that of the data" if settings.data else "MIT"),
         data=data,
         metrics=metrics,
         recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
-        card=(
+        text=(
             "iBUG's 68 landmarks of faces in grey images, from boxes as OpenCV's Haar cascade gives them or "
             "`landmarks.images.ibug_68.box_around` makes them of landmarks. Good for faces within 40 degrees of "
             f"frontal, 40 pixels or more a box. Tested on {len(errors)} faces that it had not seen."
@@ -267,8 +265,8 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
             )
         ),
         settings=effective,
-        half=("offsets", "thresholds", "bases"),
     )
+    zoo.save_model(model, settings.out, card, half=("offsets", "thresholds", "bases"))
 
 
 if __name__ == "__main__":

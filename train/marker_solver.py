@@ -69,14 +69,12 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
     flags = f"--rig {settings.rig.name}" if settings.rig else f"--markers {settings.markers} --seed {settings.seed}"
     flags += f" --attachment {settings.attachment.name}" if settings.attachment else ""
     flags += f" --part {settings.part}" if settings.part else ""
-    zoo.save_model(
-        solver,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or ("MIT" if settings.rig is None else "that of the rig"),
         data=f"The rig of {own}, {len(solver.names)} shapes, {len(solver.labels)} markers; no person's face.",
         metrics=metrics,
         recipe=f"python -m train.marker_solver {flags} --out models/{settings.out.name}",
-        card=(
+        text=(
             "Weights of blendshapes from 3D markers in millimetres, NaN for not seen; every frame on its own, the "
             "exact minimum. Good for takes of this rig with this layout, in its space; another actor needs another "
             "one. "
@@ -85,6 +83,7 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
         ),
         settings=effective,
     )
+    zoo.save_model(solver, settings.out, card)
     return solver
 
 

@@ -245,21 +245,21 @@ def save(
         tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
     carried = f"A rig of {len(model.rig_names)} shapes travels with it. " if model.rig_names else ""
     free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
-    zoo.save_model(
-        model,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or free,
         data=data,
         metrics=metrics,
         recipe=f"python -m train.morphable {flags} --out models/{settings.out.name}",
-        card=(
+        text=(
             f"Neutral heads as a linear model: a mean and {model.shape.count} components, coefficients in standard "
             "deviations, millimetres. Good for drawing heads, for holding a registration or a fit to photographs to "
             f"what heads look like, for filling in what a scan does not show. {colors} {carried}{tested} It "
             "knows no heads unlike those it has learned from: beyond 3 standard deviations it only guesses."
         ),
         settings=effective,
-        half=[name for name in _HALF if settings.half and name in model.state_dict()],
+    )
+    zoo.save_model(
+        model, settings.out, card, half=[name for name in _HALF if settings.half and name in model.state_dict()]
     )
 
 

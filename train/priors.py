@@ -384,16 +384,15 @@ def _save(
         if value != getattr(standard, name):
             flags += f" --{name.replace('_', '-')} {value.name if isinstance(value, Path) else value}"
     flags += f" --names {' '.join(settings.names)}" if settings.names else ""
-    zoo.save_model(
-        prior,
-        out,
+    known = zoo.ModelCard(
         licence=settings.licence or ("MIT" if settings.takes is None else "that of the takes"),
         data=f"{source} {len(learn.names)} shapes; tested on {len(test.weights)} more takes.",
         metrics=metrics,
         recipe=f"python -m train.priors {flags} --kind {kind} --seed {settings.seed} --out models/{out.name}",
-        card=card,
+        text=card,
         settings=effective,
     )
+    zoo.save_model(prior, out, known)
 
 
 def _lines(_: Settings, measured: dict[str, dict[str, float]]) -> list[str]:

@@ -167,20 +167,19 @@ def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErro
     flags += f" --appearance {settings.appearance}" + (f" --held-out {len(errors)}" if errors else "")
     seen = "colours" if settings.appearance == "texture" else "form"
     pitch = CylinderLayout().resized(settings.size).pitch
-    zoo.save_model(
-        detector,
-        settings.out,
+    card = zoo.ModelCard(
         licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
         data=data,
         metrics=error_table(errors),
         recipe=f"python -m train.uv_landmarks {flags} --out models/{settings.out.name}",
-        card=(
+        text=(
             f"Twelve face landmarks, lip and lid lines of raw scans, found by their {seen}. Tested on {len(errors)} "
             f"other scans; pixels are those of the unwrapped head, {settings.size} a side, {pitch:g} mm each. Lids are "
             "traced where they meet in scans with closed eyes."
         ),
         settings=effective,
     )
+    zoo.save_model(detector, settings.out, card)
 
 
 def _split(settings: Settings, progress: Progress) -> tuple[list[AnnotatedScan], list[AnnotatedScan]]:

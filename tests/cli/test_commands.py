@@ -13,8 +13,7 @@ from rich.console import Console
 import torchface
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, WholeTakeSolver
-from torchface.cli import COMMANDS, main, progress
-from torchface.cli.export import EXPORTS
+from torchface.cli import COMMANDS, GROUPS, main, progress
 from torchface.evaluation import weight_jitter
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
@@ -25,6 +24,10 @@ from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, r
 from torchface.take import Take, Track
 from torchface.workflows.attach.attach_markers import load_sites
 
+WORDS = [
+    *((name,) for name in COMMANDS),
+    *((name, second) for name, group in GROUPS.items() for second in group.commands),
+]
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 
@@ -141,7 +144,7 @@ def test_info_tells_of_the_animation_in_a_file(
 
 
 def test_every_command_that_shows_progress_can_be_quiet(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]:
+    for words in WORDS:
         with pytest.raises(SystemExit):
             main([*words, "--help"])
         told = capsys.readouterr().out
@@ -183,7 +186,7 @@ def test_mistakes_end_with_a_message_and_status_2(
 
 
 def test_every_command_explains_itself_and_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]:
+    for words in WORDS:
         with pytest.raises(SystemExit) as ended:
             main([*words, "--help"])
         assert ended.value.code == 0
@@ -198,7 +201,7 @@ def test_help_is_a_short_line_a_command(capsys: pytest.CaptureFixture[str], monk
         main(["--help"])
     assert end.value.code == 0
     lines = [line.split(None, 1) for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    assert {line[0] for line in lines} == {*COMMANDS, "export"}
+    assert {line[0] for line in lines} == {*COMMANDS, *GROUPS}
     assert all(10 < len(line[1].strip()) < 90 for line in lines)
 
 

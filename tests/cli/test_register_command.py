@@ -112,7 +112,7 @@ def test_a_model_by_folder_holds_the_registration(
 ) -> None:
     heads = dome_rig.vertices * torch.tensor([[1, 1, 1], [1.05, 1, 1], [1, 0.95, 1.1], [1, 1, 1.1]])[:, None]
     model = MorphableModel.fit(heads)
-    zoo.save_model(model, brought / "domes", licence="MIT", data="domes", metrics={}, recipe="this test")
+    zoo.save_model(model, brought / "domes", zoo.ModelCard("MIT", "domes", {}, "this test"))
     scans, template = str(brought / "scans"), str(brought / "template.glb")
     words = ["register", template, scans, "--out", str(brought / "out"), "--landmarks", scans, "--model"]
     assert status_of([*words, str(brought / "domes")]) == 1
@@ -128,7 +128,7 @@ def test_a_model_by_folder_holds_the_registration(
         main([*words, "dunes"])
     assert "found no 'dunes'" in capsys.readouterr().err
     small = MorphableModel.fit(heads[:, :50])
-    zoo.save_model(small, brought / "half", licence="MIT", data="domes", metrics={}, recipe="this test")
+    zoo.save_model(small, brought / "half", zoo.ModelCard("MIT", "domes", {}, "this test"))
     with pytest.raises(SystemExit):
         main([*words, str(brought / "half")])
     assert "found a model of (50, 3), expected the template's topology" in " ".join(capsys.readouterr().err.split())

@@ -15,7 +15,7 @@ from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.synthetic.head.performer import performer
-from torchface.zoo import get_model, save_model
+from torchface.zoo import ModelCard, get_model, save_model
 
 
 def test_a_rigid_motion_of_the_input_moves_the_output_alike(model, database):
@@ -184,7 +184,7 @@ def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monke
 def test_a_copy_and_a_saved_model_give_the_same(model, database, tmp_path):
     expected = model(database.smooth[3:5])
     assert torch.equal(copy.deepcopy(model)(database.smooth[3:5]), expected)
-    save_model(model, tmp_path / "actor", licence="MIT", data="made", metrics={}, recipe="none")
+    save_model(model, tmp_path / "actor", ModelCard("MIT", "made", {}, "none"))
     assert torch.equal(get_model(tmp_path / "actor")(database.smooth[3:5]), expected)
 
 

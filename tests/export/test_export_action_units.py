@@ -14,7 +14,7 @@ from torchface.capture import ActionUnitClassifier
 from torchface.capture.action_units.classifier import GroupSize
 from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.cli.export import action_units as command
-from torchface.errors import FileFormatError, ValueRangeError
+from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.modeling import MorphableModel
 from torchface.onnx import action_unit_graph as graph
 from torchface.onnx import export_action_units
@@ -37,7 +37,7 @@ def classifier() -> ActionUnitClassifier:
 
 @pytest.fixture
 def folder(classifier: ActionUnitClassifier, tmp_path: Path) -> Path:
-    zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="made", metrics={}, recipe="none")
+    zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "made", {}, "none"))
     return tmp_path / "units"
 
 
@@ -60,8 +60,8 @@ def test_the_command_and_the_module_write_the_same_file(
 
 def test_another_model_is_refused(tmp_path: Path) -> None:
     heads = MorphableModel.fit(torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0)))
-    zoo.save_model(heads, tmp_path / "heads", licence="MIT", data="made", metrics={}, recipe="none")
-    with pytest.raises(FileFormatError, match="found a MorphableModel"):
+    zoo.save_model(heads, tmp_path / "heads", zoo.ModelCard("MIT", "made", {}, "none"))
+    with pytest.raises(NameMismatchError, match="a MorphableModel"):
         command(str(tmp_path / "heads"), tmp_path / "x.onnx", quiet=True)
 
 

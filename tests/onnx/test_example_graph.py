@@ -63,7 +63,7 @@ def test_many_steps_are_the_exact_solve(examples: ExampleShapes, kind: str) -> N
 
 def test_it_is_written_with_its_names_or_not_at_all(examples: ExampleShapes, tmp_path: Path) -> None:
     solver = ExampleSolver(examples)
-    zoo.save_model(solver, tmp_path / "kept", licence="MIT", data="", metrics={}, recipe="")
+    zoo.save_model(solver, tmp_path / "kept", zoo.ModelCard("MIT", "", {}, ""))
     again = zoo.get_model(tmp_path / "kept")
     report = export_example_solver(again, tmp_path / "solver.onnx")
     assert all(gap.mean < 5e-3 for gap in report.gaps)

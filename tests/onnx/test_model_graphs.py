@@ -125,7 +125,7 @@ def test_the_command_exports_models_of_a_folder(
     solver = MarkerSolver(dome_rig, Attachment.from_vertices(dome_rig.neutral, range(0, 600, 9)))
     kinds = {"head": "head_decoder", "solver": "solver"}
     for name, model in zip(kinds, (head, solver), strict=True):
-        zoo.save_model(model, tmp_path / name, **FACTS)
+        zoo.save_model(model, tmp_path / name, zoo.ModelCard("MIT", "noise", {"error": 1.5}, "none"))
         out = tmp_path / f"{name}.onnx"
         main(["export", str(tmp_path / name), "--out", str(out), "--quiet"])
         assert str(out) in capsys.readouterr().out.replace("\n", "")

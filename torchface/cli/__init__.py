@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 # Threads of small matrix products that spin while they wait cost a busy machine ten times the work itself. Set before
 # anything imports torch, which reads it once.
@@ -41,6 +42,7 @@ from torchface.cli.solve import solve
 from torchface.cli.track import track
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
+from torchface.cli.zoo import ZOO
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
@@ -64,13 +66,37 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "pick": pick,
     "annotate": annotate,
 }
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands of two words, such as `torchface export solver`.
+
+    Args:
+        summary: a line for the overview.
+        description: above the group's own help.
+        commands: by their second word.
+    """
+
+    summary: str
+    description: str
+    commands: dict[str, Callable[..., None]]
+
+
+GROUPS = {
+    "export": Group(
+        "Write an ONNX graph of a solver or of a model of the zoo: `torchface export --help`.",
+        "Write an ONNX graph: of your own solver, as below, or of a learned model by its name or folder, as in "
+        "`torchface export head --out head.onnx`.",
+        EXPORTS,
+    ),
+    "zoo": Group(
+        "Tell which learned models there are and whether they are whole: `torchface zoo --help`.",
+        "What learned models there are, what is known of them, and whether they are whole.",
+        ZOO,
+    ),
+}
 DESCRIPTION = "Learn face rigs from scans, solve performances with them, ship them as ONNX and glTF."
-
-
-_EXPORT = (
-    "Write an ONNX graph: of your own solver, as below, or of a learned model by its name or folder, as in "
-    "`torchface export head --out head.onnx`."
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -85,26 +111,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(0 if words else 2)
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
-        elif words[:1] == ["export"]:
-            exports = {name: plain_options(export) for name, export in EXPORTS.items()}
-            tyro.extras.subcommand_cli_from_dict(exports, prog="torchface export", description=_EXPORT, args=words[1:])
+        elif words[0] in GROUPS:
+            group = GROUPS[words[0]]
+            tyro.extras.subcommand_cli_from_dict(
+                {name: plain_options(command) for name, command in group.commands.items()},
+                prog=f"torchface {words[0]}",
+                description=group.description,
+                args=words[1:],
+            )
         else:
             commands = {name: plain_options(command) for name, command in COMMANDS.items()}
-            commands["export"] = _export_help
             tyro.extras.subcommand_cli_from_dict(commands, prog="torchface", description=DESCRIPTION, args=words)
 
 
 def _overview() -> None:
     """A line a command; tyro would print the whole of each."""
     table = Table(box=None, show_header=False, padding=(0, 2))
-    for name, command in (COMMANDS | {"export": _export_help}).items():
-        summary = " ".join((command.__doc__ or "").partition("\n\n")[0].split())
+    summaries = {name: (command.__doc__ or "").partition("\n\n")[0] for name, command in COMMANDS.items()}
+    summaries |= {name: group.summary for name, group in GROUPS.items()}
+    for name, text in summaries.items():
+        summary = " ".join(text.split())
         table.add_row(Text(name, "bold"), re.split(r"[:;,.](?:\s|$)", summary)[0])
     page = PlainConsole(stderr=False)
     page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
     page.print(table, highlight=False)
     page.print("\ntorchface COMMAND --help shows more of each; torchface --version.", highlight=False)
-
-
-def _export_help() -> None:
-    """Write an ONNX graph of a solver or of a model of the zoo: `torchface export --help`."""

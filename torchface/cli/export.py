@@ -86,16 +86,11 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     """
     from torchface import zoo
     from torchface.capture import ActionUnitClassifier
-    from torchface.errors import FileFormatError
     from torchface.onnx import export_action_units
 
     with progress_bars(quiet) as progress:
         progress("reading the classifier")
-        classifier = zoo.get_model(model)
-        if not isinstance(classifier, ActionUnitClassifier):
-            raise FileFormatError(
-                f"{model}: found a {type(classifier).__name__}, expected a classifier of action units"
-            )
+        classifier = zoo.get_model(model, ActionUnitClassifier)
         progress("exporting and checking")
         report = export_action_units(classifier, out)
     table = Table(show_header=False)

@@ -16,10 +16,11 @@ from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config
 from torchface.files.states import check_size, pack_state, read_state
-from torchface.files.whole_files import all_or_none, made_folder, write_file
+from torchface.files.whole_files import all_or_none, made_folder, read_file, write_file
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
+_MAX_CARD_BYTES = 2**18
 _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
 
 
@@ -115,6 +116,12 @@ def read_record(folder: str | Path) -> ModelRecord:
         size=document["size"].whole(1, 2**48, f"the bytes of {STATE}"),
         **tables,
     )
+
+
+def read_card(folder: str | Path) -> str:
+    """What ``CARD.md`` says, as far as it is text; nothing where there is none."""
+    path = _inside(Path(folder), CARD)
+    return read_file(path, _MAX_CARD_BYTES).decode("utf-8", "replace") if path.is_file() else ""
 
 
 Model = TypeVar("Model", bound=nn.Module)

@@ -9,6 +9,7 @@ from pathlib import Path
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, LandmarkTrees
+from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.landmarks.images.eyes.eye_finder import EyeFinder, graph_eye_finder
 from torchface.landmarks.images.finders.crop_finder import BothSides
 from torchface.landmarks.images.finders.eyed_finder import EyedFinder
@@ -99,4 +100,4 @@ def network_finder(network: LandmarkNetwork, name: str, photographs: bool = Fals
 @cache
 def eye_finder() -> EyeFinder:
     """What reads lids and irises off the eyes of faces whose landmarks are known: the zoo's ``eye_network``."""
-    return graph_eye_finder(eye_network_model(zoo.get_model(EYES)).SerializeToString())
+    return graph_eye_finder(eye_network_model(zoo.get_model(EYES, EyeNetwork)).SerializeToString())

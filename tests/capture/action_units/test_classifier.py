@@ -160,7 +160,7 @@ def test_two_performers_can_be_learned_from(
 
 
 def test_from_disk_and_from_onnx(classifier: ActionUnitClassifier, regions: RegionVideo, tmp_path: Path) -> None:
-    zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="made", metrics={}, recipe="none")
+    zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "made", {}, "none"))
     again = zoo.get_model(tmp_path / "units")
     assert isinstance(again, ActionUnitClassifier)
     frames, rest = regions.patterns[:60], regions.rest

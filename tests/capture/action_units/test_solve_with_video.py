@@ -15,7 +15,7 @@ from torchface.synthetic.stages.camera_stage import RecordedSession
 def test_the_video_leads_what_markers_hardly_see(
     other: RecordedSession, classifier: ActionUnitClassifier, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    zoo.save_model(classifier, tmp_path / "units", licence="MIT", data="filmed", metrics={}, recipe="none")
+    zoo.save_model(classifier, tmp_path / "units", zoo.ModelCard("MIT", "filmed", {}, "none"))
     save_rig(other.rig, tmp_path / "rig.glb")
     other.attachment.save(tmp_path / "attachment.json")
     words = [

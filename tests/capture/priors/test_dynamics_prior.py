@@ -187,7 +187,7 @@ def test_a_face_at_rest_stays_where_no_take_was(swinging: DynamicsPrior) -> None
 
 
 def test_the_zoo_keeps_it(prior: DynamicsPrior, tmp_path: Path) -> None:
-    zoo.save_model(prior, tmp_path / "kept", licence="MIT", data="made up", metrics={}, recipe="none")
+    zoo.save_model(prior, tmp_path / "kept", zoo.ModelCard("MIT", "made up", {}, "none"))
     other = zoo.get_model(tmp_path / "kept")
     windows = torch.rand(3, 3, 52, generator=torch.Generator().manual_seed(1))
     assert (other.names, other.window, other.fps, other.input_noise) == (prior.names, 3, 60.0, 0.0)

@@ -19,7 +19,7 @@ from torchface.synthetic import performer
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 NAMES = ("jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft", "mouthLeft")
-FACTS = {"licence": "MIT", "data": "nothing but noise", "metrics": {}, "recipe": ""}
+CARD = zoo.ModelCard("MIT", "nothing but noise", {}, "")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def weights(solver: VideoSolver, landmarks: Tensor) -> Tensor:
 
 
 def test_a_saved_solver_needs_no_rig_to_come_back(solver: VideoSolver, landmarks: Tensor, tmp_path: Path) -> None:
-    zoo.save_model(solver, tmp_path / "mine", **FACTS)
+    zoo.save_model(solver, tmp_path / "mine", CARD)
     again = zoo.get_model(tmp_path / "mine")
     assert isinstance(again, VideoSolver)
     assert (again.names, again.settings, again.config) == (solver.names, solver.settings, solver.config)

@@ -269,7 +269,7 @@ def test_parts_far_apart_move_apart(film: PortraitVideo) -> None:
 
 
 def test_models_come_back_from_files(film: PortraitVideo, model: AppearanceModel, tmp_path: Path) -> None:
-    zoo.save_model(model, tmp_path / "actor", licence="MIT", data="a film", metrics={}, recipe="none")
+    zoo.save_model(model, tmp_path / "actor", zoo.ModelCard("MIT", "a film", {}, "none"))
     again = zoo.get_model(tmp_path / "actor")
     assert type(again) is AppearanceModel
     assert again.settings == model.settings
@@ -299,7 +299,7 @@ def test_files_that_could_not_have_been_learned_are_refused(
 ) -> None:
     model = AppearanceModel.fit(list(film.frames[:4]), film.landmarks[:4])
     break_it(model)
-    zoo.save_model(model, tmp_path / "actor", licence="MIT", data="a film", metrics={}, recipe="none")
+    zoo.save_model(model, tmp_path / "actor", zoo.ModelCard("MIT", "a film", {}, "none"))
     with pytest.raises(FileFormatError, match="config and state do not fit"):
         zoo.get_model(tmp_path / "actor")
 

@@ -213,13 +213,13 @@ def test_mirrored_pictures_teach_the_other_side() -> None:
 
 def test_a_model_of_full_size_stays_below_30_mb(tmp_path: Path) -> None:
     model = made_up(landmarks=68, cascades=10, trees=500, depth=5, features=400, components=136)
-    record = zoo.save_model(model, tmp_path / "full", licence="MIT", data="none", metrics={}, recipe="")
+    record = zoo.save_model(model, tmp_path / "full", zoo.ModelCard("MIT", "none", {}, ""))
     assert record.size < 30e6
     assert export_model(model, tmp_path / "full.onnx").size < 30e6
     usual = made_up()
     assert usual.sizes == {**model.sizes, "components": 40}
     half = ("offsets", "thresholds", "bases")
-    record = zoo.save_model(usual, tmp_path / "usual", licence="MIT", data="", metrics={}, recipe="", half=half)
+    record = zoo.save_model(usual, tmp_path / "usual", zoo.ModelCard("MIT", "", {}, ""), half=half)
     assert record.size < 8e6
 
 
@@ -239,16 +239,16 @@ def test_the_graph_computes_the_same(learned: LandmarkTrees, pixels: str, tmp_pa
 
 
 def test_zoo_round_trip(learned: LandmarkTrees, tmp_path: Path) -> None:
-    facts = {"licence": "MIT", "data": "blobs", "metrics": {}, "recipe": ""}
-    zoo.save_model(learned, tmp_path / "exact", **facts)  # type: ignore[arg-type]
+    card = zoo.ModelCard("MIT", "blobs", {}, "")
+    zoo.save_model(learned, tmp_path / "exact", card)
     images, boxes, _ = blobs(3, 4)
     pictures = torch.stack(images)[:, None].float() / 255
     half = ("offsets", "thresholds", "bases")  # trained as they are stored: nothing is lost
-    zoo.save_model(learned, tmp_path / "half", half=half, **facts)  # type: ignore[arg-type]
+    zoo.save_model(learned, tmp_path / "half", card, half=half)
     for name in ("exact", "half"):
         assert torch.equal(zoo.get_model(tmp_path / name)(pictures, boxes), learned(pictures, boxes))
     learned.first[0, 0, 0], kept = 5000, int(learned.first[0, 0, 0])
-    zoo.save_model(learned, tmp_path / "broken", **facts)  # type: ignore[arg-type]
+    zoo.save_model(learned, tmp_path / "broken", card)
     learned.first[0, 0, 0] = kept
     with pytest.raises(FileFormatError, match="first: found 0 to 5000"):
         zoo.get_model(tmp_path / "broken")

@@ -128,7 +128,7 @@ def test_the_graph_gives_what_the_network_gives(network: LandmarkNetwork, tmp_pa
 
 
 def test_a_saved_network_comes_back(network: LandmarkNetwork, tmp_path) -> None:
-    zoo.save_model(network, tmp_path / "n", licence="MIT", data="none", metrics={}, recipe="", card="")
+    zoo.save_model(network, tmp_path / "n", zoo.ModelCard("MIT", "none", {}, ""))
     crops = torch.rand(2, 3, 64, 64)
     with torch.no_grad():
         torch.testing.assert_close(zoo.get_model(tmp_path / "n")(crops).landmarks, network(crops).landmarks)
@@ -155,7 +155,7 @@ def test_both_sides_of_a_crop_give_mirrored_landmarks(network: LandmarkNetwork) 
 
 
 def test_a_finder_runs_the_network_of_a_folder(network: LandmarkNetwork, tmp_path) -> None:
-    zoo.save_model(network, tmp_path / "n", licence="MIT", data="none", metrics={}, recipe="", card="")
+    zoo.save_model(network, tmp_path / "n", zoo.ModelCard("MIT", "none", {}, ""))
     finder = load_finder(tmp_path / "n").finder
     image = (255 * torch.rand(3, 90, 120, generator=torch.Generator().manual_seed(2))).round().byte()
     box = torch.tensor([30.0, 20.0, 50.0, 50.0])

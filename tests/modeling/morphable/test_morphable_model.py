@@ -214,7 +214,7 @@ def test_a_rig_travels_with_a_head_model(dome_rig: BlendshapeRig, tmp_path: Path
     people = dome_rig.vertices + torch.randn(6, *dome_rig.vertices.shape, generator=torch.Generator().manual_seed(0))
     elsewhere = BlendshapeRig(dome_rig.neutral.with_vertices(dome_rig.vertices + 5), dome_rig.deltas, dome_rig.names)
     model = HeadModel.on(dome_rig.neutral, MorphableModel.fit(people), rig=elsewhere)
-    zoo.save_model(model, tmp_path / "heads", licence="MIT", data="noise", metrics={}, recipe="none")
+    zoo.save_model(model, tmp_path / "heads", zoo.ModelCard("MIT", "noise", {}, "none"))
     again = zoo.get_model(tmp_path / "heads").rig
     assert again.names == elsewhere.names
     assert torch.equal(again.deltas, elsewhere.deltas)

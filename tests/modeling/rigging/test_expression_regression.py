@@ -221,7 +221,7 @@ def test_a_rig_of_other_names_is_predicted_too(performers: list[BlendshapeRig]) 
 
 def test_saved_and_loaded(people: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     model = ExpressionRegression.fit(*people, names=["smile", "frown"])
-    zoo.save_model(model, tmp_path / "m", licence="MIT", data="noise", metrics={}, recipe="")
+    zoo.save_model(model, tmp_path / "m", zoo.ModelCard("MIT", "noise", {}, ""))
     again = zoo.get_model(tmp_path / "m")
     assert again.names == ("smile", "frown")
     assert torch.equal(again(people[0]), model(people[0]))

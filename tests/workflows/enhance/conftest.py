@@ -69,7 +69,7 @@ def actor(tmp_path_factory: pytest.TempPathFactory) -> Actor:
         database = folded(rig(learned), rig.vertices)
     sequences = torch.arange(4).repeat_interleave(4)
     model = EnhancementModel.fit(database, rig.neutral.faces, sequences, rig.vertices, fps=FPS, rank=8)
-    zoo.save_model(model, folder / "model", licence="MIT", data="made", metrics={}, recipe="here")
+    zoo.save_model(model, folder / "model", zoo.ModelCard("MIT", "made", {}, "here"))
     weights = torch.linspace(0, 1, FRAMES)[:, None] * (0.6 * extremes[0] + 0.4 * extremes[1])
     attachment = place_markers(rig, 60)
     save_rig(rig, folder / "rig.glb")

@@ -59,7 +59,7 @@ def studio(tmp_path_factory: pytest.TempPathFactory, actor: BlendshapeRig) -> Pa
     template = performer().select(SHAPES)
     carrying = HeadModel.on(actor.neutral, model.shape, model.color, template)
     for name, saved in (("heads", model), ("heads_with_rig", carrying)):
-        zoo.save_model(saved, folder / name, licence="MIT", data="performers", metrics={}, recipe="none")
+        zoo.save_model(saved, folder / name, zoo.ModelCard("MIT", "performers", {}, "none"))
     save_rig(template, folder / "template.glb")
     weights = torch.zeros(1, len(actor.names))
     weights[0, actor.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
@@ -269,7 +269,7 @@ def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactor
     sizes = modes.deltas.flatten(1).norm(dim=1)
     heads = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes.deltas / sizes[:, None, None], sizes), rig=rig)
     model = tmp_path_factory.mktemp("models") / "people"
-    zoo.save_model(heads, model, licence="MIT", data="ICT", metrics={}, recipe="none")
+    zoo.save_model(heads, model, zoo.ModelCard("MIT", "ICT", {}, "none"))
     return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
 
 

@@ -122,7 +122,7 @@ def test_a_model_of_heads_holds_the_sliding(actor: Actor, tmp_path: Path) -> Non
     to_actor = actor.true.vertices - template.vertices
     people = torch.linspace(-1.5, 1.5, 5)[:, None, None] * to_actor + template.vertices
     model = MorphableModel.fit(people, 1)
-    zoo.save_model(model, tmp_path / "people", licence="MIT", data="planted", metrics={}, recipe="none")
+    zoo.save_model(model, tmp_path / "people", zoo.ModelCard("MIT", "planted", {}, "none"))
     files = (
         actor.folder / "neutral.ply",
         actor.folder / "template.glb",

@@ -340,7 +340,7 @@ def test_models_that_do_not_fit_are_told(dome_rig: BlendshapeRig, tmp_path: Path
         load_track_models(dome_rig, dynamics="face_landmarks")
     takes = [torch.rand(60, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
     prior = ShapePrior.fit(takes, ("jawLeft", "mouthLeft", "browDownLeft"))
-    zoo.save_model(prior, tmp_path / "other", licence="MIT", data="none", metrics={}, recipe="none")
+    zoo.save_model(prior, tmp_path / "other", zoo.ModelCard("MIT", "none", {}, "none"))
     with pytest.raises(NameMismatchError, match=r"other: .*jawLeft"):
         load_track_models(dome_rig, prior=tmp_path / "other")
 

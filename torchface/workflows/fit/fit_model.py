@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from torchface import zoo
-from torchface.errors import NameMismatchError, TopologyError
+from torchface.errors import TopologyError
 from torchface.io import load_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.modeling import HeadModel
@@ -21,10 +21,7 @@ def load_head_model(name_or_path: str | Path) -> HeadModel:
     Raises:
         NameMismatchError: there is none of this name, or it is of another kind.
     """
-    found = zoo.get_model(name_or_path)
-    if not isinstance(found, HeadModel):
-        raise NameMismatchError(f"model: found {name_or_path}, a {type(found).__name__}, expected a HeadModel")
-    return found
+    return zoo.get_model(name_or_path, HeadModel)
 
 
 def matching(

@@ -76,11 +76,7 @@ def predicted_curves(
         NameMismatchError: the model is no classifier, or no table fits the rig.
         TorchfaceError: the video or a file beside it cannot be used.
     """
-    classifier = zoo.get_model(camera.classifier)
-    if not isinstance(classifier, ActionUnitClassifier):
-        raise NameMismatchError(
-            f"{camera.classifier}: found a {type(classifier).__name__}, expected a classifier of action units"
-        )
+    classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     labels = load_action_labels(camera.labels or camera.video.with_suffix(".toml"))
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
     return resampled_curves(action_unit_curves(classifier, camera.video, labels, table, names, progress=progress), take)

@@ -26,8 +26,8 @@ def default_webcam_solver(settings: WebcamSettings | None = None) -> WebcamSolve
         ('eyeBlinkLeft', 'eyeLookDownLeft')
     """
     rig = performer(texture=False)
-    heads = zoo.get_model(HEADS)
-    if not isinstance(heads, HeadModel) or heads.landmarks is None:
-        raise NameMismatchError(f"{HEADS}: found a {type(heads).__name__}, expected a HeadModel with landmarks")
+    heads = zoo.get_model(HEADS, HeadModel)
+    if heads.landmarks is None:
+        raise NameMismatchError(f"{HEADS}: found a HeadModel without landmarks, expected one with them")
     modes = heads.shape.modes[:, heads.landmarks]
     return WebcamSolver(rig, modes, load_priors(rig, DEFAULT_PRIOR, None).shapes, settings)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torchface
 from torchface import zoo
-from torchface.errors import FileFormatError, NameMismatchError
+from torchface.errors import FileFormatError
 from torchface.files.cache_folder import cache_folder
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, read_file, write_file
@@ -34,13 +34,10 @@ def webcam_networks() -> WebcamNetworks:
     Raises:
         NameMismatchError: one of them is another kind of model.
     """
-    boxes, landmarks, eyes = (zoo.get_model(name) for name in NETWORKS)
-    if not (isinstance(boxes, BoxNetwork) and isinstance(landmarks, LandmarkNetwork) and isinstance(eyes, EyeNetwork)):
-        kinds = ", ".join(type(one).__name__ for one in (boxes, landmarks, eyes))
-        raise NameMismatchError(
-            f"{', '.join(NETWORKS)}: found {kinds}, expected a BoxNetwork, a LandmarkNetwork and an EyeNetwork"
-        )
-    return WebcamNetworks(boxes, landmarks, eyes)
+    boxes, landmarks, eyes = NETWORKS
+    return WebcamNetworks(
+        zoo.get_model(boxes, BoxNetwork), zoo.get_model(landmarks, LandmarkNetwork), zoo.get_model(eyes, EyeNetwork)
+    )
 
 
 def webcam_graph(progress: Progress | None = None) -> bytes:

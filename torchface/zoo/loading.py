@@ -1,0 +1,127 @@
+"""Models by name or folder, each known by its class to whoever checks types."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, TypeVar, overload
+
+import torch
+from torch import nn
+
+from torchface.capture.markers.marker_solver import MarkerSolver
+from torchface.capture.priors import DynamicsPrior, ShapePrior
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.files.models import CARD, read_model, read_record
+from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.eyes import EyeNetwork
+from torchface.landmarks.images.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.network import LandmarkNetwork
+from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
+from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.rigging.expression_regression import ExpressionRegression
+from torchface.zoo.description import ModelDescription, describe
+from torchface.zoo.kinds import KINDS
+from torchface.zoo.places import find
+
+Model = TypeVar("Model", bound=nn.Module)
+Device = str | torch.device
+
+
+@overload
+def get_model(name_or_path: Literal["dynamics_prior"], *, device: Device = "cpu") -> DynamicsPrior: ...
+@overload
+def get_model(name_or_path: Literal["expressions"], *, device: Device = "cpu") -> ExpressionRegression: ...
+@overload
+def get_model(name_or_path: Literal["eye_network"], *, device: Device = "cpu") -> EyeNetwork: ...
+@overload
+def get_model(name_or_path: Literal["face_boxes"], *, device: Device = "cpu") -> BoxNetwork: ...
+@overload
+def get_model(name_or_path: Literal["face_landmarks"], *, device: Device = "cpu") -> LandmarkTrees: ...
+@overload
+def get_model(name_or_path: Literal["head"], *, device: Device = "cpu") -> HeadModel: ...
+@overload
+def get_model(name_or_path: Literal["landmark_network"], *, device: Device = "cpu") -> LandmarkNetwork: ...
+@overload
+def get_model(name_or_path: Literal["marker_solver"], *, device: Device = "cpu") -> MarkerSolver: ...
+@overload
+def get_model(name_or_path: Literal["shape_prior"], *, device: Device = "cpu") -> ShapePrior: ...
+@overload
+def get_model(name_or_path: Literal["uv_landmarks"], *, device: Device = "cpu") -> UVLandmarkDetector: ...
+@overload
+def get_model(name_or_path: str | Path, kind: type[Model], *, device: Device = "cpu") -> Model: ...
+@overload
+def get_model(name_or_path: str | Path, *, device: Device = "cpu") -> nn.Module: ...
+def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, device: Device = "cpu") -> Any:
+    """A model, ready for use.
+
+    What checks types knows the class of each model that ships by its name, and of any other by ``kind``.
+
+    Args:
+        name_or_path: a name of :func:`list_models`; or a folder, as a ``Path`` or by its path. A name of the zoo goes
+            before a folder of that name in the working directory; a separator (``./head``) asks for the folder.
+        kind: the class that the model has to be of, or a base of it.
+        device: where the model is to lie, such as ``"cuda:1"``.
+
+    Returns:
+        A module of one of the classes in ``KINDS``, in evaluation mode.
+
+    Raises:
+        NameMismatchError: there is no model of this name, or it is of another kind.
+        FileFormatError: a file is missing, damaged, of a newer format, or does not have the hash it should have.
+        ValueRangeError: the device is not there.
+
+    Example:
+        >>> prior = get_model("shape_prior")
+        >>> rest = torch.zeros(1, len(prior.names), dtype=torch.float64)
+        >>> bool(prior.log_density(rest) > prior.log_density(rest + 1))
+        True
+        >>> get_model("shape_prior", MarkerSolver)
+        Traceback (most recent call last):
+            ...
+        torchface.errors.NameMismatchError: model: found shape_prior, a ShapePrior, expected a MarkerSolver
+    """
+    place = _checked(device)
+    folder = find(name_or_path)
+    record = read_record(folder)
+    found = KINDS.get(record.kind)
+    if found is not None and not issubclass(found, kind):
+        raise NameMismatchError(f"model: found {name_or_path}, {_a(found)}, expected {_a(kind)}")
+    return read_model(folder, KINDS).to(place)
+
+
+def verify(name_or_path: str | Path) -> ModelDescription:
+    """Checks that a model is whole: its files are there, the state has its size and hash, and it loads.
+
+    Returns:
+        What the model is.
+
+    Raises:
+        NameMismatchError: there is no model of this name.
+        FileFormatError: a file is missing or damaged; the message says what was found and what was expected.
+
+    Example:
+        >>> verify("shape_prior").kind
+        'shape_prior'
+    """
+    found = describe(name_or_path)
+    if not (found.folder / CARD).is_file():
+        raise FileFormatError(f"{found.folder / CARD}: found no such file, expected the model's card")
+    read_model(found.folder, KINDS)
+    return found
+
+
+def _a(kind: type) -> str:
+    return f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}"
+
+
+def _checked(device: Device) -> torch.device:
+    """A device on which a tensor can be made."""
+    try:
+        place = torch.device(device)
+        torch.empty(0, device=place)
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:
+        there = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        there += ["mps"] if torch.backends.mps.is_available() else []
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueRangeError(f"device: found {str(device)!r} ({why}), expected one of {', '.join(there)}") from error
+    return place
