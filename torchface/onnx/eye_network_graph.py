@@ -13,7 +13,7 @@ from torchface import __version__
 from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, LEAST_SPREAD, POINTS, STRIDE, EyeNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
-from torchface.onnx.network_nodes import convolution, doubled, folded, layers
+from torchface.onnx.network_nodes import convolution, crop_cases, doubled, folded, heat_points, layers, with_context
 
 _OUTPUTS: dict[str, tuple[int, ...]] = {
     "landmarks": (6, 2), "iris": (2,), "deviation": (POINTS,), "openness": (), "closed": (), "visibility": ()
@@ -38,13 +38,7 @@ def export_eye_network(model: EyeNetwork, path: str | Path, facts: Mapping[str, 
         ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     model = model.eval()
-    generator = torch.Generator().manual_seed(0)
-    cases = []
-    for batch in (1, 2):
-        coarse = torch.rand(batch, 3, model.height // 8, model.width // 8, generator=generator)
-        crops = torch.nn.functional.interpolate(coarse, (model.height, model.width), mode="bilinear")
-        with torch.no_grad():
-            cases.append(({"eyes": crops}, model(crops)._asdict()))
+    cases = crop_cases(model, "eyes", (model.height, model.width), (1, 2))
     return write_checked(eye_network_model(model, facts), path, cases, _PARITY, _UNITS)
 
 
@@ -77,7 +71,7 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
         outputs: what the values of the network's findings shall be called, by their names in ``EyeFindings``.
     """
     net = folded(model, EyeNetwork.from_config(model.config))
-    op, quarters = build.op, nn.Conv2d(net.context.in_features, net.context.out_features, 1)
+    op = build.op
 
     def constant(name: str, value: torch.Tensor | float | tuple[int, ...]) -> str:
         return build.constant(f"eye_{name}", value)
@@ -91,22 +85,15 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
     quarter = layers(build, net.quarter, half)
     deep = layers(build, net.eighth, quarter)
     pooled = op("GlobalAveragePool", deep)
-    quarters.weight.data, quarters.bias.data = net.context.weight.data[:, :, None, None], net.context.bias.data  # type: ignore[union-attr]
-    deep = op("Add", deep, convolution(build, quarters, pooled))
+    deep = with_context(build, net.context, pooled, deep)
     quarter = layers(
         build, net.mix_quarter, op("Add", doubled(build, convolution(build, net.up_quarter, deep)), quarter)
     )
     features = layers(build, net.mix_half, op("Add", doubled(build, convolution(build, net.up_half, quarter)), half))
-    heat = op("Reshape", convolution(build, net.heat, features), constant("rows", (0, POINTS, -1)))
-    share = op("Softmax", heat, axis=-1)
     places = net.places(torch.zeros(1, 1, model.height // STRIDE, model.width // STRIDE))
-    points = op("MatMul", share, constant("places", places))
+    points, spread, under = heat_points(build, net.heat, features, places, "eye_")
     last = constant("last", (-1,))
-    squared = op("MatMul", share, constant("squares", places.square()))
-    spread = op("ReduceSum", op("Sub", squared, op("Mul", points, points)), last, keepdims=0)
-    spread = op("Log", op("Add", op("Max", spread, constant("zero", 0.0)), constant("unit", 1.0)))
-    cells = op("Reshape", features, constant("cells", (0, net.channels[0], -1)))
-    under = op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1]))
+    spread = op("Log", op("Add", spread, constant("unit", 1.0)))
     told = op("ReduceSum", op("Mul", under, build.weight(net.local)), last, keepdims=0)
     told = op("Add", told, constant("bias", net.local_bias))
     deviation = op("Exp", op("Add", told, op("Mul", spread, constant("fourth", 0.25))))

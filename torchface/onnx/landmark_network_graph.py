@@ -7,13 +7,12 @@ from pathlib import Path
 
 import onnx
 import torch
-from torch import nn
 
 from torchface import __version__
 from torchface.landmarks.images.network import DEVIATION_RANGE, LandmarkNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
-from torchface.onnx.network_nodes import convolution, doubled, folded, layers
+from torchface.onnx.network_nodes import convolution, crop_cases, doubled, folded, heat_points, layers, with_context
 
 _PARITY = {"landmarks": 0.1, "deviation": 0.1, "visibility": 0.01, "presence": 0.01}
 _UNITS = {"landmarks": "pixels", "deviation": "pixels", "visibility": "of 1", "presence": "of 1"}
@@ -37,13 +36,7 @@ def export_landmark_network(
         ValueRangeError: ONNX Runtime and PyTorch differ; nothing is written.
     """
     model = model.eval()
-    generator = torch.Generator().manual_seed(0)
-    cases = []
-    for batch in (1, 3):
-        coarse = torch.rand(batch, 3, model.size // 8, model.size // 8, generator=generator)
-        crops = torch.nn.functional.interpolate(coarse, (model.size, model.size), mode="bilinear")
-        with torch.no_grad():
-            cases.append(({"image": crops}, model(crops)._asdict()))
+    cases = crop_cases(model, "image", (model.size, model.size), (1, 3))
     return write_checked(landmark_network_model(model, facts), path, cases, _PARITY, _UNITS)
 
 
@@ -97,22 +90,14 @@ def landmark_network_nodes(
     eighth = layers(build, net.eighth, quarter)
     deep = layers(build, net.sixteenth, eighth)
     pooled = op("GlobalAveragePool", deep)
-    context = nn.Conv2d(net.context.in_features, net.context.out_features, 1)
-    context.weight.data, context.bias.data = net.context.weight.data[:, :, None, None], net.context.bias.data  # type: ignore[union-attr]
-    deep = op("Add", deep, convolution(build, context, pooled))
+    deep = with_context(build, net.context, pooled, deep)
     eighth = op("Add", doubled(build, convolution(build, net.up_eighth, deep)), eighth)
     eighth = layers(build, net.mix_eighth, eighth)
     below = doubled(build, convolution(build, net.up_quarter, eighth))
     features = layers(build, net.mix_quarter, op("Add", below, convolution(build, net.skip_quarter, quarter)))
-    heat = op("Reshape", convolution(build, net.heat, features), constant("rows", (0, 68, -1)))
-    share = op("Softmax", heat, axis=-1)
     places = net.places(torch.zeros(1, 1, model.size // 4, model.size // 4))
-    landmarks = op("MatMul", share, constant("places", places), output=f"{prefix}landmarks")
-    squared = op("MatMul", share, constant("squares", places.square()))
-    spread = op("ReduceSum", op("Sub", squared, op("Mul", landmarks, landmarks)), constant("last", (-1,)), keepdims=0)
-    spread = op("Add", op("Max", spread, constant("zero", 0.0)), "one")
-    cells = op("Reshape", features, constant("channels", (0, net.decoder, -1)))
-    under = op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1]))
+    _, spread, under = heat_points(build, net.heat, features, places, output=f"{prefix}landmarks")
+    spread = op("Add", spread, "one")
     told = [
         op("Add", op("ReduceSum", op("Mul", under, build.weight(net.local[..., i])), "last", keepdims=0),
            constant(f"bias{i}", net.local_bias[:, i]))

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from torchface.landmarks.images.network import ResidualBlock
 from torchface.onnx.graph_builder import GraphBuilder
 
 Network = TypeVar("Network", bound=nn.Module)
+Inputs = dict[str, Tensor]
+
+
+class HeatPoints(NamedTuple):
+    """Names of what is read off heat maps of P points.
+
+    Args:
+        points: (B,P,2), the mean places of the heat.
+        squared_spread: (B,P), its variance by both axes together.
+        features: (B,P,C), the features under the heat.
+    """
+
+    points: str
+    squared_spread: str
+    features: str
 
 
 def folded(model: Network, twin: Network) -> Network:
@@ -57,3 +73,52 @@ def doubled(build: GraphBuilder, value: str) -> str:
     return build.op(
         "Resize", value, "", scales, mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor"
     )
+
+
+def with_context(build: GraphBuilder, context: nn.Linear, pooled: str, deep: str) -> str:
+    """The nodes that add to a map (B,C,h,w) what a linear layer makes of its mean (B,C,1,1)."""
+    pointwise = nn.Conv2d(context.in_features, context.out_features, 1)
+    pointwise.weight.data, pointwise.bias.data = context.weight.data[:, :, None, None], context.bias.data  # type: ignore[union-attr]
+    return build.op("Add", deep, convolution(build, pointwise, pooled))
+
+
+def heat_points(
+    build: GraphBuilder, heat: nn.Conv2d, features: str, places: Tensor, prefix: str = "", output: str | None = None
+) -> HeatPoints:
+    """The nodes that read points off heat maps.
+
+    Args:
+        build: the graph that they become part of.
+        heat: makes P maps of features.
+        features: (B,C,h,w).
+        places: of the maps' cells, (h*w,2).
+        prefix: of the constants' names.
+        output: what the points shall be called.
+    """
+    op = build.op
+    maps = op(
+        "Reshape", convolution(build, heat, features), build.constant(f"{prefix}rows", (0, heat.out_channels, -1))
+    )
+    share = op("Softmax", maps, axis=-1)
+    named = {} if output is None else {"output": output}
+    points = op("MatMul", share, build.constant(f"{prefix}places", places), **named)
+    squared = op("MatMul", share, build.constant(f"{prefix}squares", places.square()))
+    last = build.constant(f"{prefix}last", (-1,))
+    spread = op("ReduceSum", op("Sub", squared, op("Mul", points, points)), last, keepdims=0)
+    spread = op("Max", spread, build.constant(f"{prefix}zero", 0.0))
+    cells = op("Reshape", features, build.constant(f"{prefix}cells", (0, heat.in_channels, -1)))
+    return HeatPoints(points, spread, op("MatMul", share, op("Transpose", cells, perm=[0, 2, 1])))
+
+
+def crop_cases(
+    model: nn.Module, name: str, size: tuple[int, int], batches: Sequence[int]
+) -> list[tuple[Inputs, Inputs]]:
+    """Smooth random crops (B,3,height,width), and what a network finds in them, to hold a graph against."""
+    generator = torch.Generator().manual_seed(0)
+    cases = []
+    for batch in batches:
+        coarse = torch.rand(batch, 3, size[0] // 8, size[1] // 8, generator=generator)
+        crops = nn.functional.interpolate(coarse, size, mode="bilinear")
+        with torch.no_grad():
+            cases.append(({name: crops}, model(crops)._asdict()))
+    return cases
