@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config
-from torchface.files.states import check_size, pack_state, read_state
+from torchface.files.states import MAX_HEADER_BYTES, check_size, pack_state, read_state
 from torchface.files.whole_files import all_or_none, made_folder, read_file, write_file
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
-_MAX_CARD_BYTES = 2**18
+MAX_CARD_BYTES = 2**18
 _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
 
 
@@ -121,7 +121,7 @@ def read_record(folder: str | Path) -> ModelRecord:
 def read_card(folder: str | Path) -> str:
     """What ``CARD.md`` says, as far as it is text; nothing where there is none."""
     path = _inside(Path(folder), CARD)
-    return read_file(path, _MAX_CARD_BYTES).decode("utf-8", "replace") if path.is_file() else ""
+    return read_file(path, MAX_CARD_BYTES).decode("utf-8", "replace") if path.is_file() else ""
 
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -139,14 +139,7 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     folder = Path(folder)
     record = _known_record(folder, kinds)
     path, state_path = folder / DESCRIPTION, _state_path(folder)
-    try:
-        with torch.device("meta"):
-            model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
-        expected: dict[str, Tensor] = model.state_dict()
-    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
-        raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
-    except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
-        raise FileFormatError(f"{path}: config cannot be used ({error})") from error
+    model, expected = _bare_model(path, record, kinds)
     state, data = read_state(state_path, expected, record.size, record.kind)
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
@@ -161,6 +154,35 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     except (RuntimeError, TorchfaceError) as error:
         raise FileFormatError(f"{path}: config and state do not fit ({error})") from error
     return model.eval()
+
+
+def check_claims(folder: Path, kinds: Mapping[str, type[nn.Module]]) -> ModelRecord:
+    """The record of a folder whose state may not be there yet: of one of these kinds, its size no more than its config
+    asks for.
+
+    Raises:
+        FileFormatError: ``model.toml`` cannot be used, or says otherwise.
+    """
+    record = _known_record(folder, kinds)
+    _, expected = _bare_model(folder / DESCRIPTION, record, kinds)
+    largest = sum(8 * tensor.numel() for tensor in expected.values()) + MAX_HEADER_BYTES
+    if record.size > largest:
+        raise FileFormatError(
+            f"{folder / DESCRIPTION}: found size = {record.size}, expected at most {largest}, which its config asks for"
+        )
+    return record
+
+
+def _bare_model(path: Path, record: ModelRecord, kinds: Mapping[str, type[Model]]) -> tuple[Model, dict[str, Tensor]]:
+    """A model that has learned nothing yet, and the state that it wants; neither takes memory."""
+    try:
+        with torch.device("meta"):
+            model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
+        return model, model.state_dict()
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
+    except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({error})") from error
 
 
 def model_fault(folder: str | Path, kinds: Collection[str]) -> str | None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.state_renames import current_state_keys
 
-_MAX_HEADER_BYTES = 2**20
+MAX_HEADER_BYTES = 2**20
 _FAMILIES = {
     **dict.fromkeys(("F16", "F32", "F64"), "float"),
     **dict.fromkeys(("I8", "I16", "I32", "I64", "U8"), "int"),
@@ -67,8 +67,8 @@ def read_state(
     try:
         check_size(path, size)
         with path.open("rb") as file:
-            if int.from_bytes(file.read(8), "little") > _MAX_HEADER_BYTES:
-                raise FileFormatError(f"{path}: no readable state (found a header above {_MAX_HEADER_BYTES} bytes)")
+            if int.from_bytes(file.read(8), "little") > MAX_HEADER_BYTES:
+                raise FileFormatError(f"{path}: no readable state (found a header above {MAX_HEADER_BYTES} bytes)")
             with safe_open(path, framework="pt") as stored:  # reads and checks the header alone
                 names = current_state_keys(kind, stored.keys(), expected)
                 _check(path, {names[key]: stored.get_slice(key) for key in stored.keys()}, expected)  # noqa: SIM118

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface.files.models import ModelRecord, read_card, read_record
+from torchface.zoo.hub import fetch_description, hub_reference
 from torchface.zoo.places import find, is_path, named_folders
 
 
@@ -37,6 +38,8 @@ class ModelDescription(ModelRecord):
 def describe(name_or_path: str | Path) -> ModelDescription:
     """What a model is, without loading it: kind, licence, data, metrics, recipe, url, size and sha256 of its state.
 
+    Of a Hugging Face repository only the description and the card are fetched.
+
     Raises:
         NameMismatchError: there is no model of this name.
         FileFormatError: its ``model.toml`` cannot be read.
@@ -45,12 +48,17 @@ def describe(name_or_path: str | Path) -> ModelDescription:
         >>> describe("face_landmarks").kind
         'landmark_trees'
     """
-    folder = find(name_or_path)
+    reference = hub_reference(str(name_or_path))
+    folder = find(name_or_path) if reference is None else fetch_description(reference)
     found = dict(vars(read_record(folder)))
-    found["url"] = found["url"] or folder.resolve().as_uri()
+    found["url"] = found["url"] or (folder.resolve().as_uri() if reference is None else str(reference))
     shadowed = () if is_path(name_or_path) else tuple(named_folders(str(name_or_path))[1:])
     return ModelDescription(
-        **found, name=folder.name, folder=folder, shadowed=shadowed, summary=_summary(read_card(folder))
+        **found,
+        name=folder.name if reference is None else reference.name,
+        folder=folder,
+        shadowed=shadowed,
+        summary=_summary(read_card(folder)),
     )
 
 

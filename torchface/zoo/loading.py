@@ -11,7 +11,7 @@ from torch import nn
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.models import CARD, read_model, read_record
+from torchface.files.models import CARD, read_model
 from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.landmarks.images.landmark_trees import LandmarkTrees
@@ -58,7 +58,9 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
 
     Args:
         name_or_path: a name of :func:`list_models`; or a folder, as a ``Path`` or by its path. A name of the zoo goes
-            before a folder of that name in the working directory; a separator (``./head``) asks for the folder.
+            before a folder of that name in the working directory; a separator (``./head``) asks for the folder. Or
+            ``hf://owner/name``, ``hf://owner/name@revision``, ``hf://owner/name/folder``: a repository of the Hugging
+            Face Hub, fetched once (extra ``hub``).
         kind: the class that the model has to be of, or a base of it.
         device: where the model is to lie, such as ``"cuda:1"``.
 
@@ -69,6 +71,7 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
         NameMismatchError: there is no model of this name, or it is of another kind.
         FileFormatError: a file is missing, damaged, of a newer format, or does not have the hash it should have.
         ValueRangeError: the device is not there.
+        MissingExtraError: a repository is asked for, and ``huggingface_hub`` is not installed.
 
     Example:
         >>> prior = get_model("shape_prior")
@@ -81,12 +84,11 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
         torchface.errors.NameMismatchError: model: found shape_prior, a ShapePrior, expected a MarkerSolver
     """
     place = _checked(device)
-    folder = find(name_or_path)
-    record = read_record(folder)
-    found = KINDS.get(record.kind)
-    if found is not None and not issubclass(found, kind):
-        raise NameMismatchError(f"model: found {name_or_path}, {_a(found)}, expected {_a(kind)}")
-    return read_model(folder, KINDS).to(place)
+    if kind is not nn.Module:
+        found = KINDS.get(describe(name_or_path).kind)
+        if found is not None and not issubclass(found, kind):
+            raise NameMismatchError(f"model: found {name_or_path}, {_a(found)}, expected {_a(kind)}")
+    return read_model(find(name_or_path), KINDS).to(place)
 
 
 def verify(name_or_path: str | Path) -> ModelDescription:
@@ -103,10 +105,11 @@ def verify(name_or_path: str | Path) -> ModelDescription:
         >>> verify("shape_prior").kind
         'shape_prior'
     """
+    folder = find(name_or_path)
     found = describe(name_or_path)
-    if not (found.folder / CARD).is_file():
-        raise FileFormatError(f"{found.folder / CARD}: found no such file, expected the model's card")
-    read_model(found.folder, KINDS)
+    if not (folder / CARD).is_file():
+        raise FileFormatError(f"{folder / CARD}: found no such file, expected the model's card")
+    read_model(folder, KINDS)
     return found
 
 
