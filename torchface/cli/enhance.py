@@ -48,9 +48,9 @@ def enhance(
     Writes into OUT: enhanced.safetensors (every frame's mesh), enhanced.glb, comparison.mp4, frames.csv (how near the
     model comes, by region), summary.json and the report index.html. Killed and started again, it goes on where it was.
 
-    Several inputs, or a folder that holds some (and no mesh of its own): OUT gets a folder NAME of each. {name} in an
-    option's path is the input's name. One that cannot be worked on is reported and skipped, and the exit status is 1;
-    started again, the command goes on where it was.
+    Several inputs, or a folder that holds some (not a folder of still meshes, which is one): OUT gets a folder NAME of
+    each. {name} in an option's path is the input's name. One that cannot be worked on is reported and skipped, and the
+    exit status is 1; started again, the command goes on where it was.
 
     Args:
         animation: What is to be enhanced.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,14 +97,42 @@ def load_animated(path: Path, rig: Path | None = None, part: str | None = None) 
 
 
 def is_animation(path: Path) -> bool:
-    """Whether :func:`load_animated` reads a file or folder, by ending, header, and what the folder holds."""
+    """Whether :func:`load_animated` reads a file or folder, by ending, header, and what the folder holds.
+
+    A folder is one where it holds meshes that are its frames: not scenes that move by themselves, nor a single mesh
+    beside animations.
+    """
     if path.is_dir():
-        return any(file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS) for file in path.iterdir())
+        files = sorted(path.iterdir())
+        meshes = [file for file in files if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS)]
+        if len(meshes) == 1 and any(map(_is_take, files)):
+            return False
+        return bool(meshes) and not _moves(file for file in meshes if file.suffix.lower() in SCENE_ENDINGS)
     ending = path.suffix.lower()
     if ending == ".csv":
         header = TableReader(path).header
         return is_live_link(header) or (is_numbered(header) and not is_marker_header(header))
     return ending in (".safetensors", *MESH_ENDINGS, *SCENE_ENDINGS)
+
+
+def _is_take(file: Path) -> bool:
+    """Whether a file holds weights, markers or meshes over time, by ending and header."""
+    try:
+        ending = file.suffix.lower()
+        if ending != ".csv":
+            return ending in (".safetensors", ".c3d", ".trc")
+        header = TableReader(file).header
+        return is_numbered(header) or is_live_link(header)
+    except FileFormatError:
+        return False
+
+
+def _moves(scenes: Iterable[Path]) -> bool:
+    """Whether the first that can be read has an animation of its own; the others of a folder are taken to be alike."""
+    for scene in scenes:
+        with suppress(FileFormatError):
+            return load_animation(scene) is not None
+    return False
 
 
 def _of_weights(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -17,12 +16,19 @@ import pytest
 from slow_items import WORDS, SpellJob
 
 from torchface.errors import ValueRangeError
+from torchface.workflows.batch import ray_cluster
 from torchface.workflows.batch.batch_items import find_items
 from torchface.workflows.batch.outcomes import Outcome
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport, run_batch
 
 pytestmark = [pytest.mark.cluster, pytest.mark.slow]
 
+NODE = {
+    "num_cpus": 1,
+    "object_store_memory": 80 * 2**20,
+    "include_log_monitor": False,
+    "node_ip_address": "127.0.0.1",
+}
 TEXTS = {f"w{i}": f"word {i}" for i in range(8)}
 DRIVER = """
 import sys
@@ -37,19 +43,29 @@ run_batch(job, WORDS, find_items([words], WORDS), words.parent / "out", BatchOpt
 """
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Two nodes of one CPU each, on this machine; the second is ``cluster.second``."""
-    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-    from ray.cluster_utils import Cluster
+@pytest.fixture(scope="module")
+def shared_cluster() -> Iterator[Any]:
+    """A Ray cluster on this machine's loopback, of what batches need alone."""
+    ray = pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+        from ray.cluster_utils import Cluster
 
-    small = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-    made = Cluster(initialize_head=True, head_node_args=small)
-    made.second = made.add_node(num_cpus=1, object_store_memory=80 * 2**20)
-    yield made
-    made.shutdown()
+        made = Cluster(initialize_head=True, head_node_args=NODE | {"include_dashboard": False, "no_monitor": True})
+        try:
+            yield made
+        finally:
+            ray.shutdown()
+            made.shutdown()
+
+
+@pytest.fixture
+def cluster(shared_cluster: Any) -> Any:
+    """The cluster with two nodes of one CPU each; the second is ``cluster.second``."""
+    if not shared_cluster.worker_nodes:
+        shared_cluster.second = shared_cluster.add_node(**NODE)
+    return shared_cluster
 
 
 @pytest.fixture
@@ -78,6 +94,50 @@ def check_whole(words: Path, report: BatchReport) -> None:
     assert sorted(path.stem for path in (report.out / "records").iterdir()) == sorted(TEXTS)
 
 
+def test_what_is_no_cluster_is_told_within_20_seconds(words: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before any cluster runs here, which ``auto`` would find."""
+    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
+    assert ray_cluster._SECONDS_TO_ANSWER + 1 + ray_cluster._SECONDS_TO_JOIN < 20  # what is left is Ray's loading
+    monkeypatch.setattr(ray_cluster, "_SECONDS_TO_JOIN", 2.0)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        addresses = ("nonsense", "127.0.0.1:1", "127.0.0.1:99999", "auto", f"127.0.0.1:{silent.getsockname()[1]}")
+        for address in addresses:
+            with pytest.raises(ValueRangeError, match=f"found no Ray cluster at '{address}'"):
+                run(words, BatchOptions(cluster=address))
+
+    def slow(*_: Any) -> None:  # as where no name server answers
+        time.sleep(5)
+        raise OSError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ray_cluster, "_SECONDS_TO_ANSWER", 0.1)
+        patch.setattr(socket, "create_connection", slow)
+        with pytest.raises(ValueRangeError, match="nobody answered within"):
+            run(words, BatchOptions(cluster="far.example:6379"))
+    assert not (words.parent / "out").exists()
+
+
+def test_a_driver_that_is_killed_and_started_again_does_each_item_once(cluster: Any, words: Path) -> None:
+    out = words.parent / "out"
+    process = subprocess.Popen([sys.executable, "-c", DRIVER, str(words), cluster.address])
+    limit = time.monotonic() + 240
+    try:
+        while len(list(out.glob("records/*.json"))) < 2 and process.poll() is None and time.monotonic() < limit:
+            time.sleep(0.05)
+    finally:
+        process.kill()
+        process.wait()
+    finished = {path.name: path.stat().st_mtime_ns for path in out.glob("records/*.json")}
+    assert 2 <= len(finished) < len(TEXTS)
+    report = run(words, BatchOptions(cluster=cluster.address), pause=1.0)
+    check_whole(words, report)
+    assert sum(outcome.reused for outcome in report.outcomes) >= len(finished)
+    for name, when in finished.items():
+        assert (out / "records" / name).stat().st_mtime_ns == when  # what was finished is not made again
+
+
 def test_a_killed_worker_and_a_lost_node_cost_no_item(cluster: Any, words: Path) -> None:
     job = SpellJob(words.parent / "log")
     (words / "x.txt").write_text("dies once")
@@ -102,34 +162,3 @@ def test_a_killed_worker_and_a_lost_node_cost_no_item(cluster: Any, words: Path)
     for name, text in TEXTS.items():
         assert (report.out / name / "word.txt").read_text() == text[::-1]
         assert job.attempts(name) <= 2  # one that was under way on the lost node is begun again
-
-
-def test_a_driver_that_is_killed_and_started_again_does_each_item_once(cluster: Any, words: Path) -> None:
-    out = words.parent / "out"
-    process = subprocess.Popen([sys.executable, "-c", DRIVER, str(words), cluster.address])
-    limit = time.monotonic() + 90
-    while len(list(out.glob("records/*.json"))) < 2 and time.monotonic() < limit:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    finished = {path.name: path.stat().st_mtime_ns for path in out.glob("records/*.json")}
-    assert 2 <= len(finished) < len(TEXTS)
-    report = run(words, BatchOptions(cluster=cluster.address), pause=1.0)
-    check_whole(words, report)
-    assert sum(outcome.reused for outcome in report.outcomes) >= len(finished)
-    for name, when in finished.items():
-        assert (out / "records" / name).stat().st_mtime_ns == when  # what was finished is not made again
-
-
-def test_what_is_no_cluster_is_told_within_20_seconds(words: Path) -> None:
-    pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
-    with socket.socket() as silent:
-        silent.bind(("127.0.0.1", 0))
-        silent.listen()
-        addresses = ("nonsense", "127.0.0.1:1", "auto", f"127.0.0.1:{silent.getsockname()[1]}")
-        for address in addresses:
-            begin = time.monotonic()
-            with pytest.raises(ValueRangeError, match=f"found no Ray cluster at '{address}'"):
-                run(words, BatchOptions(cluster=address))
-            assert time.monotonic() - begin < 20
-    assert not (words.parent / "out").exists()

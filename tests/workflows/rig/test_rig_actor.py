@@ -117,6 +117,43 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     assert maps.neutral is not None
 
 
+def rig_folder(actor: Actor, out: Path, *more: str) -> list[str]:
+    """Rigs a folder of the actor's scan, a damaged one and a video by the command; the names of what comes of it."""
+    scans = out.parent / "scans"
+    scans.mkdir(exist_ok=True)
+    for name in ("neutral.ply", "neutral.json"):
+        (scans / name).write_bytes((actor.folder / name).read_bytes())
+    (scans / "torn.ply").write_bytes((scans / "neutral.ply").read_bytes()[:5000])
+    (scans / "film.mp4").write_text("x")
+    words = [scans, "--template", actor.folder / "template.glb", "--landmarks", scans, "--out", out, *more]
+    with pytest.raises(SystemExit) as ended:
+        main(["rig", *map(str, words)])
+    assert ended.value.code == 1
+    return sorted(path.name for path in out.iterdir())
+
+
+def test_a_folder_of_actors_is_rigged_as_each_alone(
+    actor: Actor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = rig_folder(actor, tmp_path / "rigs")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "1 of 2 scans rigged" in told
+    assert "left out 1 video" in told
+    assert "torn: " in told
+    assert found == ["contact_sheet.png", "neutral.glb", "neutral_registration.png", "records", "summary.csv"]
+    files = (actor.folder / "neutral.ply", actor.folder / "template.glb", tmp_path / "neutral.glb")
+    rig_actor(*files, actor.folder / "neutral.json")
+    assert files[2].read_bytes() == (tmp_path / "rigs" / "neutral.glb").read_bytes()
+
+
+@pytest.mark.bench  # two processes load the library
+def test_two_processes_rig_as_one(actor: Actor, tmp_path: Path) -> None:
+    names = rig_folder(actor, tmp_path / "one")
+    assert rig_folder(actor, tmp_path / "two", "--jobs", "2") == names
+    for name in ("neutral.glb", "neutral_registration.png", "contact_sheet.png"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
 def test_a_model_of_heads_holds_the_sliding(actor: Actor, tmp_path: Path) -> None:
     template = load_rig(actor.folder / "template.glb")
     to_actor = actor.true.vertices - template.vertices

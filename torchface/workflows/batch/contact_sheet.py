@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, from_pillow, sheet
+from torchface.shown_text import visible
 from torchface.viz.figures.face_views import frame_face
 from torchface.workflows.batch.batch_job import picture_path
 from torchface.workflows.batch.outcomes import Outcome
@@ -20,13 +22,16 @@ CONTACT_SHEET = "contact_sheet.png"
 MOST_PICTURES = 400
 """On one sheet: more is not looked at, and a picture of 60 megapixels opens slowly."""
 _TEXT = 11
-_SKIPPED = 0.85
+_LETTER = 7
+"""Pixels a letter takes at most in a text of that size, on average."""
+_SKIPPED = 217
+"""The grey of what has no picture, of 255."""
 WIDTH, HEIGHT = 144, 180
 """Of one view of a face, pixels."""
 
 
 def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
-    """The pictures with their names and headlines, skipped items as blanks; (3,H,W).
+    """The pictures with their names and headlines, of skipped items why they were; (3,H,W).
 
     Args:
         outcomes: of all items; the first :data:`MOST_PICTURES` are shown.
@@ -38,14 +43,14 @@ def contact_sheet(outcomes: Sequence[Outcome], out: Path) -> Tensor:
     cells = []
     for outcome, picture in zip(shown, pictures, strict=True):
         name = outcome.name if len(outcome.name) <= 20 else f"{outcome.name[:9]}..{outcome.name[-9:]}"
-        view = torch.full((3, *size), _SKIPPED) if picture is None else picture
+        view = _blank(outcome, *size) if picture is None else picture
         cells.append(caption(caption(view, name, _TEXT), outcome.headline if outcome.done else "skipped", _TEXT))
     return sheet(cells, min(max(4, round((len(cells) * 1.8) ** 0.5)), len(cells)))
 
 
-def face_picture(mesh: Mesh, colors: Tensor | None = None) -> Tensor:
-    """A face from its front for the contact sheet, (3,H,W); in clay, or with colours (V,3)."""
-    return render(mesh, frame_face(mesh, width=WIDTH, height=HEIGHT), colors, samples=1)
+def face_picture(mesh: Mesh, colors: Tensor | None = None, framed_by: Mesh | None = None) -> Tensor:
+    """A face from its front for the contact sheet, (3,H,W), as it is or with colours (V,3), framed as another pose."""
+    return render(mesh, frame_face(framed_by or mesh, width=WIDTH, height=HEIGHT), colors, samples=1)
 
 
 def small_picture(file: Path) -> Tensor:
@@ -53,6 +58,16 @@ def small_picture(file: Path) -> Tensor:
     with Image.open(file) as image:
         image.thumbnail((4 * WIDTH, HEIGHT))
         return from_pillow(image)
+
+
+def _blank(outcome: Outcome, height: int, width: int) -> Tensor:
+    """Why there is no picture, (3,H,W)."""
+    view = Image.new("RGB", (width, height), (_SKIPPED,) * 3)
+    reason = visible(outcome.error.removeprefix(f"{outcome.item.path}: "))
+    lines = textwrap.wrap(reason, max(1, width // _LETTER), max_lines=height // (_TEXT + 4) - 1, placeholder="..")
+    font = ImageFont.load_default(_TEXT)
+    ImageDraw.Draw(view).multiline_text((6, 6), "\n".join(lines), fill="black", font=font)
+    return from_pillow(view)
 
 
 def _picture(outcome: Outcome, out: Path) -> Tensor | None:

@@ -26,8 +26,12 @@ from torchface.workflows.batch.processes import lost, too_long
 
 _ATTEMPTS = 4
 _PORT = 6379
-_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN = 4.0, 15.0
-_JOIN = "import logging, sys, ray; ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.ERROR)"
+_SECONDS_TO_ANSWER, _SECONDS_TO_JOIN = 3.0, 14.0
+_JOIN = """
+import logging, sys, ray
+print(flush=True)  # loading takes long on a busy machine, and tells nothing about the cluster
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.ERROR)
+"""
 _GRACE = 10.0  # seconds
 _POLL = 1.0  # seconds between looks at how many CPUs the cluster has
 
@@ -42,21 +46,43 @@ def check_cluster(address: str) -> None:
     if _import_ray().is_initialized():
         return
     if address != "auto":
-        host, _, port = address.removeprefix("ray://").rpartition(":")
-        host, port = (host, port) if host else (port, str(_PORT))
+        _check_answers(address)
+    # Ray itself waits for minutes for what does not answer as a cluster does; a process can be ended before.
+    words = [sys.executable, "-c", _JOIN, address]
+    with subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()  # loaded, or ended
+            told = process.communicate(timeout=_SECONDS_TO_JOIN)[1].decode(errors="replace").strip().splitlines()
+        except subprocess.TimeoutExpired as error:
+            why = f"it did not let this process join within {_SECONDS_TO_JOIN:g} seconds"
+            raise _none_there(address, why) from error
+        finally:
+            process.kill()
+    if process.returncode:
+        raise _none_there(address, (told or [f"status {process.returncode}"])[-1][:300])
+
+
+def _check_answers(address: str) -> None:
+    """Raises where nobody takes a connection at ``HOST:PORT``."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    host, port = (host, port) if host else (port, str(_PORT))
+    found: list[Exception] = []
+
+    def connect() -> None:
         try:
             socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()
-        except (OSError, ValueError) as error:
-            raise _none_there(address, str(error)) from error
-    # Ray itself waits for minutes for what does not answer as a cluster does; a process can be ended before.
-    try:
-        words = [sys.executable, "-c", _JOIN, address]
-        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, timeout=_SECONDS_TO_JOIN)
-    except subprocess.TimeoutExpired as error:
-        raise _none_there(address, f"it did not let this process join within {_SECONDS_TO_JOIN:g} seconds") from error
-    if done.returncode:
-        told = done.stderr.decode(errors="replace").strip().splitlines() or [f"status {done.returncode}"]
-        raise _none_there(address, told[-1][:300])
+        except (OSError, ValueError, OverflowError) as error:
+            found.append(error)
+
+    # Where name servers do not answer, looking a name up takes longer than any time limit of a connection.
+    thread = threading.Thread(target=connect, daemon=True)
+    thread.start()
+    thread.join(_SECONDS_TO_ANSWER + 1)
+    if thread.is_alive():
+        raise _none_there(address, f"nobody answered within {_SECONDS_TO_ANSWER:g} seconds")
+    if found:
+        raise _none_there(address, str(found[0])) from found[0]
 
 
 def on_cluster(

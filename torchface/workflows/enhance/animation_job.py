@@ -8,14 +8,15 @@ from pathlib import Path
 from torchface.files.content_keys import content_key
 from torchface.workflows.animated_meshes import is_animation
 from torchface.workflows.batch.batch_items import MARKER_ENDINGS, SCAN_ENDINGS, BatchItem, ItemKind
-from torchface.workflows.batch.contact_sheet import face_picture
+from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.enhance.coarse_input import is_markers, tracked_animation
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, enhance_animation, spread_frames
 from torchface.workflows.enhance.enhance_page import write_enhance_page
+from torchface.workflows.enhance.enhance_views import shown_frame, small_views
 
-_METHOD = "enhance batch/1"
+_METHOD = "enhance batch/2"
 
 
 def is_coarse(path: Path) -> bool:
@@ -53,7 +54,7 @@ class AnimationJob:
         own, folder = item.owned(self), out / item.name
         done = enhance_animation(item.path, own.model, folder, own.settings)
         page = write_enhance_page(done, folder, own.height)
-        shown = done.frames.sequence.read(frame := spread_frames(done, 1)[0], frame + 1)[0]
+        shown = shown_frame(done.animation, done.model, done.frames, spread_frames(done, 1)[0])
         frames = done.animation.count
         return Made(
             (*(path for path in done.products.values() if path.is_file()), page),
@@ -65,5 +66,5 @@ class AnimationJob:
             },
             f"{frames} frames",
             tuple(note.removeprefix("warning: ") for note in done.notes if note.startswith("warning: ")),
-            face_picture(done.mesh.with_vertices(shown)),
+            small_views(shown, done.animation, done.mesh, WIDTH, HEIGHT),
         )

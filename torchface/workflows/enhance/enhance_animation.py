@@ -14,7 +14,7 @@ from torchface.errors import NameMismatchError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job
-from torchface.files.whole_files import all_or_none, make_folder
+from torchface.files.whole_files import all_or_none, made_folder, make_folder
 from torchface.io import save_mesh
 from torchface.io.tables.csv_table import write_table
 from torchface.io.video import write_video
@@ -133,15 +133,16 @@ def enhance_animation(
     Raises:
         TorchfaceError: a file is broken or does not fit the others, or the disk is full.
     """
-    with within_job(out):
-        return _enhance(path, model_name, out, settings, progress or silent)
+    with within_job(out), made_folder(out / STATE) as state:
+        return _enhance(path, model_name, out, state, settings, progress or silent)
 
 
-def _enhance(path: Path, model_name: str, out: Path, settings: EnhanceSettings, progress: Progress) -> Enhanced:
+def _enhance(
+    path: Path, model_name: str, out: Path, state: Path, settings: EnhanceSettings, progress: Progress
+) -> Enhanced:
     progress("reading the model")
     model = load_model(model_name)
     neutral = Mesh(model.neutral, model.faces)
-    state = make_folder(out / STATE)
     animation = read_coarse(path, neutral, settings.given, state, progress)
     if animation.head is not None or settings.detail != 1:
         model = model.on_actor(model.neutral if animation.head is None else animation.head, settings.detail)

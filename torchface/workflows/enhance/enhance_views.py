@@ -33,6 +33,7 @@ _DOT = (60, 230, 60)
 _VIDEO_HEIGHT, _MOST_DRAWN = 480, 450
 _PORES_MM = 8.0  # of which the curvature pictures keep half
 _CURVATURE = 0.1  # end of the colour scale, one over millimetres
+_SMALL_VIEW_MM = 1.0  # end of the colour scale where pictures of many animations lie side by side
 _ALIGNED_BY = 4000  # vertices, which are plenty for a rigid motion
 
 
@@ -62,13 +63,13 @@ def shown_frame(animation: CoarseAnimation, model: EnhancementModel, found: Enha
         smooth = model.low(coarse)[0]
     enhanced = found.sequence.read(number, number + 1)
     given = animation.shown(number, number + 1)
-    away = head_motion(enhanced, model.neutral)
+    away = head_motion(enhanced, smooth)  # as the model holds the head still: what is left between both was added
     still = [away.apply(points.double())[0].float() for points in (given, coarse, enhanced)]
     return ShownFrame(number, still[0], still[1], smooth, still[2])
 
 
 def head_motion(vertices: Tensor, neutral: Tensor) -> Similarity:
-    """What takes the head's rigid motion out of meshes (t,V,3)."""
+    """What takes the head's rigid motion from a mesh (V,3) out of meshes (t,V,3)."""
     step = max(1, len(neutral) // _ALIGNED_BY)
     return rigid_motion(neutral[::step].double(), vertices[:, ::step].double()).inverse()
 
@@ -161,6 +162,15 @@ def added_views(shown: list[ShownFrame], mesh: Mesh, height: int) -> Tensor:
     ]  # fmt: skip
     row = sheet(pictures, len(pictures))
     return sheet([row, color_bar(maximum, "added (mm)", row.shape[1])], 2)
+
+
+def small_views(frame: ShownFrame, animation: CoarseAnimation, mesh: Mesh, width: int, height: int) -> Tensor:
+    """Input, enhanced, and what was added (blue 0 to red 1 mm), of one size each, in a row; (3,H,W)."""
+    camera = frame_face(mesh, width=width, height=height)
+    enhanced = mesh.with_vertices(frame.enhanced)
+    added = error_colors((frame.enhanced - frame.smooth).norm(dim=-1), _SMALL_VIEW_MM, "turbo")
+    views = [_given(frame, animation, mesh, camera), render(enhanced, camera, clay_colors(mesh))]
+    return sheet([*views, render(enhanced, camera, added)], 3)
 
 
 def drawn_frames(

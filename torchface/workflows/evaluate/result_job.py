@@ -17,7 +17,8 @@ from torchface.workflows.evaluate.evaluate_page import write_evaluation_page
 from torchface.workflows.evaluate.evaluation_record import ALL
 
 RESULTS = ItemKind("result", "compared", (".csv", ".safetensors", *SCAN_ENDINGS), is_animation)
-_METHOD = "evaluate batch/1"
+_METHOD = "evaluate batch/2"
+_SHEET_MAXIMUM = 1.0  # millimetres; the same for all, which lie side by side
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class ResultJob:
                 "frames": len(found.frames),
             },
             f"{whole.mean:.3f} mm",
-            picture=face_picture(found.mesh, error_colors(found.vertex_mean, found.maximum)),
+            picture=face_picture(found.mesh, error_colors(found.vertex_mean, self.settings.maximum or _SHEET_MAXIMUM)),
         )
 
     def _truth(self, item: BatchItem) -> Path:

@@ -5,17 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from torchface.files.content_keys import content_key
 from torchface.io.meshes.named_files import named_files
 from torchface.registration.landmark_files import landmark_file
+from torchface.rendering.compositing import sheet
+from torchface.viz.figures.heat_maps import error_colors
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
-from torchface.workflows.batch.contact_sheet import small_picture
+from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.model_contents import model_content
 from torchface.workflows.batch.outcomes import Made
-from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
+from torchface.workflows.rig.actor_rig import ActorReport, RigOptions, rig_actor
 
 ACTORS = ItemKind("scan", "rigged", SCAN_ENDINGS)
-_METHOD = "rig batch/1"
+_METHOD = "rig batch/2"
+_MAX_DISTANCE = 1.0  # millimetres, red in the picture
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class ActorJob:
             },
             f"{found.median_distance:.2f} mm on {found.shown:.0%}",
             (*found.notes, *(f"left out: {line}" for line in done.skipped)),
-            small_picture(done.figure),
+            _picture(done),
         )
 
     def _own(self, item: BatchItem) -> ActorJob:
@@ -69,3 +75,18 @@ class ActorJob:
         if own.landmarks is not None and own.landmarks.is_dir():
             return replace(own, landmarks=landmark_file(own.landmarks, item.path))
         return own
+
+
+def _picture(done: ActorReport) -> Tensor:
+    """The face, its distances to the scan (blue 0 to red 1 mm), and the shape that moves it furthest, (3,H,W)."""
+    neutral, found = done.rig.neutral, done.neutral
+    distances = found.distance.masked_fill(~found.matched, torch.nan).to(neutral.vertices)
+    furthest = done.rig.deltas[done.rig.deltas.norm(dim=-1).amax(1).argmax()]
+    return sheet(
+        [
+            face_picture(neutral),
+            face_picture(neutral, error_colors(distances, _MAX_DISTANCE, "turbo")),
+            face_picture(neutral.with_vertices(neutral.vertices + furthest), framed_by=neutral),
+        ],
+        3,
+    )
