@@ -75,11 +75,18 @@ def test_an_expression_that_the_database_never_shows_is_told(model, database):
 
 
 def test_a_model_of_an_earlier_version_is_refused(model):
-    config = {name: value for name, value in model.config.items() if name != "limits"}
-    with pytest.raises(ValueRangeError, match="earlier version, without limits: learn it again"):
-        EnhancementModel.from_config(config)
-    with pytest.raises(ValueRangeError, match=r"limits: found 1, expected one of each of"):
-        EnhancementModel.from_config({**model.config, "limits": [0.5]})
+    lacking = {name: value for name, value in model.config.items() if name != "scale"}
+    for config in (lacking, {**model.config, "limits": [0.5] * len(model.region_names)}):
+        with pytest.raises(ValueRangeError, match="earlier version, which had no limits in its state: learn it again"):
+            EnhancementModel.from_config(config)
+
+
+def test_a_state_out_of_range_is_refused(model):
+    for name, value in (("limits", 0.0), ("map_shares", 1.5)):
+        broken = copy.deepcopy(model)
+        getattr(broken, name)[0] = value
+        with pytest.raises(ValueRangeError, match=f"{name}: found"):
+            broken.check_state()
 
 
 def test_another_actor_gets_the_detail_in_its_own_place_and_scale(model, database):

@@ -36,6 +36,7 @@ from torchface.geometry.meshes.operators import triangle_areas
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
+from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress, silent
 
@@ -92,10 +93,7 @@ class EnhancementModel(nn.Module):
             for frames beyond it.
         temporal: how much weights hold on to those of the frame before, see ``RegionProjection``.
         keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
-        limits: distances of the R regions from which on a frame is outside of the database, see
-            ``RegionProjection.limits``; 1 of each if absent.
         scale: how much of what is added to the coarse frames, see :meth:`on_actor`.
-        map_shares: how much of the learned map counts in each region, see ``learned_map.map_shares``; 1 if absent.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, sections 4 and 5. Changed: the filter
     works on displacements, alignment and averages by patches; detail is of low rank.
@@ -124,6 +122,8 @@ class EnhancementModel(nn.Module):
     mean_color: Tensor
     color_components: Tensor
     color_coefficients: Tensor
+    limits: Tensor
+    map_shares: Tensor
 
     def __init__(
         self,
@@ -142,9 +142,7 @@ class EnhancementModel(nn.Module):
         keeps_input: bool = False,
         matching: Matching = "learned",
         temporal: float = 0.0,
-        limits: Sequence[float] | None = None,
         scale: float = 1.0,
-        map_shares: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         if detail not in _DETAILS:
@@ -162,18 +160,14 @@ class EnhancementModel(nn.Module):
         self.temporal = checked_number("temporal", temporal)
         self.scale = checked_number("scale", scale)
         regions = len(self.region_names)
-        self.limits = tuple(checked_number("limits", limit, above=True) for limit in limits or [1.0] * regions)
-        self.map_shares = tuple(
-            checked_number("map_shares", share, 0.0, 1.0) for share in map_shares or [1.0] * regions
-        )
-        for name, given in (("limits", self.limits), ("map_shares", self.map_shares)):
-            if len(given) != regions:
-                raise ValueRangeError(f"{name}: found {len(given)}, expected one of each of {regions} regions")
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
         self.register_buffer("patches", torch.zeros(triangles, dtype=torch.int64))
         self.register_buffer("region_weights", torch.zeros(regions, triangles))
         self.register_buffer("sequences", torch.zeros(frames, dtype=torch.int64))
+        # From which distance on a frame is outside of the database, and how much of the learned map counts.
+        self.register_buffer("limits", torch.ones(regions, dtype=torch.float64))
+        self.register_buffer("map_shares", torch.ones(regions, dtype=torch.float64))
         self.register_buffer("database_features", torch.zeros(frames, patches, 9))
         size = 3 * vertices if detail == "displacements" else 9 * triangles
         self.register_buffer("components", torch.zeros(rank, size, dtype=torch.float16))
@@ -208,9 +202,7 @@ class EnhancementModel(nn.Module):
             "keeps_input": self.keeps_input,
             "matching": self.matching,
             "temporal": self.temporal,
-            "limits": list(self.limits),
             "scale": self.scale,
-            "map_shares": list(self.map_shares),
         }
 
     @classmethod
@@ -218,11 +210,12 @@ class EnhancementModel(nn.Module):
         """A model of zeros for the state to be loaded into.
 
         Raises:
-            ValueRangeError: the config is of an earlier version, whose detail had other axes.
+            ValueRangeError: the config is of an earlier version.
         """
-        lacking = [name for name in ("limits", "scale", "map_shares") if name not in config]
-        if lacking:
-            raise ValueRangeError(f"found a model of an earlier version, without {', '.join(lacking)}: learn it again")
+        if "scale" not in config or "limits" in config:
+            raise ValueRangeError(
+                "found a model of an earlier version, which had no limits in its state: learn it again"
+            )
         return cls(**config)
 
     @classmethod
@@ -328,11 +321,11 @@ class EnhancementModel(nn.Module):
         model.components, model.coefficients = learned.basis.components, learned.basis.coefficients
         progress("comparing the sequences")
         projection = model._matching()
-        model.limits = tuple(projection.limits(sequences).tolist())
+        model.limits = projection.limits(sequences).to(model.limits)
         if model.keeps_input:  # what the smooth part lacks is mostly motion, of which the map always counts whole
             products = region_products(model.components, encoder.detail.site_weights(model.vertex_weights))
             shares = map_shares(projection, model.coefficients, model._reach(), products, sequences)
-            model.map_shares = tuple(shares.tolist())
+            model.map_shares = shares.to(model.map_shares)
         if hue is not None and colors is not None:
             model.mean_color = colors.float().mean(0)
             for some in colors.split(32):
@@ -351,6 +344,7 @@ class EnhancementModel(nn.Module):
         """Enhanced frames (T,V,3) of coarse ones (T,V,3), millimetres, where they are; differentiable."""
         return self.enhance(coarse).vertices
 
+    @data_dependent("WrinkleWeights, which `torchface export enhancement` writes")
     def enhance(self, coarse: Tensor, previous: Tensor | None = None) -> Enhancement:
         """Enhanced frames, with what they were made of.
 
@@ -428,7 +422,7 @@ class EnhancementModel(nn.Module):
     def timing(self) -> ActorTiming:
         """How the actor moves between two poses, by region."""
         return self._timing.get(
-            (self.database_features, self.region_weights, self.neutral, self.sequences),
+            (*self._matched_with(), self.sequences),
             lambda: ActorTiming(self.database_features, self.sequences, self.patch_weights, self.fps),
         )
 
@@ -476,24 +470,29 @@ class EnhancementModel(nn.Module):
 
         Raises:
             TopologyError: a triangle or a patch is none.
+            ValueRangeError: a limit or a share is out of range.
         """
         if not 0 <= int(self.faces.min()) <= int(self.faces.max()) < len(self.neutral):
             raise TopologyError(f"faces: found vertices beyond the {len(self.neutral)} there are")
         if not 0 <= int(self.patches.min()) <= int(self.patches.max()) < self.database_features.shape[1]:
             raise TopologyError(f"patches: found some beyond the {self.database_features.shape[1]} there are")
+        if not bool((self.limits > 0).all()):
+            raise ValueRangeError(f"limits: found {self.limits.tolist()}, expected positive ones")
+        if not bool(((self.map_shares >= 0) & (self.map_shares <= 1)).all()):
+            raise ValueRangeError(f"map_shares: found {self.map_shares.tolist()}, expected some of 0 to 1")
 
     def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
         smooth, displacements, pose = self._smooth(coarse)
         encoder = self._prepared()
         turned = encoder.frames.turned(smooth)
         features = encoder.gradients.features(smooth, turned)
-        projection, limits = self._matching(), torch.tensor(self.limits)
+        projection = self._matching()
         matched = projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         if self.matching == "learned":
-            reach, shares = self._reach(), torch.tensor(self.map_shares)
+            reach, shares = self._reach(), self.map_shares
             learned = self._learned.get(
-                (self.database_features, self.region_weights, self.neutral, self.coefficients, reach, shares),
+                (*self._matched_with(), self.coefficients, reach, shares),
                 lambda: LearnedMap(projection, self.coefficients, reach, shares),
             )
             coefficients = coefficients + learned.corrections(features, matched)
@@ -506,7 +505,7 @@ class EnhancementModel(nn.Module):
             vertices = self._lids()(encoder.detail.compose(low, details, turned), low, own)
         if self.scale != 1.0:
             vertices = own + self.scale * (vertices - own)
-        outside = matched.distances > limits.to(matched.distances)
+        outside = matched.distances > self.limits.to(matched.distances)
         return Enhancement(pose.inverse().apply(vertices), matched.weights, matched.distances, outside)
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:
@@ -525,11 +524,14 @@ class EnhancementModel(nn.Module):
         def made() -> RegionProjection:
             return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
 
-        return self._projection.get((self.database_features, self.region_weights, self.neutral, self.temporal), made)
+        return self._projection.get((*self._matched_with(), self.temporal), made)
+
+    def _matched_with(self) -> tuple[Tensor, ...]:
+        return self.database_features, self.region_weights, self.neutral, self.faces, self.patches
 
     def _reach(self) -> Tensor:
         """Of each region, up to what distance the learned map is trusted, (R,)."""
-        return torch.tensor(self.limits) * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
+        return self.limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
 
     def _lids(self) -> OwnLids:
         def made() -> OwnLids:

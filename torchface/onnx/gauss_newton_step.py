@@ -169,4 +169,4 @@ def _rotation_between(start: Tensor, end: Tensor, series: Tensor) -> Tensor:
     turned = end @ start.T
     axis = 0.5 * torch.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
     half = (0.25 * (3 - (turned[0, 0] + turned[1, 1] + turned[2, 2]))).clamp(0, 0.6)
-    return (half ** torch.arange(_TERMS, dtype=half.dtype) * series).sum() * axis
+    return (half ** torch.arange(_TERMS, dtype=half.dtype, device=half.device) * series).sum() * axis

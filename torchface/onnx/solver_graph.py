@@ -135,8 +135,14 @@ class SolverGraph(nn.Module):
         offset = self.rest - markers
         missing = torch.isnan(offset).any(-1, keepdim=True)
         z = previous.clamp(0.0, 1.0)
-        if bool(missing.any()):
-            return self._with_gaps(offset, missing, z)
+        if torch.compiler.is_compiling():  # a graph has both ways; here a call takes one
+            return torch.cond(missing.any(), self._with_gaps, self._complete, (offset, missing, z))
+        return (self._with_gaps if bool(missing.any()) else self._complete)(offset, missing, z)
+
+    def _complete(
+        self, offset: Tensor, missing: Tensor, z: Tensor, pull: Tensor | None = None, target: Tensor | None = None
+    ) -> Tensor:
+        """Frames that share one H: nothing of markers (B,M,3) is missing, nothing pulls."""
         offset = offset.flatten(1)
         v = z
         for steps in stretches(self.steps):

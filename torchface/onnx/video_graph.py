@@ -93,7 +93,7 @@ class VideoGraph(nn.Module):
             "initial_covariance": torch.tensor(deviations, dtype=torch.float64).square().diag(),
             "motion_variance": torch.tensor([ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3, dtype=torch.float64),
         }.items():
-            self.register_buffer(name, value)
+            self.register_buffer(name, value.to(solver.rest.device))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -193,7 +193,8 @@ class VideoGraph(nn.Module):
         dual = torch.zeros_like(self.step.lower)
         state = (head.weights, head.rotation, head.translation, dual, rows)
         # A loop takes no tensor twice, nor two that share memory.
-        carried = (torch.zeros((), dtype=torch.int64), settled, *(value.clone() for value in state))
+        begin = torch.zeros((), dtype=torch.int64, device=settled.device)
+        carried = (begin, settled, *(value.clone() for value in state))
         given = tuple(value.clone() for value in given)
         _, _, weights, rotation, translation, _, rows = torch.ops.higher_order.while_loop(
             unfinished, advanced, carried, (*given, *buffers.values())

@@ -14,6 +14,7 @@ from torchface.number_checks import checked_number
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem, check_box, metric
 from torchface.optim.compiled_program import CompiledProgram, compiled_solver_installed
+from torchface.optim.data_dependent import data_dependent
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.operator_splitting import (
     SplittingFactors,
@@ -144,6 +145,7 @@ class BoxQP(nn.Module):
         for name, bound in zip(("lower", "upper"), _checked_bounds(lower, upper, exact), strict=True):
             self.register_buffer(name, bound)
 
+    @data_dependent("torchface.onnx.SolverGraph, or steps of torchface.optim.exported_operators, which are fixed")
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
         tolerance = _TOLERANCE[self.H.dtype] if self.tolerance is None else self.tolerance

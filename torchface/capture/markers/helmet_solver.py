@@ -15,6 +15,7 @@ from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
+from torchface.optim.data_dependent import data_dependent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.temporal import bridged, nearest_rows
@@ -119,6 +120,7 @@ class HelmetSolver(nn.Module):
         """Of the markers."""
         return self.markers.labels
 
+    @data_dependent("torchface.onnx.SolverGraph, for weights alone, which `torchface export solver` writes")
     def forward(self, markers: Tensor) -> tuple[Tensor, HelmetMotion]:
         """Weights and motion for markers.
 
@@ -205,7 +207,7 @@ class HelmetSolver(nn.Module):
             step = solution[:, shapes : shapes + 3]
             translation = translation + (rotation @ step[..., None])[..., 0]
             rotation = rotation @ rigid_rotation(solution[:, shapes + 3 :])
-            moved = float(solution[:, shapes:].abs().max())
+            moved = float(solution[:, shapes:].detach().abs().max())
             solution = torch.cat([solution[:, :shapes], torch.zeros_like(solution[:, shapes:])], dim=1)
             if moved < _MOTION_TOLERANCE:
                 break

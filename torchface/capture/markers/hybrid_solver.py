@@ -13,6 +13,7 @@ from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
+from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import bridged, savitzky_golay
 
@@ -100,6 +101,7 @@ class HybridSolver(nn.Module):
         energy = self.markers.energy(markers)
         return energy + pull_term(predicted.double(), gamma.double() / len(self.markers.labels))
 
+    @data_dependent("torchface.onnx.HybridGraph, which `torchface export hybrid-solver` writes")
     def forward(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> Tensor:
         r"""Weights for markers and predictions.
 
@@ -167,8 +169,8 @@ class HybridSolver(nn.Module):
                 f"predicted curves: found {', '.join(unknown[:5])}, expected shapes of the rig: "
                 f"{', '.join(self.names[:5])}, ..."
             )
-        rows = torch.tensor([self.names.index(name) for name in known], dtype=torch.int64)
-        values = curves.select(known).values[..., 0]
+        values = curves.select(known).values[..., 0].to(self.markers.rest.device)
+        rows = torch.tensor([self.names.index(name) for name in known], dtype=torch.int64, device=values.device)
         return values.new_zeros(len(curves), len(self.names)).index_copy(1, rows, values)
 
     def _check(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> None:

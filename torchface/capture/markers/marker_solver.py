@@ -18,6 +18,7 @@ from torchface.correctives.definitions import Corrective, definitions_from_recor
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
+from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -234,6 +235,7 @@ class MarkerSolver(nn.Module):
         squared = (self.points(weights) - self._in_rig_space(markers.double())).square().sum(-1)
         return squared.nanmean(-1)
 
+    @data_dependent("torchface.onnx.SolverGraph, which `torchface export solver` writes")
     def forward(self, markers: Tensor, initial: Tensor | None = None) -> Tensor:
         """Weights for markers.
 

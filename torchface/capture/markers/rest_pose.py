@@ -82,7 +82,7 @@ def pose_step(
     y, residual, n = moved[seen], (on_rig - moved)[seen], outward[seen]
     centre = y.mean(0)
     arm = y - centre
-    axes = torch.eye(3, dtype=y.dtype).expand(len(y), 3, 3)
+    axes = torch.eye(3, dtype=y.dtype, device=y.device).expand(len(y), 3, 3)
     rows = torch.cat([cross_matrix(arm), axes, arm[:, None], -n[:, None]], dim=1)
     matrix = torch.einsum("pic,pjc->ij", rows, rows)
     step = torch.linalg.solve(matrix, torch.einsum("pic,pc->i", rows, residual))

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import torch
 from scipy.fft import dct, idct
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, penalty_value
 from torchface.capture.markers.sparsity import with_sparsity
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import NameMismatchError, ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
+from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import bridged
 
@@ -33,8 +34,7 @@ _REFERENCE_FPS = 60.0
 _CORRECTED_STEPS, _HALVINGS, _HESSIAN_FRAMES, _LEAST_FALL = 20, 6, 64, 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class WholeTakeSolver:
+class WholeTakeSolver(nn.Module):
     r"""Solves markers for the weights of all frames of a take together.
 
     .. math::
@@ -67,18 +67,26 @@ class WholeTakeSolver:
         True
     """
 
-    markers: MarkerSolver
-    smoothness: float = SMOOTHNESS
-    huber_threshold: float = HUBER_THRESHOLD
-    sparsity: float | None = None
+    def __init__(
+        self,
+        markers: MarkerSolver,
+        smoothness: float = SMOOTHNESS,
+        huber_threshold: float = HUBER_THRESHOLD,
+        sparsity: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.markers = markers
+        self.smoothness = checked_number("smoothness", smoothness, 0.0, LARGEST_WEIGHT)
+        endless = huber_threshold == math.inf
+        self.huber_threshold = (
+            math.inf if endless else checked_number("huber_threshold", huber_threshold, 0.0, LARGEST_WEIGHT)
+        )
+        self._sparsity = None if sparsity is None else checked_number("sparsity", sparsity, 0.0, LARGEST_WEIGHT)
 
-    def __post_init__(self) -> None:
-        sparsity = SPARSITY_RATIO * penalty_value(self.markers.sparsity) if self.sparsity is None else self.sparsity
-        object.__setattr__(self, "sparsity", float(sparsity))
-        for name in ("smoothness", "huber_threshold", "sparsity"):
-            value = getattr(self, name)
-            if not (name == "huber_threshold" and value == math.inf):
-                checked_number(name, value, 0.0, LARGEST_WEIGHT)
+    @property
+    def sparsity(self) -> float:
+        """Of the L1 penalty, mm² a marker; follows the marker solver's where none was given."""
+        return SPARSITY_RATIO * penalty_value(self.markers.sparsity) if self._sparsity is None else self._sparsity
 
     def solve_take(self, take: Take) -> Take:
         """The take with weights solved from its markers, matched by label.
@@ -92,13 +100,19 @@ class WholeTakeSolver:
         weights = self(self.markers.arrange(take.markers), take.fps)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))
 
-    def __call__(self, markers: Tensor, fps: float = _REFERENCE_FPS) -> Tensor:
-        """Weights (T,N) for the markers (T,M,3) of consecutive frames, NaN for not seen.
+    @data_dependent("torchface.onnx.SolverGraph for frame by frame, which `torchface export solver` writes")
+    def forward(self, markers: Tensor, fps: float = _REFERENCE_FPS) -> Tensor:
+        """Weights (T,N) for the markers (T,M,3) of consecutive frames, NaN for not seen; without derivatives.
 
         Raises:
             ShapeError: ``markers`` is not (T,M,3).
             ValueRangeError: no frame shows any marker, or a coordinate is infinite.
+            TraceError: ``markers`` ask for gradients.
         """
+        if markers.requires_grad and torch.is_grad_enabled():
+            raise TraceError(
+                "WholeTakeSolver: found markers that ask for gradients, expected none, or MarkerSolver, which has them"
+            )
         if markers.ndim != 3 or markers.shape[1:] != self.markers.rest.shape:
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (T,{len(self.markers.rest)},3)")
         if torch.isinf(markers).any():
@@ -106,7 +120,8 @@ class WholeTakeSolver:
         if not len(markers) or bool(torch.isnan(markers).any(-1).all()):
             raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
         solve = self._solve if self.markers.activation is None else self._solve_corrected
-        return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
+        with torch.no_grad():
+            return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
 
     def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
         """What the solve minimises, over all frames."""
@@ -117,7 +132,7 @@ class WholeTakeSolver:
         points = solver.points(w)
         data = (points - seen).square().sum(-1).nan_to_num(0.0).sum() / points.shape[1]
         huber = _huber(w, huber_threshold)
-        penalty = self.sparsity or 0.0
+        penalty = self.sparsity
         return float(data + penalty * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber)
 
     def _scaled(self, fps: float) -> tuple[float, float]:
@@ -149,7 +164,7 @@ class WholeTakeSolver:
         frames = gaps.any(-1).nonzero()[:, 0]
         hidden = gaps[frames].repeat_interleave(3, dim=1)
         z = seen.new_zeros(len(seen), shapes)
-        penalty = self.sparsity or 0.0
+        penalty = self.sparsity
 
         def slope(z: Tensor) -> Tensor:
             f = offset + penalty
@@ -164,7 +179,7 @@ class WholeTakeSolver:
 
         A step is taken as far as the energy falls. The start is each frame's own solution.
         """
-        solver = with_sparsity(self.markers, self.sparsity or 0.0)
+        solver = with_sparsity(self.markers, self.sparsity)
         data = _TakeData.of(solver, markers)
         rows = frames_seen(markers)
         w = bridged(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
@@ -189,6 +204,9 @@ class WholeTakeSolver:
                 break
         return w
 
+    def extra_repr(self) -> str:
+        return f"smoothness={self.smoothness:g}, huber_threshold={self.huber_threshold:g}, sparsity={self.sparsity:g}"
+
 
 @dataclass(frozen=True, eq=False)
 class _SmoothProblem:
@@ -204,7 +222,7 @@ class _SmoothProblem:
     def of(H: Tensor, frames: int, smoothness: float, huber_threshold: float) -> _SmoothProblem:
         values, vectors = torch.linalg.eigh(H)
         rho = _RHO * float(H.diagonal().mean())
-        waves = torch.arange(frames, dtype=torch.float64) * (math.pi / frames)
+        waves = torch.arange(frames, dtype=H.dtype, device=H.device) * (math.pi / frames)
         bending = (2 - 2 * torch.cos(waves)).square()
         divisor = values + (2 * smoothness) * bending[:, None] + rho
         return _SmoothProblem(vectors, divisor, rho, smoothness, huber_threshold)
@@ -293,8 +311,8 @@ def curvature(weights: Tensor) -> Tensor:
 
 
 def _transform(x: Tensor) -> Tensor:
-    return torch.from_numpy(dct(x.numpy(), type=2, norm="ortho", axis=0))
+    return torch.from_numpy(dct(x.cpu().numpy(), type=2, norm="ortho", axis=0)).to(x.device)
 
 
 def _inverse_transform(x: Tensor) -> Tensor:
-    return torch.from_numpy(idct(x.numpy(), type=2, norm="ortho", axis=0))
+    return torch.from_numpy(idct(x.cpu().numpy(), type=2, norm="ortho", axis=0)).to(x.device)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchface.capture.priors.squared_distances import squared_distances
 from torchface.errors import ShapeError
 
 # Directions of the inducing points that the kernel tells apart by less than this are left out: float32 cannot.
@@ -34,7 +35,7 @@ class Kernel:
     def between(self, first: Tensor, second: Tensor) -> Tensor:
         """k of inputs (A,F) and (B,F), (A,B)."""
         scaled = [inputs * self.inverse_lengths.to(inputs) for inputs in (first, second)]
-        return self.signal * torch.exp(-0.5 * _squared_distances(*scaled))
+        return self.signal * torch.exp(-0.5 * squared_distances(*scaled))
 
 
 class GaussianProcesses(nn.Module):
@@ -112,7 +113,7 @@ class GaussianProcesses(nn.Module):
             (B,N), summed over the processes, and (B,G) in units of the signal.
         """
         scaled = inputs * self.inverse_lengths[:, None]
-        near = self.signal[:, None, None] * torch.exp(-0.5 * _squared_distances(scaled, self.inducing))
+        near = self.signal[:, None, None] * torch.exp(-0.5 * squared_distances(scaled, self.inducing))
         projected = near @ self.covariance_root
         explained = (near @ self.whitening).square().sum(-1)
         variance = (self.signal[:, None] - explained).clamp(min=0.0) + projected.square().sum(-1)
@@ -171,9 +172,3 @@ def posterior(
     root = torch.linalg.solve_triangular(factor, eye, upper=False).T
     weights = root.T @ statistics.product / noise
     return Posterior(inducing * kernel.inverse_lengths, whitening, whitening @ root, weights)
-
-
-def _squared_distances(first: Tensor, second: Tensor) -> Tensor:
-    """(...,A,F) and (...,B,F) to (...,A,B), by one product."""
-    lengths = first.square().sum(-1, keepdim=True) + second.square().sum(-1)[..., None, :]
-    return (lengths - 2 * first @ second.transpose(-1, -2)).clamp(min=0.0)

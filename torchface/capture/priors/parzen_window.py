@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchface.capture.priors.squared_distances import squared_distances
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.optim.mean_shift import mean_shift
@@ -91,8 +92,7 @@ class ParzenDensity(nn.Module):
         return ParzenDensity(self.centers @ matrix.to(self.centers).T, self.bandwidth)
 
     def _log_kernels(self, samples: Tensor) -> Tensor:
-        squared = torch.cdist(samples, self.centers.to(samples)).square()
-        return -0.5 * squared / self.bandwidth.to(samples).square()
+        return -0.5 * squared_distances(samples, self.centers.to(samples)) / self.bandwidth.to(samples).square()
 
     @property
     def config(self) -> dict[str, Any]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import ShapeError, ValueRangeError
@@ -161,6 +163,31 @@ class FacePoints:
         depth = rotation[:, 2] @ (0.5 * (right + left)) + translation[:, 2]
         # A pose gone astray puts the eyes at no distance at all.
         return 0.5 * (intrinsics[0, 0] + intrinsics[1, 1]) * apart / torch.maximum(depth, apart)
+
+
+def make_room_for_points(
+    solver: nn.Module, state: Mapping[str, Any], prefix: str = "", more: Sequence[str] = ()
+) -> None:
+    """Gives a solver's buffers of points the sizes that a state has them in, where these fit one another.
+
+    Another rig's contour may have more or fewer points. What does not fit is left to ``load_state_dict`` to refuse.
+
+    Args:
+        solver: with the buffers ``rest``, ``basis``, ``rows`` and ``valid`` of :class:`FacePoints`.
+        state: to be loaded, by names that begin with ``prefix``.
+        more: other buffers with a row a point.
+    """
+    by_point, by_curve = ("rest", "basis", *more), ("rows", "valid")
+    found = {name: state.get(prefix + name) for name in (*by_point, *by_curve)}
+    shapes = {name: tuple(value.shape) for name, value in found.items() if isinstance(value, Tensor)}
+    count, curve = (shapes.get(name, (0, 0))[axis] for name, axis in (("rest", 0), ("rows", -1)))
+    expected = {name: (count, *getattr(solver, name).shape[1:]) for name in by_point}
+    expected |= dict.fromkeys(by_curve, (JAW, curve))
+    if shapes == expected and count >= LANDMARKS:
+        for name, shape in shapes.items():
+            own = getattr(solver, name)
+            if own.shape != shape:
+                setattr(solver, name, own.new_zeros(shape))
 
 
 def _thinned(curves: LevelCurves, vertices: Tensor) -> LevelCurves:

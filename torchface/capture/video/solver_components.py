@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ReciprocalPrior, ShapePrior
-from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.video.landmark_offsets import LandmarkOffsets, shifted_points
 from torchface.capture.video.video_settings import VideoSettings
 from torchface.capture.video.weight_walk import relative_trust
@@ -235,24 +235,7 @@ class VideoSolverParts(nn.Module):
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
         """As modules do; but another rig's contour may have more or fewer points than this one's."""
-        names = _POINTS if self.corrective_basis is None else (*_POINTS, "corrective_basis")
-        found = {name: state_dict.get(prefix + name) for name in names}
-        shapes = {name: tuple(value.shape) for name, value in found.items() if isinstance(value, Tensor)}
-        count, curve = (shapes.get(name, (0, 0))[axis] for name, axis in (("rest", 0), ("rows", -1)))
-        expected = {
-            "rest": (count, 3),
-            "basis": (count, 3, len(self.names)),
-            "rows": (JAW, curve),
-            "valid": (JAW, curve),
-            "side": (JAW,),
-        }
-        if self.corrective_basis is not None:
-            expected["corrective_basis"] = (count, 3, self.corrective_basis.shape[-1])
-        if shapes == expected and count >= LANDMARKS:
-            for name, shape in shapes.items():
-                own = getattr(self, name)
-                if own.shape != shape:
-                    setattr(self, name, own.new_zeros(shape))
+        make_room_for_points(self, state_dict, prefix, () if self.corrective_basis is None else ("corrective_basis",))
         super()._load_from_state_dict(state_dict, prefix, *rest)  # type: ignore[arg-type]
 
     def extra_repr(self) -> str:

@@ -18,6 +18,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.optim.active_set import projected_newton
 from torchface.optim.box_problem import BoxProblem
+from torchface.optim.data_dependent import data_dependent
 from torchface.optim.fixed_point_gradient import attach_gradients
 from torchface.optim.warm_active_set import solve_from_active_set
 
@@ -78,6 +79,7 @@ class VideoSolver(VideoSolverParts):
         (True, True)
     """
 
+    @data_dependent("torchface.onnx.VideoGraph, which `torchface export video-solver` writes")
     def forward(
         self,
         landmarks: Tensor,
@@ -143,6 +145,7 @@ class VideoSolver(VideoSolverParts):
         """The state before the first frame."""
         return VideoState(None, None, self.lower.new_zeros(1, 0, len(self.names), dtype=torch.float64))
 
+    @data_dependent("torchface.onnx.VideoGraph, which `torchface export video-solver` writes")
     def step(
         self,
         state: VideoState,

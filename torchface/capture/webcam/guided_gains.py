@@ -61,4 +61,4 @@ def learned_gains(
 
 def _asked(pose: Tensor) -> Tensor:
     """Which groups of shapes a pose asks for, (G,)."""
-    return ((pose - 2 - torch.arange(len(_GROUPS))).abs() < 0.5).to(pose)
+    return ((pose - 2 - torch.arange(len(_GROUPS), device=pose.device)).abs() < 0.5).to(pose)

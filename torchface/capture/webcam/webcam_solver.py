@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +13,7 @@ from torch.nn.functional import pad
 
 from torchface.capture.priors import ShapePrior
 from torchface.capture.priors.student_groups import StudentGroups
-from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints
+from torchface.capture.video.face_points import JAW, LANDMARKS, FacePoints, make_room_for_points
 from torchface.capture.video.reprojection import HeadState, Linearised, linearise
 from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
 from torchface.capture.webcam.eye_signals import (
@@ -27,7 +29,7 @@ from torchface.capture.webcam.person_filter import frame_information, lasting_pr
 from torchface.capture.webcam.person_prior import PersonPrior
 from torchface.capture.webcam.rig_tables import CONTOUR_TRUST, arkit_names, closing, owners, tells
 from torchface.capture.webcam.webcam_settings import WebcamSettings
-from torchface.capture.webcam.webcam_state import StateLayout, WebcamControls, WebcamState
+from torchface.capture.webcam.webcam_state import PARTS, StateLayout, WebcamControls, WebcamState
 from torchface.capture.webcam.weight_filter import one_euro_step
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
@@ -60,6 +62,7 @@ _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
 _LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
+_CONSTANTS = ("landmark_weights", "identity", "camera", "look_eyes", "upright", "damping", "filter_units")
 
 
 class WebcamSolver(nn.Module):
@@ -197,7 +200,14 @@ class WebcamSolver(nn.Module):
                 [_BLINK_UNIT if n.startswith("eyeBlink") else 1.0 for n in ARKIT] + _MOTION_UNITS
             ),
         }.items():
-            self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=False)
+            # What no rig, person or prior brings is in no state.
+            kept = name not in _CONSTANTS
+            self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=kept)
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *rest: Any) -> None:
+        """As modules do; but another rig's contour may have more or fewer points than this one's."""
+        make_room_for_points(self, state_dict, prefix, ("owner",))
+        super()._load_from_state_dict(state_dict, prefix, *rest)  # type: ignore[arg-type]
 
     def start(self) -> WebcamState:
         """The state before the first frame, all zeros."""
@@ -438,7 +448,7 @@ class WebcamSolver(nn.Module):
         frame = at.residual[0], at.jacobian[0], head.weights[0], head.rotation[0], interval, resting
         known = before.person, before.information, before.evidence, before.learned
         learns = good > 0
-        if torch.compiler.is_exporting():  # a graph has both ways; here a call that is not exported takes one
+        if torch.compiler.is_compiling():  # a graph has both ways; here a call that is not exported takes one
             return torch.cond(learns, self._updated_person, self._same_person, (*frame, *known))
         return (self._updated_person if bool(learns) else self._same_person)(*frame, *known)
 
@@ -531,9 +541,8 @@ def _known(values: Tensor, otherwise: float) -> Tensor:
 
 
 def _double(state: WebcamState) -> WebcamState:
-    return WebcamState(*(getattr(state, one.name).double() for one in fields(state)))
+    return WebcamState(*(getattr(state, name).double() for name in PARTS))
 
 
 def _chosen(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
-    names = [part.name for part in fields(WebcamState)]
-    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in names))
+    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in PARTS))

@@ -116,7 +116,11 @@ class WebcamState:
 
     def pack(self) -> Tensor:
         """All of it in one vector, (S,) float32; see :class:`StateLayout` for the way back."""
-        return torch.cat([getattr(self, one.name).reshape(-1).float() for one in fields(self)])
+        return torch.cat([getattr(self, name).reshape(-1).float() for name in PARTS])
+
+
+PARTS = tuple(part.name for part in fields(WebcamState))
+"""Of a state, in order."""
 
 
 @dataclass(frozen=True)

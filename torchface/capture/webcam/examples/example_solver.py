@@ -22,6 +22,7 @@ from torchface.capture.webcam.examples.landmark_placement import (
     SolvedSimilarity,
 )
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.optim.data_dependent import data_dependent
 
 _OBJECTIVES = {"squared_distances": SquaredDistances, "distances": Distances}
 _METHODS = {"all_at_once": AllAtOnce, "regional": Regional}
@@ -169,6 +170,7 @@ class ExampleSolver(nn.Module):
         """What landmarks (B,68,2) say of weights and placement, float64."""
         return self.placement.equations(landmarks.double(), self.neutral.double(), self.basis.double())
 
+    @data_dependent("the graph that `torchface export examples` writes")
     def fit(self, landmarks: Tensor, initial: Tensor | None = None) -> ExampleFit:
         """Weights and placement.
 

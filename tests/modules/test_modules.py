@@ -1,0 +1,266 @@
+"""Modules behave as modules: what docs/concepts/modules.md says of each works, or is refused as it says there."""
+
+from __future__ import annotations
+
+import copy
+import io
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from module_examples import (
+    EXAMPLES,
+    NAMES,
+    Example,
+    corrected_rig,
+    corrected_solver,
+    seen_landmarks,
+    seen_markers,
+    video_solver,
+)
+from pretended_device import pretended
+from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
+
+from torchface.errors import TraceError
+from torchface.onnx import VideoGraph
+from torchface.onnx.corrective_graph import CorrectiveGraph
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "modules.md"
+COLUMNS = (
+    "to", "double", "load_state_dict", "deepcopy", "torch.save", "gradients", "vmap", "jacrev", "torch.compile",
+    "torch.export",
+)  # fmt: skip
+ROUNDING = 1e-9
+
+every_class = pytest.mark.parametrize("name", EXAMPLES)
+
+
+def outputs(example: Example, module: Any, *inputs: Tensor) -> list[Tensor]:
+    found = example.call(module, *inputs)
+    return [
+        leaf for leaf in tree_leaves(list(found) if isinstance(found, tuple) else found) if isinstance(leaf, Tensor)
+    ]
+
+
+def fresh(example: Example, number: int = 0) -> Any:
+    """An instance of the test's own, which has been used."""
+    module = copy.deepcopy(example.make(number))
+    outputs(example, module, *example.inputs())
+    return module
+
+
+def assert_same(found: list[Tensor], wanted: list[Tensor], tolerance: float = ROUNDING) -> None:
+    assert len(found) == len(wanted) > 0
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(
+            one, other, rtol=tolerance, atol=tolerance, equal_nan=True, check_dtype=False, check_device=False
+        )
+
+
+def numbers(example: Example, module: Any, first: Tensor, *rest: Tensor) -> Tensor:
+    """A few sums of all that is computed, which the first input bears on."""
+    found = [
+        part.double().nan_to_num(0.0) for part in outputs(example, module, first, *rest) if part.is_floating_point()
+    ]
+    weights = [torch.linspace(1, 2, part.numel(), dtype=torch.float64).view(part.shape) for part in found]
+    return torch.stack([(part * weight).sum() for part, weight in zip(found, weights, strict=True)])
+
+
+@every_class
+def test_it_moves_to_another_device(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After use; no tensor is made elsewhere than where the inputs are."""
+    example = EXAMPLES[name]
+    inputs, wanted = example.inputs(), outputs(example, example.make(0), *example.inputs())
+    # Tensors of a class of one's own cannot be looked at in inference mode.
+    monkeypatch.setattr(torch, "inference_mode", torch.no_grad)
+    module = fresh(example)
+    with pretended() as device, torch.no_grad():
+        module.to(device)
+        held = [*module.buffers(), *module.parameters()]
+        assert {tensor.device.type for tensor in held} == {device}
+        found = outputs(example, module, *(tensor.to(device) for tensor in inputs))
+        assert {tensor.device.type for tensor in found} == {device}
+        assert_same([tensor.cpu() for tensor in found], wanted, 1e-5)
+
+
+@every_class
+def test_it_goes_to_double_precision(name: str) -> None:
+    """After use; what comes out is double too, and near what came before."""
+    example = EXAMPLES[name]
+    inputs, module = example.inputs(), fresh(example)
+    wanted = outputs(example, module, *inputs)
+    module.double()
+    held = [*module.buffers(), *module.parameters()]
+    assert {tensor.dtype for tensor in held if tensor.is_floating_point()} == {torch.float64}
+    found = outputs(example, module, *(x.double() if x.is_floating_point() else x for x in inputs))
+    if name != "WebcamSolver":  # its state is float32, whatever it computes in
+        assert {tensor.dtype for tensor in found if tensor.is_floating_point()} == {torch.float64}
+    assert_same(found, wanted, 1e-3)
+
+
+@every_class
+@pytest.mark.parametrize("assign", [False, True], ids=["copied", "assigned"])
+def test_a_state_that_is_loaded_after_use_takes_effect(name: str, assign: bool) -> None:
+    example = EXAMPLES[name]
+    inputs, ours, theirs = example.inputs(), fresh(example, 0), fresh(example, 1)
+    wanted = outputs(example, theirs, *inputs)
+    before = outputs(example, ours, *inputs)
+    ours.load_state_dict(theirs.state_dict(), assign=assign)
+    assert_same(outputs(example, ours, *inputs), wanted)
+    apart = [(a.double() - b.double()).abs().nan_to_num(0).max() for a, b in zip(before, wanted, strict=True)]
+    assert max(apart) > 0.02
+
+
+@every_class
+def test_a_deep_copy_is_on_its_own(name: str) -> None:
+    example = EXAMPLES[name]
+    inputs, module = example.inputs(), fresh(example)
+    wanted = outputs(example, module, *inputs)
+    copied = copy.deepcopy(module)
+    assert_same(outputs(example, copied, *inputs), wanted)
+    copied.load_state_dict(example.make(1).state_dict())
+    assert_same(outputs(example, module, *inputs), wanted)
+
+
+@every_class
+def test_its_state_is_saved_without_pickled_classes(name: str) -> None:
+    example = EXAMPLES[name]
+    module, file = fresh(example), io.BytesIO()
+    torch.save(module.state_dict(), file)
+    file.seek(0)
+    other = fresh(example, 1)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert_same(outputs(example, other, *example.inputs()), outputs(example, module, *example.inputs()))
+
+
+@every_class
+def test_gradients_reach_its_input(name: str) -> None:
+    example = EXAMPLES[name]
+    module, (first, *rest) = example.make(0), example.inputs()
+    asking = first.clone().requires_grad_()
+
+    def slope() -> Tensor:
+        return torch.autograd.grad(numbers(example, module, asking, *rest).sum(), asking)[0]
+
+    if example.cells.get("gradients") == "no":
+        with pytest.raises(
+            (TraceError, RuntimeError), match=r"WholeTakeSolver: found|no autograd formula|not require grad"
+        ):
+            slope()
+    else:
+        assert float(slope().abs().nan_to_num(0).max()) > 0
+
+
+@every_class
+def test_vmap(name: str) -> None:
+    example = EXAMPLES[name]
+    module, inputs = example.make(0), example.inputs()
+    several = [torch.stack([x, 0.9 * x]) for x in inputs]
+
+    def mapped() -> tuple[Tensor, ...]:
+        return torch.func.vmap(lambda *given: tuple(outputs(example, module, *given)))(*several)
+
+    cell = example.cells.get("vmap", "yes")
+    if cell == "batches":
+        with pytest.raises(TraceError, match="expected a batch in place of vmap"):
+            mapped()
+    elif cell == "no":
+        with pytest.raises(RuntimeError, match=r"vmap|functorch"):
+            mapped()
+    else:
+        for i, found in enumerate(zip(*mapped(), strict=True)):
+            assert_same(list(found), outputs(example, module, *(x[i] for x in several)), 1e-5)
+
+
+@every_class
+def test_jacobians(name: str) -> None:
+    example = EXAMPLES[name]
+    module, (first, *rest) = example.make(0), example.inputs()
+
+    def computed(x: Tensor) -> Tensor:
+        return numbers(example, module, x, *rest)
+
+    cell = example.cells.get("jacrev", "yes")
+    if cell == "yes":
+        found = torch.func.jacrev(computed)(first)
+        torch.testing.assert_close(found, torch.autograd.functional.jacobian(computed, first), equal_nan=True)
+        return
+    if name == "ActionUnitClassifier":  # classes are steps
+        assert not torch.func.jacrev(computed)(first).any()
+        return
+    with pytest.raises((TraceError, RuntimeError), match=r"in place of jacrev|autograd|WholeTakeSolver: found"):
+        torch.func.jacrev(computed)(first)
+    if cell == "jacobian":
+        found = torch.autograd.functional.jacobian(computed, first)
+        assert found.abs().nan_to_num(0).max() > 0
+    outputs(example, module, first, *rest)  # nothing of the transform stays behind
+
+
+@every_class
+def test_compiled_it_computes_the_same(name: str) -> None:
+    """In one graph, or with one gap in which it runs as ever."""
+    example = EXAMPLES[name]
+    module, inputs = example.make(0), example.inputs()
+    whole = example.cells.get("torch.compile", "yes") == "yes"
+    torch.compiler.reset()
+    compiled = torch.compile(Called(example, module), backend="eager", fullgraph=whole)
+    with torch.no_grad():
+        wanted = outputs(example, module, *inputs)
+        for _ in range(2):
+            assert_same(list(compiled(*inputs)), wanted, 1e-5)
+
+
+@every_class
+def test_exported_it_computes_the_same(name: str) -> None:
+    example = EXAMPLES[name]
+    cell = example.cells.get("torch.export", "yes")
+    if cell != "yes":
+        with pytest.raises(TraceError, match="a trace would repeat one frame's path"):
+            torch.export.export(Called(example, example.make(0)), example.inputs(), strict=False)
+        return
+    module, inputs = example.make(0), example.inputs()
+    with torch.no_grad():
+        program = torch.export.export(Called(example, module), inputs, strict=False)
+        assert_same(list(program.module()(*inputs)), outputs(example, module, *inputs), 1e-5)
+
+
+@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph"])
+def test_graphs_of_solvers_are_exported(kind: str) -> None:
+    if kind == "VideoGraph":
+        graph: nn.Module = VideoGraph(video_solver(0))
+        inputs: tuple[Tensor, ...] = (seen_landmarks()[0].float(), torch.ones(68), *graph.start())
+    else:
+        graph = CorrectiveGraph(corrected_solver(0), steps=1)
+        inputs = seen_markers(corrected_rig()).float(), torch.zeros(4, len(NAMES))
+    with torch.no_grad():
+        program = torch.export.export(graph, inputs, strict=False)
+        assert_same(tree_leaves(program.module()(*inputs)), tree_leaves(graph(*inputs)), 1e-5)
+
+
+class Called(nn.Module):
+    """A network that holds the module."""
+
+    def __init__(self, example: Example, module: nn.Module) -> None:
+        super().__init__()
+        self.call, self.module = example.call, module
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        found = self.call(self.module, *(1.0 * x for x in inputs))
+        return (found,) if isinstance(found, Tensor) else tuple(leaf for leaf in found if isinstance(leaf, Tensor))
+
+
+def table() -> str:
+    """As the page has it."""
+    heads = [f"`{column}`" if column != "gradients" else column for column in COLUMNS]
+    rows = [["", *heads], ["---"] * (len(COLUMNS) + 1)]
+    for name, example in EXAMPLES.items():
+        first, _, more = name.partition(" with ")
+        title = f"`{first}`" + (f" with {more}" if more else "")
+        rows.append([title, *(example.cells.get(column, "yes") for column in COLUMNS)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def test_the_page_says_what_is_tested() -> None:
+    assert table() in PAGE.read_text(), f"{PAGE}: expected the table\n{table()}"

@@ -1,0 +1,63 @@
+"""Calls whose path depends on the numbers given, kept apart from what records one path for all numbers."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import torch
+
+from torchface.errors import TraceError
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable[Given, Result]]:
+    """Marks a method that iterates until a problem is solved.
+
+    ``torch.compile`` leaves a gap in its graph for it, in which it runs as ever: what it would compile of such a
+    method are dozens of pieces, for minutes. What follows one path only is refused at once: ``torch.jit.trace``,
+    ``torch.export`` and the transforms of ``torch.func``.
+
+    Args:
+        instead: what may be exported, for the error.
+
+    Example:
+        >>> @data_dependent("a series")
+        ... def halved(x):
+        ...     while x.max() > 1:
+        ...         x = x / 2
+        ...     return x
+        >>> halved(torch.tensor([3.0])).item()
+        0.75
+        >>> torch.func.vmap(halved)(torch.tensor([3.0]))
+        Traceback (most recent call last):
+            ...
+        torchface.errors.TraceError: halved: found one of torch.func's transforms...
+    """
+
+    def marked(method: Callable[Given, Result]) -> Callable[Given, Result]:
+        name = method.__qualname__.removesuffix(".forward")
+
+        @functools.wraps(method)
+        def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+            if torch.compiler.is_dynamo_compiling():
+                return torch.compiler.disable(method)(*args, **kwargs)
+            if torch.jit.is_tracing() or torch.compiler.is_exporting():
+                raise TraceError(
+                    f"{name}: iterates until every problem is solved, and a trace would repeat one frame's path for "
+                    f"all; expected {instead}"
+                )
+            # There is no public name for it.
+            if torch._C._functorch.peek_interpreter_stack() is not None:
+                raise TraceError(
+                    f"{name}: found one of torch.func's transforms, expected a batch in place of vmap, and "
+                    "torch.autograd.functional.jacobian in place of jacrev"
+                )
+            return method(*args, **kwargs)
+
+        return call
+
+    return marked
