@@ -16,7 +16,7 @@ from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
-from torchface.modeling import ExpressionRegression, fit_expression_samples
+from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_expression_samples
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
@@ -100,9 +100,7 @@ def fit(people: People, settings: Settings, progress: Progress | None = None) ->
         people.neutrals,
         people.expressions,
         people.names,
-        settings.neutral_components,
-        settings.offset_components,
-        settings.ridge,
+        ExpressionSettings(settings.neutral_components, settings.offset_components, settings.ridge),
         people.template.fingerprint(),
         progress=progress,
     )

@@ -17,6 +17,7 @@ from torchface.landmarks import (
     CylinderLayout,
     DetectorSettings,
     FaceFrame,
+    LineExamples,
     ScanAnnotation,
     UVLandmarkDetector,
     appearance_image,
@@ -134,8 +135,7 @@ def fit(
         appearance,
         detector,
         frame,
-        lines,
-        torch.stack(traced),
+        LineExamples(lines, torch.stack(traced)),
         progress,
     )
 

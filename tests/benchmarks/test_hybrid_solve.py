@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, load_take
-from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver, align_take
+from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver, align_take
 from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
 from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.markers import gamma_curves, rest_residual
@@ -141,7 +141,9 @@ def solved(classifier: ActionUnitClassifier, one: Film, units: tuple[str, ...] |
     assert one.take.markers is not None
     markers = solver.arrange(one.take.markers)
     table = load_shape_table("arkit")
-    curves = action_unit_curves(classifier, one.video, one.labels, table, one.rig.names, units, at_rest=at_rest)
+    curves = action_unit_curves(
+        classifier, one.video, one.labels, table, one.rig.names, CurveSettings(units=units, at_rest=at_rest)
+    )
     hybrid = HybridSolver(solver)(markers, curves.weights, gamma_curves(curves.active))
     return Solved(one, solver(markers), hybrid, curves)
 

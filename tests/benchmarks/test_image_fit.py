@@ -202,7 +202,9 @@ def table(faces: Faces, truths: list[Planted], model: HeadModel, transfers: int 
     row = Row()
     for truth in truths:
         start = time.process_time()
-        fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=settings, transfers=transfers)
+        fit = fit_images(
+            model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=replace(settings, transfers=transfers)
+        )
         row.add(fit, truth, faces.rig, time.process_time() - start)
     return row
 
@@ -309,7 +311,9 @@ def test_contour_at_seventy_degrees(faces: Faces) -> None:
         truth = planted(faces, seed, slides=True, yaws=(-70.0, 70.0))
         for slides in (True, False):
             settings = FitSettings(focal_deviation=SPREAD, sliding=slides)
-            fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=settings, transfers=0)
+            fit = fit_images(
+                model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=replace(settings, transfers=0)
+            )
             blank = torch.ones(3, SIZE[1], SIZE[0])
             off = similarity_transform(fit.mesh.vertices[None].double(), truth.rest[None].double())
             away = (off.apply(fit.mesh.vertices[None].double())[0] - truth.rest).norm(dim=-1)
@@ -451,7 +455,7 @@ def test_photographs_beside_eos(faces: Faces, data: Path) -> None:
         size = (image.shape[2], image.shape[1])
         for name, model, rig in (("zoo's head", zoo_model, zoo_rig), ("people", people, faces.rig)):
             start = time.process_time()
-            fit = fit_images(model, rig, marks[None], size, transfers=0)
+            fit = fit_images(model, rig, marks[None], size, settings=FitSettings(transfers=0))
             took = time.process_time() - start
             left, right = _smiles(rig)
             apart = float((fit.weights[left] - fit.weights[right]).abs())
@@ -483,7 +487,7 @@ def test_planted_single_views_beside_eos(faces: Faces) -> None:
     for seed in range(12):
         truth = planted(faces, seed, slides=False, yaws=(20.0,))
         settings = FitSettings(focal_deviation=SPREAD)
-        fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=settings, transfers=0)
+        fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=replace(settings, transfers=0))
         _, _, posed = peer.fit(truth.landmarks[0], *SIZE, 0)
         ours.append(error(fit.posed.vertices, truth.face))
         theirs.append(error(posed, truth.face))

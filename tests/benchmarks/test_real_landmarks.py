@@ -24,7 +24,7 @@ from torchface.capture.video.offset_estimate import estimate_offsets
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io import load_rig
 from torchface.io.rigs.ict_facekit import load_identity_modes
-from torchface.modeling import HeadModel, MorphableModel, fit_images
+from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.track_models import load_priors
 
@@ -103,7 +103,7 @@ def fitted(rig: BlendshapeRig, modes: Tensor, landmarks: Tensor, size: tuple[int
     model = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
     chosen = landmarks[torch.linspace(0, len(landmarks) - 1, 6).round().long()]
     camera = assumed_calibration(*size).intrinsics
-    fit = fit_images(model, rig, chosen, size, camera=camera, transfers=0, texture_size=0)
+    fit = fit_images(model, rig, chosen, size, camera=camera, settings=FitSettings(transfers=0, texture_size=0))
     return BlendshapeRig(rig.neutral.with_vertices(fit.mesh.vertices), rig.deltas, rig.names)
 
 

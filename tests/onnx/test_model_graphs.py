@@ -17,7 +17,7 @@ from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.landmarks import DetectorSettings, UVLandmarkDetector
 from torchface.landmarks.scans.hog import HogLayout
-from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
+from torchface.modeling import ExpressionRegression, ExpressionSettings, HeadModel, MorphableModel
 from torchface.onnx import export_model
 from torchface.onnx.uv_landmark_graph import LandmarkBank, export_landmark_bank
 
@@ -142,7 +142,9 @@ def test_what_has_no_graph_is_named(regression: ExpressionRegression, dome_rig: 
     with pytest.raises(ValueRangeError, match="found a Linear"):
         export_model(nn.Linear(2, 2), tmp_path / "x.onnx")
     neutrals = dome_rig.vertices + noise(4, *dome_rig.vertices.shape)
-    whole = ExpressionRegression.fit(neutrals, neutrals[:, None] + dome_rig.deltas, form="expressions")
+    whole = ExpressionRegression.fit(
+        neutrals, neutrals[:, None] + dome_rig.deltas, ExpressionSettings(form="expressions")
+    )
     with pytest.raises(ValueRangeError, match="form 'expressions'"):
         export_model(whole, tmp_path / "x.onnx")
     assert not (tmp_path / "x.onnx").exists()

@@ -10,7 +10,7 @@ import torch
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, save_mesh, save_rig, zoo
 from torchface.errors import NameMismatchError
-from torchface.modeling import ExpressionRegression
+from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import silent
 from train import expression as recipe
 from train import expression_table, people_samples
@@ -124,7 +124,9 @@ def test_people_on_disk_give_what_people_in_memory_give(
         assert torch.equal(kept.without(i).neutrals.read(2, 6), held.without(i).neutrals.read(2, 6))
     asked = Settings(pairs, neutral_components=None, offset_components=None, ridge=None)
     faces = held.expressions.read(0, 8).unflatten(1, (len(held.names), -1))
-    whole = ExpressionRegression.fit(held.neutrals.read(0, 8), faces, None, None, None)
+    whole = ExpressionRegression.fit(
+        held.neutrals.read(0, 8), faces, ExpressionSettings(neutral_components=None, offset_components=None, ridge=None)
+    )
     for people in (held, kept):
         for name, value in fit(people, asked).state_dict().items():
             torch.testing.assert_close(value, whole.state_dict()[name], msg=name)

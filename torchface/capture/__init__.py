@@ -1,6 +1,6 @@
 """Blendshape weights from what cameras and marker systems saw."""
 
-from torchface.capture.action_units import ActionUnitClassifier, action_unit_curves
+from torchface.capture.action_units import ActionUnitClassifier, CurveSettings, action_unit_curves
 from torchface.capture.markers import (
     HelmetSolver,
     HybridSolver,
@@ -17,6 +17,7 @@ from torchface.capture.webcam import ExampleSolver, WebcamControls, WebcamSolver
 
 __all__ = [
     "ActionUnitClassifier",
+    "CurveSettings",
     "DynamicsPrior",
     "DynamicsSettings",
     "ExampleSolver",

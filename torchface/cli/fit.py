@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,31 +65,18 @@ def fit(
     from torchface.files.job_lock import file_lock
     from torchface.modeling import FitSettings
     from torchface.workflows.fit.given_landmarks import is_landmark_file
-    from torchface.workflows.fit.photograph_rig import fit_photographs
+    from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
     from torchface.workflows.rig_names import naming_lines
 
     given = tuple(Path(one) for one in landmarks)
     if len(landmarks) == 1 and not is_landmark_file(given[0]):
         given, landmark_model = (), landmarks[0]
-    settings = FitSettings() if inner_weight is None else FitSettings(inner_weight=inner_weight)
+    fitting = FitSettings(texture_size=texture_size, masked=not everything)
+    if inner_weight is not None:
+        fitting = replace(fitting, inner_weight=inner_weight)
+    settings = PhotographSettings(fitting, template, part, focal, face, landmark_model, names, insist)
     with file_lock(out), progress_bars(quiet) as progress:
-        made = fit_photographs(
-            photographs,
-            given,
-            model,
-            out,
-            template,
-            focal,
-            settings,
-            face,
-            texture_size,
-            progress,
-            landmark_model,
-            names,
-            part,
-            everything,
-            insist,
-        )
+        made = fit_photographs(photographs, given, model, out, settings, progress)
     for line in [*made.lines(photographs), *naming_lines(made.rig, names)]:
         console.print(line, highlight=False)
     marks = (overlay.with_suffix(".pts") for overlay in made.overlays[: len(made.found)])

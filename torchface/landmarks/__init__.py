@@ -39,7 +39,7 @@ from torchface.landmarks.scans.face_frame import FaceFrame
 from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks, LandmarkPairs, contour_correspondences
 from torchface.landmarks.scans.scan_annotations import ScanAnnotation, load_annotations, save_annotations
 from torchface.landmarks.scans.scan_landmarks import ScanLandmarks, appearance_image, line_image, scan_landmarks
-from torchface.landmarks.scans.uv_detector import UVLandmarkDetector, UVLandmarks
+from torchface.landmarks.scans.uv_detector import LineExamples, UVLandmarkDetector, UVLandmarks
 from torchface.landmarks.scans.uv_landmark_names import UV_LANDMARK_NAMES, uv_landmarks_from_ibug
 
 __all__ = [
@@ -64,6 +64,7 @@ __all__ = [
     "LandmarkPairs",
     "LandmarkTracker",
     "LandmarkTrees",
+    "LineExamples",
     "NetworkDetector",
     "NetworkLandmarks",
     "NetworkSettings",

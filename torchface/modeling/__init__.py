@@ -1,6 +1,12 @@
 """Faces as models: learned ones, personal rigs, and the detail that meshes are too coarse to hold."""
 
-from torchface.modeling.detail.normal_map_baking import BakeStatistics, NormalMap, bake_normal_map, detail_maps
+from torchface.modeling.detail.normal_map_baking import (
+    BakeSettings,
+    BakeStatistics,
+    NormalMap,
+    bake_normal_map,
+    detail_maps,
+)
 from torchface.modeling.detail.scan_alignment import ScanAlignment, align_scan
 from torchface.modeling.morphable.color_casts import color_casts, texture_areas, without_cast
 from torchface.modeling.morphable.head_model import HeadModel, Heads
@@ -19,7 +25,7 @@ from torchface.modeling.rigging.deformation_transfer import (
 )
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.modeling.rigging.expression_regression import ExpressionRegression, rig_from_neutral
-from torchface.modeling.rigging.expression_training import fit_expression_samples, fit_expressions
+from torchface.modeling.rigging.expression_training import ExpressionSettings, fit_expression_samples, fit_expressions
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
@@ -29,10 +35,12 @@ from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shap
 ExpressionRegression.fit = staticmethod(fit_expressions)
 
 __all__ = [
+    "BakeSettings",
     "BakeStatistics",
     "ColorFit",
     "ExampleRig",
     "ExpressionRegression",
+    "ExpressionSettings",
     "FitSettings",
     "HeadModel",
     "Heads",

@@ -8,7 +8,7 @@ from torchface.onnx.example_graph_export import ExampleReport, export_example_so
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.model_export import export_model
 from torchface.onnx.solver_graph import SolverGraph
-from torchface.onnx.solver_graph_export import SolverReport, export_hybrid_solver, export_solver
+from torchface.onnx.solver_graph_export import GraphSteps, SolverReport, export_hybrid_solver, export_solver
 from torchface.onnx.video_graph import VideoGraph
 from torchface.onnx.video_graph_export import VideoReport, export_video_solver
 
@@ -16,6 +16,7 @@ __all__ = [
     "ActionUnitReport",
     "ExampleReport",
     "ExportReport",
+    "GraphSteps",
     "HybridGraph",
     "SolverGraph",
     "SolverReport",

@@ -20,6 +20,7 @@ from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolve
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import checked_count
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.corrective_model import corrective_model
 from torchface.onnx.hybrid_graph import HybridGraph
@@ -99,6 +100,30 @@ class SolverReport:
         return "\n".join(f"{name}: {value}" for name, value in self.rows())
 
 
+@dataclass(frozen=True)
+class GraphSteps:
+    """How many steps of operator splitting a solver's graph takes; see ``SolverGraph``.
+
+    Args:
+        seen: for batches in which every marker is seen.
+        with_gaps: for batches with missing markers.
+
+    Raises:
+        ValueRangeError: less than one.
+
+    Example:
+        >>> GraphSteps(seen=20).seen
+        20
+    """
+
+    seen: int = STEPS
+    with_gaps: int = STEPS_WITH_GAPS
+
+    def __post_init__(self) -> None:
+        checked_count("steps", self.seen, 1)
+        checked_count("steps with gaps", self.with_gaps, 1)
+
+
 def export_solver(
     rig: BlendshapeRig,
     attachment: Attachment,
@@ -106,8 +131,7 @@ def export_solver(
     alignment: Similarity | None = None,
     sparsity: float = SPARSITY,
     ridge: float = RIDGE,
-    steps: int = STEPS,
-    steps_with_gaps: int = STEPS_WITH_GAPS,
+    steps: GraphSteps = GraphSteps(),
     markers: Tensor | None = None,
 ) -> SolverReport:
     """Writes the marker solve of one rig and layout as ONNX, and checks it.
@@ -121,7 +145,7 @@ def export_solver(
         path: the file to write; it appears only when it is complete and checked.
         alignment: marker space to rig space, baked in.
         sparsity, ridge: as in ``MarkerSolver``.
-        steps, steps_with_gaps: as in ``SolverGraph``; a rig with correctives takes ``CorrectiveGraph``'s.
+        steps: of the graph's solve; a rig with correctives takes ``CorrectiveGraph``'s.
         markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
 
     Raises:
@@ -137,14 +161,13 @@ def export_solver(
         True
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge)
-    return export_marker_solver(solver, path, steps, steps_with_gaps, markers)
+    return export_marker_solver(solver, path, steps, markers)
 
 
 def export_marker_solver(
     solver: MarkerSolver,
     path: str | Path,
-    steps: int = STEPS,
-    steps_with_gaps: int = STEPS_WITH_GAPS,
+    steps: GraphSteps = GraphSteps(),
     markers: Tensor | None = None,
     facts: Mapping[str, object] | None = None,
 ) -> SolverReport:
@@ -152,7 +175,7 @@ def export_marker_solver(
 
     Args:
         solver: of N shapes and M markers.
-        path, steps, steps_with_gaps, markers: as there.
+        path, steps, markers: as there.
         facts: further metadata, such as licence and data.
     """
     solver = copy.deepcopy(solver).cpu().float()
@@ -161,7 +184,7 @@ def export_marker_solver(
         corrected = CorrectiveGraph(solver)
         return _export(corrective_model(corrected, facts), corrected, solver, frames, (), path)
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
-    graph = SolverGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    graph = SolverGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
     return _export(solver_model(graph, facts), graph, solver, frames, (), path)
 
 
@@ -172,8 +195,7 @@ def export_hybrid_solver(
     alignment: Similarity | None = None,
     sparsity: float = SPARSITY,
     ridge: float = RIDGE,
-    steps: int = STEPS,
-    steps_with_gaps: int = STEPS_WITH_GAPS,
+    steps: GraphSteps = GraphSteps(),
     markers: Tensor | None = None,
 ) -> SolverReport:
     """Writes the hybrid solve of one rig and layout as ONNX, and checks it.
@@ -193,7 +215,7 @@ def export_hybrid_solver(
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
     frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
-    graph = HybridGraph(solver, steps, steps_with_gaps, choose_rho(solver, steps, frames))
+    graph = HybridGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
     generator = torch.Generator().manual_seed(1)
     shape = (len(frames), len(solver.names))
     predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)

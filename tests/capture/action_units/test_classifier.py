@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from torchface import zoo
+from torchface.capture import CurveSettings
 from torchface.capture.action_units import (
     GROUPS,
     ActionUnitClassifier,
@@ -114,7 +115,12 @@ def test_planted_intensities_come_back(
     assert found["exact"] > 0.8
     names = session.rig.names
     curves = action_unit_curves(
-        classifier, regions, session.labels, load_shape_table("arkit"), names, windows=dict.fromkeys(MOVES, 7)
+        classifier,
+        regions,
+        session.labels,
+        load_shape_table("arkit"),
+        names,
+        CurveSettings(windows=dict.fromkeys(MOVES, 7)),
     )
     assert curves.weights.shape == curves.active.shape == (len(truth), len(names))
     assert (curves.intensities - truth).square().mean().sqrt() < 0.06
@@ -122,7 +128,9 @@ def test_planted_intensities_come_back(
     assert (curves.weights[:, row] - session.performance.weights[:, row]).abs().mean() < 0.04
     assert not curves.active[:, names.index("jawOpen")].any()
     assert curves.weights[:, names.index("jawOpen")].abs().max() == 0
-    asked = action_unit_curves(classifier, regions, session.labels, load_shape_table("arkit"), names, units=["9"])
+    asked = action_unit_curves(
+        classifier, regions, session.labels, load_shape_table("arkit"), names, CurveSettings(units=["9"])
+    )
     assert asked.active.any(0).nonzero()[:, 0].tolist() == sorted(
         names.index(f"noseSneer{s}") for s in ("Left", "Right")
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchface.capture import ActionUnitClassifier, HybridSolver, MarkerSolver
+from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver
 from torchface.capture.action_units import RegionVideo, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
 from torchface.synthetic.stages.action_performance import MOVES
@@ -44,14 +44,14 @@ def test_where_the_classifier_leads(
     classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:
     names, table = session.rig.names, load_shape_table("arkit")
-    source = action_unit_curves(classifier, regions, session.labels, table, names, at_rest=False)
+    source = action_unit_curves(classifier, regions, session.labels, table, names, CurveSettings(at_rest=False))
     everywhere = action_unit_curves(classifier, regions, session.labels, table, names)
     assert not source.active[(source.levels == 0).all(1)].any()
     led = source.active.any(0)
     assert bool(everywhere.active[:, led].all())
     assert not everywhere.active[:, ~led].any()
     # Blinks, which shall not lead, keep the lids for the markers.
-    asked = action_unit_curves(classifier, regions, session.labels, table, names, ["6+43"])
+    asked = action_unit_curves(classifier, regions, session.labels, table, names, CurveSettings(units=["6+43"]))
     level = {unit: asked.levels[:, i] > 0 for i, unit in enumerate(asked.units)}
     blinks = level["45"] & ~level["6+43"]
     assert blinks.any()

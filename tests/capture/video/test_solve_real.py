@@ -11,7 +11,7 @@ from torchface.capture.priors import ShapePrior
 from torchface.capture.video import VideoSolver
 from torchface.io import load_rig, load_take, save_animation
 from torchface.io.rigs.ict_facekit import load_identity_modes
-from torchface.modeling import HeadModel, MorphableModel, fit_images
+from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
@@ -32,7 +32,7 @@ def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performa
     model = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
     reach = landmarks[torch.isfinite(landmarks).all(-1)].amax(0)
     image_size = (int(1.2 * reach[0]), int(1.2 * reach[1]))
-    fit = fit_images(model, rig, landmarks[:1], image_size, transfers=0, texture_size=0)
+    fit = fit_images(model, rig, landmarks[:1], image_size, settings=FitSettings(transfers=0, texture_size=0))
     actor = BlendshapeRig(fit.mesh, rig.deltas, rig.names)
     prior = ShapePrior.fit(takes, rig.names)
     solver = VideoSolver(actor, rig.neutral.landmarks, fit.cameras[0].intrinsics, prior)

@@ -11,6 +11,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.landmarks import LineExamples
 from torchface.landmarks.scans.detector_files import load_detector, save_detector
 from torchface.landmarks.scans.detector_settings import DetectorSettings
 from torchface.landmarks.scans.hog import HogLayout
@@ -95,7 +96,9 @@ def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
     """Keys of the state, and the word for what it sees, as they were."""
     images, places = zip(*(drawn(seed) for seed in range(3)), strict=True)
     lines = [{"lips": torch.tensor([[40.0, 90.0], [60.0, 95.0 + i], [80.0, 90.0]])} for i in range(3)]
-    fitted = UVLandmarkDetector.fit(torch.stack(images), torch.stack(places), NAMES, "curvature", SETTINGS, lines=lines)
+    fitted = UVLandmarkDetector.fit(
+        torch.stack(images), torch.stack(places), NAMES, "curvature", SETTINGS, lines=LineExamples(lines)
+    )
     folder = tmp_path / "model"
     save_detector(fitted, folder)
     path, text = folder / "state.safetensors", (folder / "model.toml").read_text()

@@ -18,7 +18,7 @@ from torchface.geometry.meshes.uv_raster import interpolate, rasterise_uvs
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig
 from torchface.mesh import Mesh, submesh
-from torchface.modeling.detail.normal_map_baking import NormalMap, bake_normal_map, detail_maps, dilate
+from torchface.modeling.detail.normal_map_baking import BakeSettings, NormalMap, bake_normal_map, detail_maps, dilate
 from torchface.modeling.detail.scan_alignment import align_scan
 
 DEPTH, WIDTH = 0.3, 2.0
@@ -169,7 +169,7 @@ def test_a_scan_in_another_scale_is_fitted_when_asked(face: Mesh) -> None:
 
 def test_hits_too_far_or_from_inside_leave_the_map_flat(face: Mesh, forehead: Mesh) -> None:
     away = forehead.with_vertices(forehead.vertices * 1.1)
-    baked = bake_normal_map(face, away, SIZE, alignment=still(), maximum_distance=2.0)
+    baked = bake_normal_map(face, away, SIZE, alignment=still(), settings=BakeSettings(maximum_distance=2.0))
     assert baked.statistics.hit_share == 0
     assert torch.equal(baked.normals[2], torch.ones(SIZE, SIZE))
     near = bake_normal_map(face, forehead, SIZE, alignment=still())

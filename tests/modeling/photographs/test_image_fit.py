@@ -84,7 +84,10 @@ def aligned_error(found: Tensor, true: Tensor) -> float:
 @pytest.fixture(scope="module")
 def planted(rig: BlendshapeRig, model: HeadModel) -> list[tuple[Person, ImageFit]]:
     people = [person(rig, model, seed) for seed in range(4)]
-    return [(p, fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=FIXED, transfers=0)) for p in people]
+    return [
+        (p, fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=replace(FIXED, transfers=0)))
+        for p in people
+    ]
 
 
 def test_planted_heads_come_back(planted: list[tuple[Person, ImageFit]], model: HeadModel) -> None:
@@ -115,7 +118,7 @@ def test_a_lopsided_smile_stays_lopsided(rig: BlendshapeRig, model: HeadModel) -
     weights = torch.zeros(len(rig.names))
     weights[left] = 0.7
     p = person(rig, model, 3, weights=weights)
-    fit = fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=FIXED, transfers=0)
+    fit = fit_images(model, rig, p.landmarks, SIZE, camera=p.focal, settings=replace(FIXED, transfers=0))
     assert float(fit.weights[left] - fit.weights[right]) > 0.5
 
 
@@ -133,7 +136,7 @@ def test_covariance_tells_how_far_off_coefficients_are(rig: BlendshapeRig, model
     found, told = [], []
     for _ in range(12):
         noisy = p.landmarks + torch.randn(p.landmarks.shape, generator=generator).double()
-        fit = fit_images(model, rig, noisy, SIZE, camera=p.focal, settings=settings, transfers=0)
+        fit = fit_images(model, rig, noisy, SIZE, camera=p.focal, settings=replace(settings, transfers=0))
         found.append(fit.coefficients)
         told.append(fit.covariance.diagonal()[: model.shape.count].sqrt())
     spread, told_mean = torch.stack(found).std(0), torch.stack(told).mean(0)
@@ -148,7 +151,7 @@ def test_missing_landmarks_are_left_out(rig: BlendshapeRig, model: HeadModel) ->
     gaps[0, :20] = torch.nan
     gaps[2, ::3] = torch.nan
     skin = model.annotations.regions["face"]
-    fit = fit_images(model, rig, gaps, SIZE, camera=p.focal, settings=FIXED, transfers=0)
+    fit = fit_images(model, rig, gaps, SIZE, camera=p.focal, settings=replace(FIXED, transfers=0))
     assert torch.equal(torch.isnan(fit.residuals), torch.isnan(gaps))
     assert torch.isfinite(fit.errors).all()
     assert aligned_error(fit.mesh.vertices[skin], p.rest[skin]) < 0.4 * aligned_error(
@@ -159,10 +162,10 @@ def test_missing_landmarks_are_left_out(rig: BlendshapeRig, model: HeadModel) ->
 def test_focal_lengths_are_estimated(rig: BlendshapeRig, model: HeadModel) -> None:
     p = person(rig, model, 7)
     settings = replace(FIXED, focal_deviation=0.15)
-    fit = fit_images(model, rig, p.landmarks, SIZE, camera=1.2 * p.focal, settings=settings, transfers=0)
+    fit = fit_images(model, rig, p.landmarks, SIZE, camera=1.2 * p.focal, settings=replace(settings, transfers=0))
     found = torch.stack([camera.intrinsics[0, 0] for camera in fit.cameras])
     assert float((found / p.focal - 1).abs().max()) < 0.1
-    known = fit_images(model, rig, p.landmarks, SIZE, camera=6000.0, settings=FIXED, transfers=0)
+    known = fit_images(model, rig, p.landmarks, SIZE, camera=6000.0, settings=replace(FIXED, transfers=0))
     assert all(float(camera.intrinsics[0, 0]) == 6000.0 for camera in known.cameras)
 
 
@@ -178,7 +181,7 @@ def test_transferred_shapes_explain_a_persons_own(rig: BlendshapeRig, model: Hea
         seen = torch.stack([camera.project(face[rig.neutral.landmarks].double()) for camera in cameras])
         focal = float(cameras[0].intrinsics[0, 0])
         for turns in (0, 1):
-            fit = fit_images(model, few, seen, SIZE, camera=focal, settings=FIXED, transfers=turns)
+            fit = fit_images(model, few, seen, SIZE, camera=focal, settings=replace(FIXED, transfers=turns))
             errors.append(aligned_error(fit.posed.vertices[skin], face[skin]))
     without, with_transfer = errors[0] + errors[2], errors[1] + errors[3]
     assert with_transfer < 0.8 * without
@@ -234,5 +237,5 @@ def test_wrong_shapes_and_other_topology(
         fit_images(model, rig, seen, SIZE, camera=-1.0)
     bare = Mesh(rig.vertices, rig.neutral.faces)
     plain, plain_rig = HeadModel.on(bare, model.shape), BlendshapeRig(bare, rig.deltas, rig.names)
-    with pytest.raises(ValueRangeError, match="landmark_vertices: found none"):
+    with pytest.raises(ValueRangeError, match="landmarks: found none"):
         fit_images(plain, plain_rig, seen, SIZE)

@@ -13,7 +13,7 @@ from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.rigs.ict_facekit import load_identity_modes
-from torchface.modeling import HeadModel, MorphableModel, fit_images
+from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 
 
@@ -33,7 +33,7 @@ def test_a_real_portrait(
     path = data / "images" / "ibug" / "image_0010.png"
     image = load_image(path)
     marks = load_landmark_points(path.with_suffix(".pts")).ibug()
-    fit = fit_images(model, rig, marks[None], (image.shape[2], image.shape[1]), transfers=0)
+    fit = fit_images(model, rig, marks[None], (image.shape[2], image.shape[1]), settings=FitSettings(transfers=0))
     eyes = float((marks[36] - marks[45]).norm())
     assert float(fit.errors[0]) < 0.07 * eyes
     assert float(fit.residuals[0, 17:].norm(dim=-1).mean()) < 0.04 * eyes
@@ -55,7 +55,9 @@ def test_smiles_of_turned_heads_are_as_strong_on_both_sides(
     folder, apart = data / "images" / "dlib_faces", []
     for face in load_dlib_faces(folder / "training_with_face_landmarks.xml"):
         image = load_image(folder / face.image)
-        fit = fit_images(model, rig, face.points[None], (image.shape[2], image.shape[1]), transfers=0)
+        fit = fit_images(
+            model, rig, face.points[None], (image.shape[2], image.shape[1]), settings=FitSettings(transfers=0)
+        )
         apart.append(float((fit.weights[left] - fit.weights[right]).abs()))
     assert max(apart) < 0.1
     assert sum(apart) / len(apart) < 0.06

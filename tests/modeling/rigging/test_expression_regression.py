@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchface import BlendshapeRig, load_rig, zoo
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
-from torchface.modeling import ExpressionRegression, rig_from_neutral, transfer_deformation
+from torchface.modeling import ExpressionRegression, ExpressionSettings, rig_from_neutral, transfer_deformation
 from torchface.modeling.rigging.component_choice import choose_components
 from torchface.synthetic import draw_identities, performer
 
@@ -73,7 +73,12 @@ def test_agrees_with_scikit_learn(people: tuple[Tensor, Tensor], ridge: float) -
     neutrals, expressions = people
     expressions = expressions + 0.5 * noise(*expressions.shape, seed=5)
     neutrals = neutrals + 0.5 * noise(*neutrals.shape, seed=6)
-    model = ExpressionRegression.fit(neutrals[:20], expressions[:20], 6, 5, ridge, region=torch.ones(V) > 0)
+    model = ExpressionRegression.fit(
+        neutrals[:20],
+        expressions[:20],
+        ExpressionSettings(neutral_components=6, offset_components=5, ridge=ridge),
+        region=torch.ones(V) > 0,
+    )
     # The reference is told the people as they are laid together, the rest is its own.
     laid = neutrals.clone()
     for i in range(len(neutrals)):
@@ -113,7 +118,7 @@ def test_the_head_may_have_any_pose(people: tuple[Tensor, Tensor]) -> None:
 
 
 def test_gradients_go_through(people: tuple[Tensor, Tensor]) -> None:
-    model = ExpressionRegression.fit(*people, 3, 3).double()
+    model = ExpressionRegression.fit(*people, ExpressionSettings(neutral_components=3, offset_components=3)).double()
     neutral = people[0][:1].clone().requires_grad_()
     weight = noise(1, 2, V, 3, seed=9).double()
     assert torch.autograd.gradcheck(lambda n: (model(n) * weight).sum(), neutral, atol=1e-4, rtol=1e-3)
@@ -125,7 +130,7 @@ def test_the_first_form_of_the_thesis_leaks_identity(performers: list[Blendshape
     smiles = torch.stack([rig.select(["mouthSmileLeft"])(torch.ones(1, 1)) for rig in performers])
     left = {}
     for form in ("offsets", "expressions"):
-        model = ExpressionRegression.fit(neutrals[:6], smiles[:6], form=form)
+        model = ExpressionRegression.fit(neutrals[:6], smiles[:6], ExpressionSettings(form=form))
         still = (smiles - neutrals[:, None]).abs().amax((0, 1, 3)) == 0
         left[form] = (model(neutrals[6:]) - neutrals[6:, None])[0, 0, still].norm(dim=-1).mean()
     assert left["offsets"] == 0
@@ -166,7 +171,7 @@ def test_what_is_chosen_predicts_better_than_too_many(people: tuple[Tensor, Tens
     shown = seen[:, None] + (expressions - neutrals[:, None]) + 2.0 * noise(*expressions.shape, seed=5)
     error = {}
     for name, asked in {"chosen": (None, None, None), "default": (14, 13, 0.0)}.items():
-        model = ExpressionRegression.fit(seen[:16], shown[:16], *asked)
+        model = ExpressionRegression.fit(seen[:16], shown[:16], ExpressionSettings(*asked))
         error[name] = (model.offsets(seen[16:]) - (expressions - neutrals[:, None])[16:]).square().sum()
     assert error["chosen"] < 0.8 * error["default"]
 
@@ -247,7 +252,7 @@ def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
     with pytest.raises(ShapeError, match=r"expected \(24,N,40,3\)"):
         fit(neutrals, expressions[:, :, 1:])
     with pytest.raises(ShapeError, match="three at least"):
-        fit(neutrals[:2], expressions[:2], None)
+        fit(neutrals[:2], expressions[:2], ExpressionSettings(neutral_components=None))
     with pytest.raises(ValueRangeError, match="expressions: 1 of 24 hold NaN"):
         fit(neutrals, torch.where(torch.arange(24).view(24, 1, 1, 1) == 3, torch.nan, expressions))
     with pytest.raises(ValueRangeError, match="all the same"):
@@ -257,9 +262,9 @@ def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
     with pytest.raises(NameMismatchError, match="distinct"):
         fit(neutrals, expressions, names=["smile", "smile"])
     with pytest.raises(ValueRangeError, match="ridge: found -1"):
-        fit(neutrals, expressions, ridge=-1.0)
+        fit(neutrals, expressions, ExpressionSettings(ridge=-1.0))
     with pytest.raises(ValueRangeError, match="neutral_components: found 0"):
-        fit(neutrals, expressions, 0)
+        fit(neutrals, expressions, ExpressionSettings(neutral_components=0))
     with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
         fit(neutrals, expressions)(neutrals[:, 1:])
 

@@ -21,6 +21,7 @@ from torchface.synthetic.stages.camera_stage import (
     render_video,
     stage_markers,
 )
+from torchface.synthetic.stages.head_camera_images import HeadCameraRenderer
 from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from torchface.synthetic.stages.reflective_paint import reflective_paint
 
@@ -90,9 +91,8 @@ def test_the_paint_moves_with_the_skin() -> None:
     generator = torch.Generator().manual_seed(0)
     rotation, translation = shaken_cameras(camera, 2, 60.0, STILL, generator)
     markers = stage_markers(rig, 20).select(SIDE_MARKERS)
-    pictures = list(
-        render_video(rig, weights, reflective_paint(512), markers, camera, rotation, translation, STILL, generator)
-    )
+    scene = HeadCameraRenderer(rig, reflective_paint(512), markers)
+    pictures = list(render_video(scene, weights, camera, rotation, translation, STILL, generator))
     skin = rig(weights)
     stroke = ((rig.vertices - torch.tensor([14.0, 34.0, 90.0])).norm(dim=1)).argmin()
     pixels = camera.project(skin[:, stroke].double())
@@ -144,17 +144,7 @@ def test_nonsense_is_refused() -> None:
     with pytest.raises(ValueRangeError, match="noise"):
         CameraFlaws(noise=float("nan"))
     camera = helmet_camera()
+    scene = HeadCameraRenderer(rig, reflective_paint(64), stage_markers(rig, 20))
+    still = camera, torch.eye(3)[None], torch.zeros(1, 3)
     with pytest.raises(ShapeError, match="as many"):
-        next(
-            render_video(
-                rig,
-                torch.zeros(3, 51),
-                torch.zeros(8, 8),
-                None,
-                camera,
-                torch.eye(3)[None],
-                torch.zeros(1, 3),
-                STILL,
-                generator,
-            )
-        )  # type: ignore[arg-type]
+        next(render_video(scene, torch.zeros(3, 51), *still, STILL, generator))

@@ -27,7 +27,7 @@ from torchface.io.camera_files import load_calibration
 from torchface.io.images.image_files import load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import NoFaceError, TrackedFace, find_faces
-from torchface.modeling import HeadModel, ImageFit, MorphableModel, fit_images
+from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
@@ -37,7 +37,7 @@ from torchface.workflows.fit.fit_checks import one_person_lines
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from torchface.workflows.fit.found_landmarks import PhotographLandmarks
 from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
-from torchface.workflows.fit.photograph_rig import fit_photographs
+from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
 
 YAWS = (-35.0, 0.0, 35.0)
 SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
@@ -129,11 +129,17 @@ def test_photographs_without_a_face_are_said(studio: Path, tmp_path: Path) -> No
     save_image(torch.full((3, 120, 160), 0.4), tmp_path / "wall.png")
     template, out = studio / "template.glb", tmp_path / "rig.glb"
     with pytest.raises(NoFaceError, match=r"wall\.png: found no face, expected one at least; .* with --landmarks"):
-        fit_photographs([tmp_path / "wall.png"], [], studio / "heads", out, template)
+        fit_photographs([tmp_path / "wall.png"], [], studio / "heads", out, PhotographSettings(template=template))
     with pytest.raises(NoFaceError, match=r"p1\.png: found 1 face, expected more than 1"):
-        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, face=1)
+        fit_photographs([studio / "p1.png"], [], studio / "heads", out, PhotographSettings(template=template, face=1))
     with pytest.raises(NameMismatchError, match="a HeadModel, expected a LandmarkTrees"):
-        fit_photographs([studio / "p1.png"], [], studio / "heads", out, template, landmark_model=studio / "heads")
+        fit_photographs(
+            [studio / "p1.png"],
+            [],
+            studio / "heads",
+            out,
+            PhotographSettings(template=template, landmark_model=studio / "heads"),
+        )
     assert not out.exists()
 
 
@@ -156,14 +162,30 @@ def test_unsure_landmarks_are_left_out(studio: Path) -> None:
 def test_a_rig_that_travels_with_the_model_needs_no_template(studio: Path, tmp_path: Path) -> None:
     photographs, marks = [studio / "p1.png"], [studio / "p1.pts"]
     heads, template = studio / "heads", studio / "template.glb"
-    plain = fit_photographs(photographs, marks, heads, tmp_path / "a.glb", template, texture_size=0)
-    own = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "b.glb", texture_size=0)
+    plain = fit_photographs(
+        photographs,
+        marks,
+        heads,
+        tmp_path / "a.glb",
+        PhotographSettings(template=template, fit=FitSettings(texture_size=0)),
+    )
+    own = fit_photographs(
+        photographs,
+        marks,
+        studio / "heads_with_rig",
+        tmp_path / "b.glb",
+        PhotographSettings(fit=FitSettings(texture_size=0)),
+    )
     assert own.rig.names == tuple(SHAPES)
     torch.testing.assert_close(own.rig.deltas, plain.rig.deltas, rtol=0, atol=0.02)
     skin = performer(texture=False).neutral.annotations
     assert skin is not None
     face = fit_photographs(
-        photographs, marks, studio / "heads_with_rig", tmp_path / "c.glb", part="face", texture_size=0
+        photographs,
+        marks,
+        studio / "heads_with_rig",
+        tmp_path / "c.glb",
+        PhotographSettings(fit=FitSettings(texture_size=0), part="face"),
     )
     assert len(face.rig.vertices) == int(skin.regions["face"].sum())
     assert aligned_error(face.rig.vertices, own.rig.vertices[skin.regions["face"]]) < 0.5
@@ -258,7 +280,9 @@ class People:
         sizes = [load_image(path).shape[:0:-1] for path in photographs]
 
         def bare(points: Tensor, rows: list[int]) -> ImageFit:
-            return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], transfers=0)
+            return fit_images(
+                self.heads, self.rig, points, [sizes[row] for row in rows], settings=FitSettings(transfers=0)
+            )
 
         return one_person_lines(photographs, marks, bare, insist)
 
@@ -293,7 +317,9 @@ def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) 
 def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path) -> None:
     photograph = people.photographs[3]
     files = [photograph.with_suffix(".pts")]
-    made = fit_photographs([photograph], files, people.model, tmp_path / "rig.glb", texture_size=0)
+    made = fit_photographs(
+        [photograph], files, people.model, tmp_path / "rig.glb", PhotographSettings(fit=FitSettings(texture_size=0))
+    )
     assert len(made.remarks) == 1
     assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
     assert "those that landmark_network finds have" in made.remarks[0]
@@ -302,7 +328,13 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
 
 def test_photographs_of_one_performer_are_one_person(studio: Path, tmp_path: Path) -> None:
     photographs, marks = ([studio / f"p{i}.{ending}" for i in range(3)] for ending in ("png", "pts"))
-    made = fit_photographs(photographs, marks, studio / "heads_with_rig", tmp_path / "rig.glb", texture_size=0)
+    made = fit_photographs(
+        photographs,
+        marks,
+        studio / "heads_with_rig",
+        tmp_path / "rig.glb",
+        PhotographSettings(fit=FitSettings(texture_size=0)),
+    )
     assert made.remarks == ()
 
 

@@ -5,7 +5,7 @@ from torchface.capture.action_units.classifier_training import TrainingSettings,
 from torchface.capture.action_units.region_video import RegionVideo, read_regions
 from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.capture.action_units.shape_table import ShapeTable, load_shape_table
-from torchface.capture.action_units.weight_targets import ActionUnitCurves, action_unit_curves, classify
+from torchface.capture.action_units.weight_targets import ActionUnitCurves, CurveSettings, action_unit_curves, classify
 
 # Training knows its model; a model knows of its training only here.
 ActionUnitClassifier.fit = staticmethod(fit_classifier)
@@ -14,6 +14,7 @@ __all__ = [
     "GROUPS",
     "ActionUnitClassifier",
     "ActionUnitCurves",
+    "CurveSettings",
     "RegionGroup",
     "RegionVideo",
     "ShapeTable",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -44,15 +44,32 @@ class ActionUnitCurves:
     fps: float
 
 
+@dataclass(frozen=True)
+class CurveSettings:
+    """Which of a classifier's units count in a solve, and how they are smoothed.
+
+    Args:
+        units: names of those that count; all if absent.
+        windows: frames at 60 a second over which each unit is smoothed.
+        at_rest: also use predictions where no unit is active; otherwise only the markers count, as in the source.
+
+    Example:
+        >>> CurveSettings(units=("9", "25")).at_rest
+        True
+    """
+
+    units: Sequence[str] | None = None
+    windows: Mapping[str, int] = field(default_factory=lambda: WINDOWS)
+    at_rest: bool = True
+
+
 def action_unit_curves(
     classifier: ActionUnitClassifier,
     video: VideoFile | RegionVideo | str | Path,
     labels: ActionLabels,
     table: ShapeTable,
     names: Sequence[str],
-    units: Sequence[str] | None = None,
-    windows: Mapping[str, int] = WINDOWS,
-    at_rest: bool = True,
+    settings: CurveSettings = CurveSettings(),
     progress: Progress | None = None,
 ) -> ActionUnitCurves:
     r"""Classifies a video and gives the curves :math:`\tilde w` of a rig's shapes.
@@ -67,17 +84,17 @@ def action_unit_curves(
         labels: where helmet, markers and regions are in it.
         table: units in the rig's shapes.
         names: of the rig's shapes, N.
-        units: which of the classifier's are used in the solve; all if absent.
-        windows: frames at 60 a second over which each unit is smoothed.
-        at_rest: also use predictions where no unit is active; otherwise only the markers count, as in the source.
+        settings: which units count, and how they are smoothed.
         progress: called with each step and how far it is.
 
     Raises:
-        NameMismatchError: the rig lacks a shape of the table, or ``units`` names one that the classifier does not know.
+        NameMismatchError: the rig lacks a shape of the table, or ``settings.units`` names one that the
+            classifier does not know.
         FileFormatError, ShapeError, ValueRangeError, AlignmentError: the video cannot be used; see ``read_regions``.
 
     Source: thesis 4.1.8 and 4.1.12.
     """
+    units = settings.units
     unknown = sorted(set(units or ()) - set(classifier.units))
     if unknown:
         raise NameMismatchError(f"units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
@@ -87,10 +104,10 @@ def action_unit_curves(
     if not isinstance(video, RegionVideo):
         video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
     levels = classify(classifier, video)
-    intensities = smooth_intensities(levels, classifier.units, windows, fps=video.fps)
+    intensities = smooth_intensities(levels, classifier.units, settings.windows, fps=video.fps)
     weights = (intensities[:, :, None] * matrix).amax(1)
     active = _moved(levels, matrix)
-    if at_rest:
+    if settings.at_rest:
         active |= (matrix > 0).any(0) & ~_moved(levels, whole)
     return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -31,6 +31,24 @@ class UVLandmarks(NamedTuple):
 
     pixels: Tensor
     confidence: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class LineExamples:
+    """Lip and lid lines of images that a detector learns from.
+
+    Args:
+        lines: pixels of each image's lines by name, (N,2) from left to right, where known.
+        images: that they are traced in, (M,C,S,S), where these are others than those that show the landmarks.
+
+    Example:
+        >>> lips = {"lips": torch.tensor([[10.0, 20.0], [14.0, 19.0]])}
+        >>> LineExamples([lips, {}]).images is None  # the second image's lines are not known
+        True
+    """
+
+    lines: Sequence[Mapping[str, Tensor]]
+    images: Tensor | None = None
 
 
 class UVLandmarkDetector(nn.Module):
@@ -141,8 +159,7 @@ class UVLandmarkDetector(nn.Module):
         appearance: str = "texture",
         settings: DetectorSettings | None = None,
         frame: FaceFrame | None = None,
-        lines: Sequence[Mapping[str, Tensor]] | None = None,
-        line_images: Tensor | None = None,
+        lines: LineExamples | None = None,
         progress: Any = None,
     ) -> UVLandmarkDetector:
         """Learns from annotated images.
@@ -154,9 +171,8 @@ class UVLandmarkDetector(nn.Module):
             appearance: what the images show, "texture" or "curvature".
             settings: how to match.
             frame: the frame the images were unwrapped in, kept for ``scan_landmarks``.
-            lines: pixels of each image's lip and lid lines by name, (N,2) from left to right, where known:
-                tracing starts from their mean and looks for what they look like.
-            line_images: the images that lines are traced in, (M,C,S,S), where they are others.
+            lines: where lips and lids run in the images, where known: tracing starts from their mean and looks for
+                what they look like.
             progress: called with the number of images done and in all.
 
         Raises:
@@ -180,7 +196,8 @@ class UVLandmarkDetector(nn.Module):
         self.good.copy_(scores.good)
         self.bad.copy_(scores.bad)
         self._fit_noise(scores.best, scores.places, maps[0].shape[-1], landmarks)
-        self._fit_lines(lines or [], images if line_images is None else line_images)
+        if lines is not None:
+            self._fit_lines(lines.lines, images if lines.images is None else lines.images)
         return self
 
     def forward(self, images: Tensor) -> UVLandmarks:

@@ -25,6 +25,36 @@ _STAND_OFF = 1e-3  # millimetres; rays start this far behind the surface, so tha
 
 
 @dataclass(frozen=True)
+class BakeSettings:
+    """How far a bake's rays go, and which hits count.
+
+    Args:
+        maximum_distance: along the normal, millimetres.
+        maximum_angle: between the normals of mesh and scan, degrees, less than 90.
+        padding: texels by which charts are dilated, so that seams do not show when the map is filtered.
+
+    Raises:
+        ValueRangeError: a limit that makes no sense.
+
+    Example:
+        >>> BakeSettings(maximum_distance=2.0).maximum_angle
+        80.0
+    """
+
+    maximum_distance: float = 5.0
+    maximum_angle: float = 80.0
+    padding: int = 16
+
+    def __post_init__(self) -> None:
+        if not 0 < self.maximum_distance < float("inf"):
+            raise ValueRangeError(f"maximum_distance: found {self.maximum_distance}, expected positive millimetres")
+        if not 0 < self.maximum_angle < 90:
+            raise ValueRangeError(f"maximum_angle: found {self.maximum_angle}, expected degrees between 0 and 90")
+        if self.padding < 0:
+            raise ValueRangeError(f"padding: found {self.padding}, expected texels, at least 0")
+
+
+@dataclass(frozen=True)
 class BakeStatistics:
     """What the rays of a bake found.
 
@@ -79,9 +109,7 @@ def bake_normal_map(
     correspondences: Correspondences | None = None,
     alignment: Similarity | None = None,
     scale: bool = False,
-    maximum_distance: float = 5.0,
-    maximum_angle: float = 80.0,
-    padding: int = 16,
+    settings: BakeSettings = BakeSettings(),
 ) -> NormalMap:
     """Writes the normals of a high-resolution scan into a map for a mesh of the same face and expression.
 
@@ -97,9 +125,7 @@ def bake_normal_map(
             the scan finds its place by itself if they are absent, see ``align_scan``.
         alignment: scan space to mesh space, if given; then nothing is estimated.
         scale: estimate the scan's scale too.
-        maximum_distance: along the normal, millimetres.
-        maximum_angle: between the normals of mesh and scan, degrees, less than 90.
-        padding: texels by which charts are dilated, so that seams do not show when the map is filtered.
+        settings: how far rays go, and what counts as a hit.
 
     Returns:
         ``NormalMap(normals (3,H,W), hit (H,W), heights (H,W), alignment, statistics)``.
@@ -122,7 +148,6 @@ def bake_normal_map(
         (True, True)
     """
     height, width = _checked_size(size)
-    _check_limits(maximum_distance, maximum_angle, padding)
     uvs, uv_faces = _checked_meshes(mesh, high_resolution_scan)
     found = None
     if alignment is None:
@@ -139,8 +164,8 @@ def bake_normal_map(
     vertices = mesh.vertices.double()
     space = tangent_space(vertices, mesh.faces, uvs.double(), uv_faces, vertex_normals(vertices, mesh.faces))
     scan = _Surface.of(high_resolution_scan.vertices.double(), high_resolution_scan.faces, alignment)
-    cosine = float(torch.tensor(maximum_angle).deg2rad().cos())
-    normals, offset, opposed = _cast_all(vertices, space, texels, scan, maximum_distance, cosine)
+    cosine = float(torch.tensor(settings.maximum_angle).deg2rad().cos())
+    normals, offset, opposed = _cast_all(vertices, space, texels, scan, settings.maximum_distance, cosine)
     seen = torch.isfinite(offset)
     if float(opposed) > 0.5 and float(seen.double().mean()) < 0.05:
         raise ValueRangeError(
@@ -154,9 +179,9 @@ def bake_normal_map(
     heights = torch.zeros(1, height, width, dtype=torch.float32)
     heights.view(-1)[texels.texels] = torch.where(seen, offset, 0.0)
     return NormalMap(
-        dilate(image, texels.mask(), padding),
+        dilate(image, texels.mask(), settings.padding),
         hit.view(height, width),
-        dilate(heights, texels.mask(), padding)[0],
+        dilate(heights, texels.mask(), settings.padding)[0],
         found,
         _statistics(offset[seen], len(offset)),
     )
@@ -299,15 +324,6 @@ def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
     if not whole or not all(1 <= side <= MAX_SIDE for side in sides):
         raise ValueRangeError(f"size: found {size!r}, expected one or two whole numbers from 1 to {MAX_SIDE}")
     return sides[0], sides[1]
-
-
-def _check_limits(maximum_distance: float, maximum_angle: float, padding: int) -> None:
-    if not 0 < maximum_distance < float("inf"):
-        raise ValueRangeError(f"maximum_distance: found {maximum_distance}, expected positive millimetres")
-    if not 0 < maximum_angle < 90:
-        raise ValueRangeError(f"maximum_angle: found {maximum_angle}, expected degrees between 0 and 90")
-    if padding < 0:
-        raise ValueRangeError(f"padding: found {padding}, expected texels, at least 0")
 
 
 def _checked_meshes(mesh: Mesh, scan: Mesh) -> tuple[Tensor, Tensor]:

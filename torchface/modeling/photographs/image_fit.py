@@ -70,12 +70,8 @@ def fit_images(
     landmarks: Tensor,
     image_size: tuple[int, int] | Sequence[tuple[int, int]],
     images: Sequence[Tensor] | None = None,
-    landmark_vertices: Tensor | None = None,
     camera: float | Tensor | None = None,
     settings: FitSettings | None = None,
-    transfers: int = 1,
-    texture_size: int = 1024,
-    masked: bool = True,
     progress: Progress | None = None,
 ) -> ImageFit:
     r"""The head whose landmarks are seen where photographs show them.
@@ -90,17 +86,13 @@ def fit_images(
 
     Args:
         model: heads at rest.
-        rig: template with the model's topology.
+        rig: template with the model's topology. Its annotated landmarks are seen, or the model's where it has none.
         landmarks: in iBUG's order, (I,68,2), pixels, x right, y down; NaN for missing.
         image_size: (width, height) of all photographs, or one for each.
         images: the photographs, (3,H,W) each, for the head's skin; see ``photographed_skin``.
-        landmark_vertices: of the 68, (68,); the rig's annotated ones, or the model's, if absent.
         camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as exact unless
             ``settings.focal_deviation`` gives its deviation. Estimated if absent.
-        settings: the noise of landmarks; see ``FitSettings``.
-        transfers: how often shapes are transferred to the head found; 0 keeps the template's.
-        texture_size: of the skin, texels a side; 0 makes no texture.
-        masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
+        settings: the noise of landmarks, transfers of shapes, the skin; see ``FitSettings``.
         progress: called with each step and how far it is.
 
     Returns:
@@ -121,13 +113,13 @@ def fit_images(
         >>> model, rig = zoo.get_model("head"), performer(texture=False).select(["jawOpen"])
         >>> points = model.template().vertices[rig.neutral.landmarks].double()
         >>> camera = look_at(points.mean(0), yaw=20.0, width=600, height=800)
-        >>> fit = fit_images(model, rig, camera.project(points)[None], (600, 800), transfers=0)
+        >>> fit = fit_images(model, rig, camera.project(points)[None], (600, 800), settings=FitSettings(transfers=0))
         >>> fit.errors.item() < 5  # pixels
         True
     """
     progress = progress or silent
     rig = rig.linear("fit_images")
-    vertices = checked_landmark_vertices(model, rig, landmark_vertices)
+    vertices = checked_landmark_vertices(model, rig)
     sizes = checked_sizes(landmarks, image_size)
     if images is not None:
         check_images(images, sizes)
@@ -149,8 +141,8 @@ def fit_images(
     )
     progress("fitting identity and expression")
     problem, state = solve_either(problem, initial)
-    for number in range(transfers):
-        progress("transferring the shapes that show", number, transfers)
+    for number in range(settings.transfers):
+        progress("transferring the shapes that show", number, settings.transfers)
         weights = state.coefficients[len(modes) :].float()
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)
@@ -161,7 +153,7 @@ def fit_images(
     if images is None:
         return fit
     progress("laying the photographs on the head")
-    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, texture_size, masked)
+    skin = photographed_skin(fit.posed, model.color, images, fit.cameras, settings.texture_size, settings.masked)
     return replace(fit, mesh=skin.on(fit.mesh), posed=skin.on(fit.posed), color=skin.fit)
 
 

@@ -20,8 +20,8 @@ _FOCAL, _FOCAL_DEVIATION = 1.5, 0.3  # of the longer side: what is assumed where
 _INSIDE = 0.5
 
 
-def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig, landmark_vertices: Tensor | None) -> Tensor:
-    """The landmark vertices (68,).
+def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig) -> Tensor:
+    """The landmark vertices (68,), of the rig, or of the model where the rig has none.
 
     Raises:
         TopologyError: model and rig have other triangles, or a vertex is none of theirs.
@@ -34,24 +34,19 @@ def checked_landmark_vertices(model: HeadModel, rig: BlendshapeRig, landmark_ver
             f"fit_images: found a model of {len(model.shape.mean)} vertices and {len(model.faces)} triangles for a rig "
             f"of {len(rig.vertices)} and {len(faces)}, expected the same triangles"
         )
-    if landmark_vertices is None:
-        annotated = rig.neutral.annotations.landmarks if rig.neutral.annotations is not None else None
-        landmark_vertices = model.landmarks if annotated is None else annotated
-    if landmark_vertices is None:
-        raise ValueRangeError(
-            "landmark_vertices: found none, neither given nor annotated on rig or model; expected (68,) vertex ids"
-        )
-    if landmark_vertices.shape != (LANDMARKS,) or landmark_vertices.dtype != torch.int64:
+    annotated = rig.neutral.annotations.landmarks if rig.neutral.annotations is not None else None
+    found = model.landmarks if annotated is None else annotated
+    if found is None:
+        raise ValueRangeError("landmarks: found none annotated on rig or model; expected (68,) vertex ids")
+    if found.shape != (LANDMARKS,) or found.dtype != torch.int64:
         raise ShapeError(
-            f"landmark_vertices: found {tuple(landmark_vertices.shape)} of {landmark_vertices.dtype}, expected "
-            f"({LANDMARKS},) of torch.int64"
+            f"landmarks: found {tuple(found.shape)} of {found.dtype}, expected ({LANDMARKS},) of torch.int64"
         )
-    if not 0 <= int(landmark_vertices.min()) <= int(landmark_vertices.max()) < len(rig.vertices):
+    if not 0 <= int(found.min()) <= int(found.max()) < len(rig.vertices):
         raise TopologyError(
-            f"landmark_vertices: found {int(landmark_vertices.min())} to {int(landmark_vertices.max())}, expected 0 "
-            f"to {len(rig.vertices) - 1}"
+            f"landmarks: found {int(found.min())} to {int(found.max())}, expected 0 to {len(rig.vertices) - 1}"
         )
-    return landmark_vertices.cpu()
+    return found.cpu()
 
 
 def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tuple[int, int]]) -> Tensor:

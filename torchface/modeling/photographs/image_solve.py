@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.geometry.cameras.pinhole import MAX_SIDE
 from torchface.modeling.photographs.landmark_view import (
     JAW,
     Linearised,
@@ -27,7 +28,7 @@ _MIN_NOISE = 1e-5  # of the focal length: finer than any landmark is found
 
 @dataclass(frozen=True)
 class FitSettings:
-    """The noise of landmarks, and the priors on faces.
+    """The noise of landmarks, the priors on faces, and what is made of them.
 
     Args:
         inner_weight: of a squared error at brows, eyes, nose and mouth beside one at the contour.
@@ -44,6 +45,9 @@ class FitSettings:
         focal_deviation: relative deviation of the true focal length from the given one; 0 takes it as exact.
         shared_focal: one focal length for all photographs.
         max_iterations: of Gauss-Newton.
+        transfers: how often shapes are transferred to the head found; 0 keeps the template's.
+        texture_size: of the skin, texels a side; 0 makes no texture.
+        masked: only skin and the face's features are laid on the head; see ``photographed_skin``.
 
     Raises:
         ValueRangeError: a setting is NaN, infinite or out of its range.
@@ -64,6 +68,9 @@ class FitSettings:
     focal_deviation: float = 0.0
     shared_focal: bool = True
     max_iterations: int = 20
+    transfers: int = 1
+    texture_size: int = 1024
+    masked: bool = True
 
     def __post_init__(self) -> None:
         for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):
@@ -73,6 +80,8 @@ class FitSettings:
         checked_number("contour_slide", self.contour_slide, 0.0, 1.0)
         checked_number("focal_deviation", self.focal_deviation)
         checked_count("max_iterations", self.max_iterations, 1)
+        checked_count("transfers", self.transfers)
+        checked_count("texture_size", self.texture_size, 0, MAX_SIDE)
 
 
 @dataclass(frozen=True, eq=False)

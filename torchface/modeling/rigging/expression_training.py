@@ -24,15 +24,44 @@ _CHOSEN_FROM = 300
 _MOVES = 0.05
 
 
+@dataclass(frozen=True)
+class ExpressionSettings:
+    """How many components an expression regression has, how strongly they are held down, and what it predicts.
+
+    Args:
+        neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
+            has them chosen by leaving out one person after the other.
+        ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
+        form: "offsets" (equation 32) or "expressions" (equation 31).
+
+    Raises:
+        ValueRangeError: no component, or a negative ridge.
+
+    Example:
+        >>> ExpressionSettings(neutral_components=None).offset_components
+        13
+    """
+
+    neutral_components: int | None = NEUTRAL_COMPONENTS
+    offset_components: int | None = OFFSET_COMPONENTS
+    ridge: float | None = 0.0
+    form: Form = "offsets"
+
+    def __post_init__(self) -> None:
+        for what in ("neutral_components", "offset_components"):
+            found = getattr(self, what)
+            if found is not None and found < 1:
+                raise ValueRangeError(f"{what}: found {found}, expected 1 at least")
+        if self.ridge is not None and not 0 <= self.ridge < float("inf"):
+            raise ValueRangeError(f"ridge: found {self.ridge}, expected a finite number of at least 0")
+
+
 def fit_expressions(
     neutrals: Tensor,
     expressions: Tensor,
-    neutral_components: int | None = NEUTRAL_COMPONENTS,
-    offset_components: int | None = OFFSET_COMPONENTS,
-    ridge: float | None = 0.0,
+    settings: ExpressionSettings = ExpressionSettings(),
     names: Sequence[str] | None = None,
     topology: str | None = None,
-    form: Form = "offsets",
     region: Tensor | None = None,
 ) -> ExpressionRegression:
     """Learns from people in correspondence, each with a neutral face and the same expressions.
@@ -40,18 +69,15 @@ def fit_expressions(
     Args:
         neutrals: (M,V,3), millimetres, in any pose.
         expressions: (M,N,V,3), each person's in the space of his or her own neutral.
-        neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
-            has them chosen by leaving out one person after the other.
-        ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
+        settings: how many components, and what they predict.
         names: of the expressions; ``expression0``, ... if absent.
         topology: ``Mesh.fingerprint()`` of the faces.
-        form: "offsets" (equation 32) or "expressions" (equation 31).
         region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
             most in some expression, if absent; all of them for the form "expressions", as in the thesis.
 
     Raises:
         ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
-        ValueRangeError: NaN or infinity, neutrals that are all the same, or a negative ridge.
+        ValueRangeError: NaN or infinity, or neutrals that are all the same.
         NameMismatchError: not one name an expression, or one twice.
 
     Example:
@@ -64,28 +90,16 @@ def fit_expressions(
     """
     names = [f"expression{i}" for i in range(expressions.shape[1])] if names is None else list(names)
     _check_examples(neutrals, expressions, names)
-    return fit_expression_samples(
-        SamplesInMemory(neutrals),
-        SamplesInMemory(expressions.flatten(1, 2)),
-        names,
-        neutral_components,
-        offset_components,
-        ridge,
-        topology,
-        form,
-        region,
-    )
+    samples = SamplesInMemory(neutrals), SamplesInMemory(expressions.flatten(1, 2))
+    return fit_expression_samples(*samples, names, settings, topology, region)
 
 
 def fit_expression_samples(
     neutrals: Samples,
     expressions: Samples,
     names: Sequence[str],
-    neutral_components: int | None = NEUTRAL_COMPONENTS,
-    offset_components: int | None = OFFSET_COMPONENTS,
-    ridge: float | None = 0.0,
+    settings: ExpressionSettings = ExpressionSettings(),
     topology: str | None = None,
-    form: Form = "offsets",
     region: Tensor | None = None,
     progress: Progress | None = None,
 ) -> ExpressionRegression:
@@ -114,11 +128,8 @@ def fit_expression_samples(
         True
     """
     progress = progress or silent
-    for what, found in (("neutral_components", neutral_components), ("offset_components", offset_components)):
-        if found is not None and found < 1:
-            raise ValueRangeError(f"{what}: found {found}, expected 1 at least")
-    if ridge is not None and not 0 <= ridge < float("inf"):
-        raise ValueRangeError(f"ridge: found {ridge}, expected a finite number of at least 0")
+    form, ridge = settings.form, settings.ridge
+    neutral_components, offset_components = settings.neutral_components, settings.offset_components
     progress("laying the neutrals on each other")
     mean, poses = laid_together(neutrals)
     predicted = Predicted(neutrals, expressions, poses, form)

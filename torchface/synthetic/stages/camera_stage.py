@@ -124,9 +124,8 @@ def record_session(
         frames=len(performance.weights),
         performed=performance.performed,
     )
-    frames = render_video(
-        rig, performance.weights, paint, attachment, camera, rotation, translation, settings.flaws, generator
-    )
+    scene = HeadCameraRenderer(rig, paint, attachment)
+    frames = render_video(scene, performance.weights, camera, rotation, translation, settings.flaws, generator)
     frames = _counted(frames, len(performance.weights), progress or silent)
     video = write_video(frames, folder / f"{name}.avi", performance.fps)
     take_path, labels_path = folder / f"{name}.c3d", folder / f"{name}.toml"
@@ -208,10 +207,8 @@ def _region_vertices() -> dict[str, Tensor]:
 
 
 def render_video(
-    rig: BlendshapeRig,
+    scene: HeadCameraRenderer,
     weights: Tensor,
-    paint: Tensor,
-    attachment: Attachment,
     camera: Camera,
     rotation: Tensor,
     translation: Tensor,
@@ -223,10 +220,8 @@ def render_video(
     The light sits round the lens: skin scatters it, paint throws much of it back, markers all of it.
 
     Args:
-        rig: a performer with skin.
+        scene: the performer with skin, paint and markers.
         weights: (T,N).
-        paint: where paint is, (size,size).
-        attachment: of the markers.
         camera: intrinsics and size.
         rotation, translation: world to camera in each frame, (T,3,3) and (T,3).
         flaws: of the camera.
@@ -239,7 +234,6 @@ def render_video(
         raise ShapeError(
             f"video: found {len(weights)} frames of weights and {len(rotation)} of camera, expected as many"
         )
-    scene = HeadCameraRenderer(rig, paint, attachment)
     _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
     shape = ways.shape[:2]
     shade = _vignette(shape, flaws.vignette)

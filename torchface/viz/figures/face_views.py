@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import CLAY, DEFAULT_LIGHTING, Lighting, render
-from torchface.rendering.compositing import caption, from_figure, heat_colors, sheet
+from torchface.rendering.compositing import from_figure, heat_colors, sheet
 from torchface.viz.figures.region_colors import as_seen
 
 __all__ = ["face_views", "frame_face", "heat_map"]
@@ -57,7 +57,6 @@ def face_views(
     mesh: Mesh,
     yaws: Sequence[float] = (FRONT, THREE_QUARTER, PROFILE),
     colors: Tensor | None = None,
-    title: str | None = None,
     width: int = 400,
     height: int = 500,
     samples: int = 2,
@@ -74,8 +73,7 @@ def face_views(
     """
     cameras = [frame_face(framed_by or mesh, yaw, width=width, height=height) for yaw in yaws]
     seen = as_seen(mesh)
-    row = sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
-    return row if title is None else caption(row, title)
+    return sheet([render(seen, camera, colors, lighting, samples=samples) for camera in cameras], len(cameras))
 
 
 def heat_map(mesh: Mesh, values: Tensor, maximum: float, label: str, width: int = 400, height: int = 500) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.geometry.cameras.pinhole import MAX_SIDE
 from torchface.io import save_calibration, save_rig
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import save_pts
@@ -29,6 +28,39 @@ from torchface.workflows.fit.found_landmarks import DEFAULT_LANDMARKS, Photograp
 from torchface.workflows.fit.given_landmarks import check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
+
+
+@dataclass(frozen=True)
+class PhotographSettings:
+    """What a fit to photographs on disk may be told besides the photographs.
+
+    Args:
+        fit: the noise of landmarks, the priors on faces, the skin.
+        template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
+            topology is the model's.
+        part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
+        focal: length in pixels, if given.
+        face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
+        landmark_model: finds landmarks where no file gives them; by name or folder.
+        names: of the written shapes; see ``rig_names.renamed``.
+        insist: also where photographs do not seem to show one person.
+
+    Raises:
+        ValueRangeError: ``face`` is no whole number from 0 on.
+    """
+
+    fit: FitSettings = field(default_factory=FitSettings)
+    template: Path | None = None
+    part: str | None = None
+    focal: float | None = None
+    face: int | None = None
+    landmark_model: str | Path = DEFAULT_LANDMARKS
+    names: Naming | None = None
+    insist: bool = False
+
+    def __post_init__(self) -> None:
+        if self.face is not None:
+            checked_count("face", self.face)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +110,8 @@ def fit_photographs(
     landmarks: Sequence[Path],
     model: str | Path,
     out: Path,
-    template: Path | None = None,
-    focal: float | None = None,
-    settings: FitSettings | None = None,
-    face: int | None = None,
-    texture_size: int = 1024,
+    settings: PhotographSettings = PhotographSettings(),
     progress: Progress | None = None,
-    landmark_model: str | Path = DEFAULT_LANDMARKS,
-    names: Naming | None = None,
-    part: str | None = None,
-    everything: bool = False,
-    insist: bool = False,
 ) -> FittedHead:
     """Fits a head to photographs of one person with one expression and writes it as a rig.
 
@@ -98,18 +121,8 @@ def fit_photographs(
             where there are none they are found, and written as .pts beside ``out``.
         model: a head model by name or folder; see ``zoo.get_model``.
         out: the ``.glb`` or folder to write, see ``save_rig``; overlays are written beside it.
-        template: a rig with the model's topology; the model's own if absent, else the embedded performer where its
-            topology is the model's.
-        focal: length in pixels, if given.
-        settings: the noise of landmarks.
-        face: which of several, from 0: in the order of an XML, or where landmarks are found the largest first.
-        texture_size: texels a side; 0 makes no texture.
+        settings: whose shapes, which lens, which face of several.
         progress: called with each step and how far it is.
-        landmark_model: finds landmarks where no file gives them; by name or folder.
-        names: of the written shapes; see ``rig_names.renamed``.
-        part: an annotated region that template and model are cut to, such as ``"face"`` of an ICT head.
-        everything: lay also hair, clothes and what stands behind on the head, not skin and features alone.
-        insist: also where photographs do not seem to show one person.
 
     Raises:
         AlignmentError: photographs show different people.
@@ -121,44 +134,31 @@ def fit_photographs(
     """
     progress = progress or silent
     check_out(out)
-    checked_count("texture_size", texture_size, 0, MAX_SIDE)
-    if face is not None:
-        checked_count("face", face)
     progress("reading the model")
-    heads, rig = matching(load_head_model(model), template, part)
+    heads, rig = matching(load_head_model(model), settings.template, settings.part)
     progress(f"reading {len(photographs)} photographs")
     images = [load_image(path) for path in photographs]
     found: list[PhotographLandmarks] = []
     if landmarks or not photographs:
-        marks = torch.stack(landmarks_of(photographs, landmarks, face))
+        marks = torch.stack(landmarks_of(photographs, landmarks, settings.face))
         for photograph in photographs:
             warn_if_stored_turned(photograph)
     else:
         progress(f"finding the landmarks of {len(photographs)} photographs")
-        found = find_in_photographs(photographs, images, landmark_model, face)
+        found = find_in_photographs(photographs, images, settings.landmark_model, settings.face)
         marks = torch.stack([one.confident for one in found])
     sizes = [(image.shape[2], image.shape[1]) for image in images]
     check_inside(photographs, marks, sizes)
 
     def bare(points: Tensor, rows: list[int]) -> ImageFit:
         some = [sizes[row] for row in rows]
-        return fit_images(heads, rig, points, some, camera=focal, settings=settings, transfers=0)
+        unmoved = replace(settings.fit, transfers=0)
+        return fit_images(heads, rig, points, some, camera=settings.focal, settings=unmoved)
 
-    remarks = one_person_lines(photographs, marks, bare, insist)
-    fit = fit_images(
-        heads,
-        rig,
-        marks,
-        sizes,
-        images,
-        camera=focal,
-        settings=settings,
-        texture_size=texture_size,
-        masked=not everything,
-        progress=progress,
-    )
+    remarks = one_person_lines(photographs, marks, bare, settings.insist)
+    fit = fit_images(heads, rig, marks, sizes, images, settings.focal, settings.fit, progress)
     if not found:
-        remarks += landmark_lines(photographs, images, marks, fit, landmark_model, bare)
+        remarks += landmark_lines(photographs, images, marks, fit, settings.landmark_model, bare)
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(rig.neutral, torch.zeros(len(rig.vertices), dtype=torch.bool))
     worn = dressed_as(fit.mesh, rig.neutral, unseen)
@@ -166,7 +166,7 @@ def fit_photographs(
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
     with all_or_none():
-        save_rig(renamed(transferred.rig, names), out)
+        save_rig(renamed(transferred.rig, settings.names), out)
         for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
             save_rendered_image(overlay(fit, i, image, marks[i]), path)
         for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
