@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import pickle
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from torchface.optim import BoxQP, box_qp
-from torchface.optim.compiled_program import CompiledProgram, compiled_solver_installed
+from torchface.optim.compiled_program import compiled_solver_installed
+from torchface.optim.prepared_program import PreparedProgram
 
 SIZE = 30
 
@@ -38,7 +37,7 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
             "torchface.optim.single_program.SingleProgram.solve", lambda *_: pytest.fail("not compiled")
         )
         return request.param
-    monkeypatch.setattr(importlib.import_module("torchface.optim.box_qp"), "compiled_solver_installed", lambda: False)
+    monkeypatch.setattr("torchface.optim.prepared_program.compiled_solver_installed", lambda: False)
     if request.param != "numpy":
         monkeypatch.setattr("torchface.optim.single_program.SingleProgram.solve", lambda *_: None)
     return request.param
@@ -58,6 +57,7 @@ def test_frames_one_at_a_time_are_those_of_the_batch(program: tuple[Tensor, Tens
         assert float(strange.max()) <= 1
         torch.testing.assert_close(strange.double(), whole[row : row + 1], rtol=0, atol=2e-3)
     torch.testing.assert_close(qp(f[:5]), whole[:5], rtol=0, atol=1e-8)
+    torch.testing.assert_close(qp(f[5:6]), whole[5:6], rtol=0, atol=1e-8)
 
 
 @pytest.mark.usefixtures("way")
@@ -77,12 +77,16 @@ def test_a_program_is_copied_and_pickled_without_what_is_compiled(program: tuple
         torch.testing.assert_close(other(f[1:2]), whole[1:2], rtol=0, atol=1e-8)
 
 
-def test_no_number_and_no_tolerance_are_left_to_the_batch(program: tuple[Tensor, Tensor, Tensor]) -> None:
+@pytest.mark.parametrize("way", [False, True])
+def test_no_number_and_no_tolerance_are_left_to_the_batch(
+    program: tuple[Tensor, Tensor, Tensor], way: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     H, f, _ = program
-    if not compiled_solver_installed():
+    if way and not compiled_solver_installed():
         pytest.skip("daqp is not installed")
-    compiled = CompiledProgram(H.numpy(), H.diagonal().numpy())
-    zeros, ones = np.zeros(SIZE), np.ones(SIZE)
-    assert compiled.solve(np.full(SIZE, np.nan), zeros, ones, 1e-9) is None
-    assert compiled.solve(f[0].numpy(), zeros, ones, 0.0) is None
-    assert compiled.solve(f[0].numpy(), zeros, ones, 1e-9) is not None
+    monkeypatch.setattr("torchface.optim.prepared_program.compiled_solver_installed", lambda: way)
+    alone = PreparedProgram.of(H, 0.0, 1.0)
+    assert alone.solved_singly(torch.full((1, SIZE), torch.nan, dtype=torch.float64), None, 1e-9) is None
+    assert alone.solved_singly(f[:1], torch.full_like(f[:1], torch.nan), 0.0) is None
+    assert alone.solved_singly(f[:1], None, 0.0) is None
+    assert alone.solved_singly(f[:1], None, 1e-9) is not None

@@ -70,17 +70,22 @@ class BoxProblem:
 
     def unsolved(self, x: Tensor, tolerance: float, gradient: Tensor | None = None) -> Tensor:
         """Where a residual exceeds both the tolerance and what rounding alone can leave of it, (B,) bool."""
+        gradient = self.gradient(x) if gradient is None else gradient
         residuals = self.residuals(x, gradient)
         open_ = residuals.amax(-1) > tolerance
-        if not bool(open_.any()):
+        rows = open_.nonzero()[:, 0]
+        if not len(rows):
             return open_
-        gradient = self.gradient(x) if gradient is None else gradient
-        sums = BoxProblem(self.H.abs(), self.f.abs(), self.lower, self.upper, self.diagonal).gradient(x.abs())
+        part = self
+        if len(rows) < len(x):
+            part, x, gradient, residuals = self.rows(rows), x[rows], gradient[rows], residuals[rows]
+        sums = BoxProblem(part.H.abs(), part.f.abs(), part.lower, part.upper, part.diagonal).gradient(x.abs())
         rounding = 4 * torch.finfo(x.dtype).eps * sums
-        above = residuals > (rounding / self.diagonal / (1 + x.abs())).clamp(min=tolerance)
+        above = residuals > (rounding / part.diagonal / (1 + x.abs())).clamp(min=tolerance)
         # What rounding may have added to a steep gradient is longer than a box, and its sign still certain.
-        certain = self.residuals(x, gradient.sign() * (gradient.abs() - rounding).clamp(min=0)) > tolerance
-        return (above | certain).any(-1)
+        certain = part.residuals(x, gradient.sign() * (gradient.abs() - rounding).clamp(min=0)) > tolerance
+        open_[rows] = (above | certain).any(-1)
+        return open_
 
 
 def check_box(name: str, lower: Tensor, upper: Tensor) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from torchface.optim.single_program import SingleProgram
 from torchface.optim.warm_active_set import Array
 
 # What DAQP takes for no bound.
@@ -23,62 +24,54 @@ def compiled_solver_installed() -> bool:
 
 
 class CompiledProgram:
-    """H (N,N), factored once; each call starts from the active set of the one before.
+    """H (N,N), factored once, and bounds (N,); each call starts from the active set of the one before.
 
     Args:
         H: symmetric, positive semidefinite, float64.
-        diagonal: its metric, (N,).
+        lower, upper: float64.
+        other: what solves where this does not.
     """
 
-    def __init__(self, H: Array, diagonal: Array) -> None:
-        self.H, self.diagonal = H, diagonal
+    def __init__(self, H: Array, lower: Array, upper: Array, other: SingleProgram) -> None:
+        self.H, self.lower, self.upper, self.other = H, lower, upper, other
         self._model: Any = None
-        self._box = b""
         # A model works in memory of its own, and lets other threads run meanwhile.
         self._free = Lock()
 
-    def __reduce__(self) -> tuple[type[CompiledProgram], tuple[Array, Array]]:
-        return CompiledProgram, (self.H, self.diagonal)
+    def __reduce__(self) -> tuple[type[CompiledProgram], tuple[Array, Array, Array, SingleProgram]]:
+        return CompiledProgram, (self.H, self.lower, self.upper, self.other)
 
-    def solve(self, f: Array, lower: Array, upper: Array, tolerance: float) -> Array | None:
+    def solve(self, f: Array, start: Array | None, tolerance: float) -> Array | None:
         """The minimiser (N,) where it is found to the tolerance on the residual of ``box_qp``.
 
         Args:
             f: (N,), float64.
-            lower, upper: (N,), float64.
+            start: such as the frame before, (N,), where the other solver has to help.
             tolerance: 0 finds none.
         """
-        slope = f @ f
-        if not slope <= _NO_BOUND or not self._free.acquire(blocking=False):  # nor is NaN
-            return None
-        try:
-            x = self._minimiser(f, lower, upper)
-        finally:
-            self._free.release()
-        if x is None:
-            return None
-        x = np.minimum(np.maximum(x, lower), upper)
-        step = self.H @ x
-        step += f
-        step /= self.diagonal
-        np.subtract(x, step, out=step)
-        np.maximum(step, lower, out=step)
-        np.minimum(step, upper, out=step)
-        step -= x
-        return x if step @ step <= tolerance**2 else None
+        x = None
+        if f @ f <= _NO_BOUND and self._free.acquire(blocking=False):  # nor is NaN
+            try:
+                x = self._minimiser(f)
+            finally:
+                self._free.release()
+        if x is not None:
+            x = np.minimum(np.maximum(x, self.lower), self.upper)
+            if self.other.scaled.residual(x, f) <= tolerance:
+                return x
+        return self.other.solve(f, start, tolerance)
 
-    def _minimiser(self, f: Array, lower: Array, upper: Array) -> Array | None:
-        box = lower.tobytes() + upper.tobytes()
-        if box == self._box:
-            self._model.update(f=f)
-        else:
+    def _minimiser(self, f: Array) -> Array | None:
+        if self._model is None:
             import daqp
 
             size = len(f)
-            bounds = (np.clip(bound, -_NO_BOUND, _NO_BOUND) for bound in (upper, lower))
-            self._box, self._model = b"", daqp.Model()
-            if self._model.setup(self.H, f, np.zeros((0, size)), *bounds, np.zeros(size, np.int32))[0] < 0:
+            bounds = (np.clip(bound, -_NO_BOUND, _NO_BOUND) for bound in (self.upper, self.lower))
+            model = daqp.Model()
+            if model.setup(self.H, f, np.zeros((0, size)), *bounds, np.zeros(size, np.int32))[0] < 0:
                 return None
-            self._box = box
+            self._model = model
+        else:
+            self._model.update(f=f)
         x, _, solved, _ = self._model.solve()
         return x if solved > 0 else None

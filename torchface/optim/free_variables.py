@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 import torch
 from scipy.linalg.lapack import dposv
 from torch import Tensor
 from torch.nn.functional import pad
 
-# Numbers in the matrices factored at once: 1 MB of float64 stays near a CPU's second-level cache; an accelerator wants
-# more.
-_CHUNK_NUMBERS = {"cpu": 2**17, "other": 2**25}
+Array: TypeAlias = "np.ndarray"
+
+# Numbers in the matrices that an accelerator factors at once.
+_CHUNK_NUMBERS = 2**25
 # Added to the scaled diagonal, so that semidefinite blocks factor; raised a thousandfold where they do not.
 _RIDGE = 1e-13
 _RIDGE_TRIES = 5
@@ -19,8 +22,6 @@ _RIDGE_TRIES = 5
 def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping: Tensor | None = None) -> Tensor:
     r"""Solves :math:`(H_{FF} + \delta D) x_F = b_F` with :math:`x = 0` elsewhere.
 
-    Problems are sorted by how many variables are free, so that those factored together are of nearly one size.
-
     Args:
         H: (N,N) or (B,N,N), positive semidefinite, float64.
         diagonal: the metric in which it is scaled, (N,) or (B,N).
@@ -28,33 +29,60 @@ def solve_free(H: Tensor, diagonal: Tensor, free: Tensor, right: Tensor, damping
         right: :math:`b`, (B,N).
         damping: :math:`\delta`, (B,); none if absent.
     """
-    size = H.shape[-1] + 1
     scale = diagonal.rsqrt()
+    scaled = H * scale[..., :, None] * scale[..., None, :]
+    ridge = right.new_full((len(right),), _RIDGE) if damping is None else damping.clamp(min=_RIDGE)
+    solve = _solved_one_by_one if right.device.type == "cpu" else _solved_at_once
+    return solve(scaled, free, right * scale, ridge) * scale
+
+
+def _solved_one_by_one(scaled: Tensor, free: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
+    """By NumPy and LAPACK: torch's batched factorisation goes one by one too, and more slowly."""
+    found = torch.zeros_like(right)
+    every = scaled.numpy() if scaled.ndim == 3 else [scaled.numpy()] * len(right)
+    rows = zip(every, free.numpy(), right.numpy(), found.numpy(), ridge.tolist(), strict=True)
+    for matrix, taken, side, solution, lift in rows:
+        ids = taken.nonzero()[0]
+        if len(ids):
+            solution[ids] = _solution(matrix, ids, side, lift)
+    return found
+
+
+def _solution(matrix: Array, ids: Array, side: Array, ridge: float) -> Array:
+    """Of one system, of some variables; with a greater ridge where it does not factor."""
+    for _ in range(1 + _RIDGE_TRIES):
+        block = matrix.take(ids, 0).take(ids, 1)
+        block.ravel()[:: len(ids) + 1] += ridge
+        _, x, failed = dposv(block.T, side.take(ids), lower=1, overwrite_a=1, overwrite_b=1)
+        if not failed:
+            break
+        ridge = max(1e3 * ridge, 1e3 * _RIDGE)
+    return x
+
+
+def _solved_at_once(scaled: Tensor, free: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
+    """Problems are sorted by how many variables are free, so that those factored together are of nearly one size."""
+    size = scaled.shape[-1] + 1
     # A row and a column of zeros pad the blocks of problems with fewer free variables.
-    scaled = pad(H * scale[..., :, None] * scale[..., None, :], (0, 1, 0, 1))
-    wide = pad(right * scale, (0, 1))
+    scaled, wide = pad(scaled, (0, 1, 0, 1)), pad(right, (0, 1))
     counts, order = free.sum(-1).sort(descending=True)
     most = counts.tolist()
-    numbers = _CHUNK_NUMBERS.get(H.device.type, _CHUNK_NUMBERS["other"])
     solved = torch.zeros_like(wide)
     first = 0
     while first < len(most) and most[first]:
-        last = first + max(1, numbers // most[first] ** 2)
+        last = first + max(1, _CHUNK_NUMBERS // most[first] ** 2)
         rows = order[first:last]
         ids = _free_ids(free[rows], counts[first:last], most[first])
         places = ids[:, :, None] * size + ids[:, None, :]
-        matrices = scaled if H.ndim == 2 else scaled[rows]
-        if H.ndim == 3:
+        matrices = scaled if scaled.ndim == 2 else scaled[rows]
+        if scaled.ndim == 3:
             places += (torch.arange(len(rows), device=rows.device) * size**2)[:, None, None]
-        # Over twice as quick as ``take``, and quicker still for short integers.
-        places = places.int() if matrices.numel() < 2**31 else places
         block = matrices.view(-1).index_select(0, places.view(-1)).view_as(places)
-        ridge = _RIDGE if damping is None else damping[rows, None].clamp(min=_RIDGE)
-        block.diagonal(dim1=-2, dim2=-1).add_(torch.where(ids == size - 1, 1.0, ridge))
+        block.diagonal(dim1=-2, dim2=-1).add_(torch.where(ids == size - 1, 1.0, ridge[rows, None]))
         x = _factored_solve(block, wide[rows].gather(1, ids))
         solved[rows] = torch.zeros_like(wide[: len(rows)]).scatter_(1, ids, x)
         first = last
-    return solved[:, :-1] * scale
+    return solved[:, :-1]
 
 
 def _free_ids(free: Tensor, counts: Tensor, size: int) -> Tensor:
@@ -68,27 +96,9 @@ def _free_ids(free: Tensor, counts: Tensor, size: int) -> Tensor:
 
 
 def _factored_solve(block: Tensor, right: Tensor) -> Tensor:
-    """Solves a system each, (B,S), of blocks (B,S,S), which it may overwrite."""
-    if block.device.type != "cpu":
-        factor, failures = torch.linalg.cholesky_ex(block)
-        return _lifted_solve(block, right, torch.cholesky_solve(right[..., None], factor)[..., 0], failures > 0)
-    diagonal = block.diagonal(dim1=1, dim2=2).clone()
-    vectors = right.numpy()
-    found, info = np.empty_like(vectors), np.zeros(len(vectors), dtype=bool)
-    # One by one: torch's batched factorisation does so too, and twice as slowly.
-    for row, (matrix, vector) in enumerate(zip(block.numpy(), vectors, strict=True)):
-        _, found[row], code = dposv(matrix.T, vector, lower=1, overwrite_a=1)
-        info[row] = code > 0
-    solved, failed = torch.from_numpy(found), torch.from_numpy(info)
-    if failed.any():
-        # The factor lies in the upper triangle.
-        block = block.tril(-1)
-        block = block + block.mT + diagonal.diag_embed()
-    return _lifted_solve(block, right, solved, failed)
-
-
-def _lifted_solve(block: Tensor, right: Tensor, solved: Tensor, failed: Tensor) -> Tensor:
-    """Solves with a ridge where factoring failed."""
+    """Solves a system each, (B,S), of blocks (B,S,S); with a ridge where factoring fails."""
+    factor, failures = torch.linalg.cholesky_ex(block)
+    solved, failed = torch.cholesky_solve(right[..., None], factor)[..., 0], failures > 0
     ridge = _RIDGE
     for _ in range(_RIDGE_TRIES):
         rows = failed.nonzero()[:, 0]

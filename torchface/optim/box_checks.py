@@ -1,0 +1,107 @@
+"""Checks of box-constrained quadratic programs: what does not fit, is not finite, or has no minimum."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import checked_number
+from torchface.optim.box_problem import BoxProblem, check_box, metric
+
+TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
+# A tolerance above it calls nearly every start a solution.
+_COARSEST = 0.5
+# The residual is relative to x and so falls where x runs away. It has, where x is this many times farther than each
+# variable alone would go, or where the residual itself is still this share of that way.
+_RUN_AWAY, _STILL_MOVING = 1e9, 1e-2
+# Bounds within it end any run before the residual, relative to x, can call it solved.
+_NEAR_BOUND = 1e3
+# Splitting runs in float32, whose numbers end at 3e38.
+_STEEPEST = 1e30
+
+
+def checked_hessian(H: Tensor) -> Tensor:
+    """The symmetric part of H in float64, after every check that needs no f."""
+    if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0:
+        raise ShapeError(f"box_qp: found H {tuple(H.shape)}, expected (N,N) or (B,N,N)")
+    if H.dtype not in TOLERANCE:
+        raise ValueRangeError(f"box_qp: found H of {H.dtype}, expected float32 or float64")
+    exact = H.detach().double()
+    if not torch.isfinite(exact).all():
+        raise ValueRangeError("box_qp: H holds NaN or infinite entries, expected finite ones")
+    precision = torch.finfo(H.dtype).eps * H.shape[-1]
+    largest = exact.abs().amax((-1, -2)) if exact.numel() else exact.new_zeros(len(exact))
+    skew = (exact - exact.transpose(-1, -2)).abs().amax((-1, -2)) if exact.numel() else largest
+    if (skew > 100 * precision * largest).any():
+        raise ValueRangeError(
+            f"box_qp: H is not symmetric: entries differ from their mirror images by up to {float(skew.max()):.3g}"
+        )
+    exact = 0.5 * (exact + exact.transpose(-1, -2))
+    scale = metric(exact).rsqrt()
+    lifted = exact * scale[..., :, None] * scale[..., None, :]
+    lifted.diagonal(dim1=-2, dim2=-1).add_(100 * precision)
+    if (torch.linalg.cholesky_ex(lifted)[1] > 0).any():
+        least = float(torch.linalg.eigvalsh(exact).min())
+        raise ValueRangeError(
+            f"box_qp: H is not positive semidefinite: found the eigenvalue {least:.3g}, expected none below 0"
+        )
+    return exact
+
+
+def checked_bounds(lower: float | Tensor, upper: float | Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
+    variables = H.shape[-1]
+    bounds = []
+    for name, bound in (("lower", lower), ("upper", upper)):
+        bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
+        if bound.ndim and bound.shape != (variables,):
+            raise ShapeError(f"box_qp: found {name} {tuple(bound.shape)}, expected a number or ({variables},)")
+        bounds.append(bound.expand(variables).contiguous())
+    low, high = bounds
+    check_box("box_qp", low, high)
+    return low, high
+
+
+def checked_tolerance(tolerance: float | None, dtype: torch.dtype) -> float:
+    return TOLERANCE[dtype] if tolerance is None else checked_number("box_qp: tolerance", tolerance, 0.0, _COARSEST)
+
+
+def check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
+    if f.ndim != 2 or f.shape[1] != H.shape[-1] or (H.ndim == 3 and len(H) != len(f)):
+        wanted = f"({len(H)},{H.shape[-1]})" if H.ndim == 3 else f"(B,{H.shape[-1]})"
+        raise ShapeError(f"box_qp: found f {tuple(f.shape)}, expected {wanted} for H {tuple(H.shape)}")
+    if f.dtype != H.dtype:
+        raise ValueRangeError(f"box_qp: found f of {f.dtype} and H of {H.dtype}, expected the same")
+    if start is not None and start.shape != f.shape:
+        raise ShapeError(f"box_qp: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
+    for name, vectors in (("f", f), ("start", start)):
+        if vectors is not None and not torch.isfinite(vectors).all():
+            bad = (~torch.isfinite(vectors)).any(1).nonzero()[:, 0].tolist()
+            raise ValueRangeError(f"box_qp: {name} holds NaN or infinite entries in rows {bad[:5]}")
+
+
+def check_slope(problem: BoxProblem) -> None:
+    steep = problem.f.abs() > _STEEPEST * problem.diagonal
+    if bool(steep.any()):
+        found = float((problem.f.abs() / problem.diagonal).amax())
+        raise ValueRangeError(
+            f"box_qp: found f {found:.2g} times the diagonal of H, expected at most {_STEEPEST:.0e} times: beyond it "
+            "numbers overflow; is a weight of a term far too large or too small?"
+        )
+
+
+def check_bounded(problem: BoxProblem, x: Tensor) -> None:
+    wide = torch.maximum(problem.lower.abs(), problem.upper.abs()).amax()
+    if wide <= _NEAR_BOUND:
+        return
+    scale = 1 + (problem.f / problem.diagonal).abs().amax(-1)
+    step = x - problem.clip(x - problem.gradient(x) / problem.diagonal)
+    far = torch.where((x > problem.lower) & (x < problem.upper), x.abs(), 0.0).amax(-1)
+    lost = (far > _RUN_AWAY * scale) | (step.abs().amax(-1) > _STILL_MOVING * scale)
+    if lost.any():
+        raise ValueRangeError(
+            f"box_qp: the objective of {int(lost.sum())} problems has no minimum: H is singular, bounds infinite"
+            if torch.isinf(wide)
+            else f"box_qp: the objective of {int(lost.sum())} problems falls farther than numbers carry: H is "
+            f"singular, bounds reach {float(wide):g}; expected bounds near the solutions, or a ridge on H"
+        )
