@@ -1,4 +1,4 @@
-"""What a user installs: the wheel brings the command, the type marker and the zoo, and nothing of tests or recipes."""
+"""What a user installs: the wheel brings the command, the type marker, the zoo and its recipes, nothing of tests."""
 
 import json
 import shutil
@@ -68,12 +68,23 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     assert {top for top in tops if not top.endswith(".dist-info")} == {"torchface"}
     assert "torchface/py.typed" in names
     assert any(name.startswith("torchface/_models/") for name in names)
+    assert "torchface/_train/morphable.py" in names
+    assert not any(name.endswith(".pyc") for name in names)
 
 
 def test_the_command_runs(python: Path, tmp_path: Path) -> None:
     shown = run(python, "import torchface.cli; print(torchface.__file__); torchface.cli.main(['--help'])", tmp_path)
     assert str(python.parent.parent) in shown
     assert "transfer" in shown
+
+
+def test_a_recipe_of_the_wheel_learns(python: Path, tmp_path: Path) -> None:
+    words = ["train", "marker_solver", "--markers", "20", "--frames", "30", "--out", "models/own"]
+    code = f"import sys, torchface.cli; torchface.cli.main({words}); print('train' in sys.modules)"
+    told = run(python, code, tmp_path)
+    assert "mean error of a weight" in told
+    assert told.endswith("False\n")
+    assert (tmp_path / "models" / "own" / "model.toml").is_file()
 
 
 def test_every_model_of_the_zoo_loads(wheel: Path, python: Path, tmp_path: Path) -> None:

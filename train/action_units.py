@@ -1,4 +1,4 @@
-"""``python -m train.action_units --video FILE --labels FILE``: a classifier of action units, of one or more performers.
+"""``torchface train action_units --video FILE --labels FILE``: a classifier of action units, of one or more performers.
 
 The labels say where helmet, markers and regions are in the video, and which units are performed when; levels of
 intensity are found without labels.
@@ -21,7 +21,8 @@ from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
-from train.runner import metric_lines, run
+
+from .runner import Recipe, metric_lines
 
 
 @dataclass(frozen=True)
@@ -163,5 +164,7 @@ def _labels(videos: tuple[Path, ...], paths: tuple[Path, ...]) -> list[ActionLab
     return [load_action_labels(path) for path in paths]
 
 
+RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics, "8.2%"))
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics, "8.2%"))
+    RECIPE.main()

@@ -1,4 +1,4 @@
-"""``python -m train.appearance --data DIR --out models/NAME``: an actor's appearance, to refine landmarks by.
+"""``torchface train appearance --data DIR --out models/NAME``: an actor's appearance, to refine landmarks by.
 
 The folder holds images with a ``.pts`` beside each, as ``torchface annotate`` saves them.
 """
@@ -18,7 +18,8 @@ from torchface.landmarks.images.appearance_level import sample_pixels
 from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
-from train.runner import run
+
+from .runner import Recipe
 
 _OFF = 0.03
 _TO_REST = 0.5
@@ -164,5 +165,7 @@ def _lines(_: Settings, trained: Trained) -> list[str]:
     ]
 
 
+RECIPE = Recipe(Settings, train, __doc__, _lines)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, _lines)
+    RECIPE.main()

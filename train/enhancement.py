@@ -1,4 +1,4 @@
-"""``python -m train.enhancement --frames DIR --out models/NAME``: an actor's fine detail and timing, as captured.
+"""``torchface train enhancement --frames DIR --out models/NAME``: an actor's fine detail and timing, as captured.
 
 ``DIR`` holds sequences from the neutral to an expression and back, all of one topology: folders of OBJ or PLY meshes,
 ``.glb`` animations, ``.npz`` files, and ``neutral.obj``. ``--performer 20000`` learns from the embedded performer with
@@ -19,10 +19,11 @@ from torchface.enhancement.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.progress import Progress, silent
-from train.captured_sequences import Capture, gather, performed, read_capture, read_pairs
-from train.enhancement_figures import draw
-from train.restored_frames import Shown, measured
-from train.runner import metric_lines, run
+
+from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
+from .enhancement_figures import draw
+from .restored_frames import Shown, measured
+from .runner import Recipe, metric_lines
 
 
 @dataclass(frozen=True)
@@ -170,5 +171,9 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
     zoo.save_model(model, settings.out, card, half=("database_features", "region_weights"))
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))
+    RECIPE.main()

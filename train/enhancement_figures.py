@@ -18,7 +18,8 @@ from torchface.progress import Progress
 from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet
 from torchface.viz.figures.face_views import face_views
 from torchface.viz.figures.heat_maps import error_views, round_maximum
-from train.restored_frames import Restored, Shown, restored
+
+from .restored_frames import Restored, Shown, restored
 
 _TRIED = 24  # frames among which the most detailed one is looked for
 _HEIGHT = 420

@@ -1,4 +1,4 @@
-"""``python -m train.expression --pairs DIR --out models/NAME``: expressions predicted from the neutral face.
+"""``torchface train expression --pairs DIR --out models/NAME``: expressions predicted from the neutral face.
 
 ``--performers 60`` learns from so many embedded performers instead, and needs no file.
 """
@@ -20,10 +20,11 @@ from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_exp
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
-from train.expression_table import Comparison, compare, picture
-from train.people_samples import People
-from train.people_samples import gather as gather_people
-from train.runner import run
+
+from .expression_table import Comparison, compare, picture
+from .people_samples import People
+from .people_samples import gather as gather_people
+from .runner import Recipe
 
 _METHOD = "a person's expressions/1"
 # Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
@@ -221,5 +222,9 @@ def _tested(comparison: Comparison | None) -> str:
     )
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda _, trained: [] if trained.comparison is None else [str(trained.comparison)]
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda _, trained: [] if trained.comparison is None else [str(trained.comparison)])
+    RECIPE.main()

@@ -14,7 +14,8 @@ from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
 from torchface.viz.figures.face_views import clay_colors, frame_face
-from train.people_samples import People
+
+from .people_samples import People
 
 METHODS = ("deformation transfer", "mean offset", "regression")
 _MANY, _TESTED = 100, 50

@@ -1,4 +1,4 @@
-"""``python -m train.eye_network --out models/NAME``: a network that reads lids and irises off crops of eyes.
+"""``torchface train eye_network --out models/NAME``: a network that reads lids and irises off crops of eyes.
 
 Learns from rendered people alone: ``--ict FaceXModel`` takes ICT-FaceKit's heads of real people beside the embedded
 performers. 14,000 pictures of two eyes take about 25 minutes of one core, 6,000 steps half an hour; a GPU is used if
@@ -21,8 +21,9 @@ from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, augmented_eyes
 from torchface.landmarks.images.eyes.eye_training import EyeSettings
 from torchface.progress import Progress, silent
-from train.eye_pictures import PART, EyePictures, render_eye_pictures
-from train.runner import metric_lines, run
+
+from .eye_pictures import PART, EyePictures, render_eye_pictures
+from .runner import Recipe, metric_lines
 
 _TEST_BATCH = 100
 _SIZES = {"600": 1.0, "120": 0.5, "60": 0.25}
@@ -160,5 +161,9 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
     )
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))
+    RECIPE.main()

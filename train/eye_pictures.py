@@ -12,8 +12,9 @@ from torch import Tensor
 from torchface.landmarks.images.eyes.eye_augmentation import EyeLabels
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
-from train.face_pictures import head_kinds
-from train.rendered_files import Rendering, rendered_files
+
+from .face_pictures import head_kinds
+from .rendered_files import Rendering, rendered_files
 
 PART = 200
 """Pictures in a file: what a killed run loses at most."""

@@ -1,4 +1,4 @@
-"""``python -m train.face_boxes --out models/NAME``: the network that finds faces in whole pictures, at every angle.
+"""``torchface train face_boxes --out models/NAME``: the network that finds faces in whole pictures, at every angle.
 
 Its scenes are put together from rendered people, which are rendered once and kept in ``--pictures``.
 """
@@ -18,8 +18,9 @@ from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture
 from torchface.landmarks.images.face_box import overlaps
 from torchface.progress import Progress, silent
 from torchface.synthetic.stages.face_scenes import CutOuts, SceneSettings, face_scene
-from train.face_pictures import render_pictures
-from train.runner import metric_lines, run
+
+from .face_pictures import render_pictures
+from .runner import Recipe, metric_lines
 
 _SAME, _NOTHING = 0.4, 0.3  # overlaps from which a box is the face's, and under which it is none's
 _TEST_SIZE = 320  # pixels a side of the scenes that it is tested on
@@ -152,5 +153,7 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
     )
 
 
+RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained[1], "8.2f"))
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained[1], "8.2f"))
+    RECIPE.main()

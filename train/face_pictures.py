@@ -17,7 +17,8 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind
-from train.rendered_files import Rendering, rendered_files
+
+from .rendered_files import Rendering, rendered_files
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""

@@ -11,7 +11,8 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
-from train.head_samples import vertex_colored
+
+from .head_samples import vertex_colored
 
 
 def ict_head_model(folder: Path, part: str | None = None, components: int | None = None) -> HeadModel:

@@ -1,4 +1,4 @@
-"""``python -m train.landmark_network --out models/NAME``: a network that finds 68 landmarks in pictures of faces.
+"""``torchface train landmark_network --out models/NAME``: a network that finds 68 landmarks in pictures of faces.
 
 Learns from rendered people alone: ``--ict FaceXModel`` takes ICT-FaceKit's heads of real people beside the embedded
 performers. Pictures stay in files, of which a batch is read at a time. 15,000 pictures take about 50 minutes of one
@@ -21,8 +21,9 @@ from torchface.landmarks.images.ibug_68 import INNER
 from torchface.landmarks.images.network_training import LabelledPictures, fit_network_rows
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
 from torchface.progress import Progress, silent
-from train.face_pictures import PART, StoredPictures, picture_files
-from train.runner import metric_lines, run
+
+from .face_pictures import PART, StoredPictures, picture_files
+from .runner import Recipe, metric_lines
 
 _TEST_BATCH = 64
 _LIDS = ((37, 41), (38, 40), (43, 47), (44, 46))
@@ -150,5 +151,9 @@ def save(model: LandmarkNetwork, settings: Settings, metrics: dict[str, float]) 
     )
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))
+    RECIPE.main()

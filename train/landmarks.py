@@ -1,4 +1,4 @@
-"""``python -m train.landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in images.
+"""``torchface train landmarks --data DIR... --out models/NAME``: 68 landmarks of faces in images.
 
 A folder of iBUG's kind holds images with a ``.pts`` beside each; a dlib ``.xml`` names its images itself.
 ``--performers 2000`` learns from so many rendered images of synthetic people, alone or besides the data.
@@ -27,7 +27,8 @@ from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import box_around, relative_errors
 from torchface.progress import Progress, silent
 from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
-from train.runner import metric_lines, run
+
+from .runner import Recipe, metric_lines
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
@@ -269,5 +270,9 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
     zoo.save_model(model, settings.out, card, half=("offsets", "thresholds", "bases"))
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))
+    RECIPE.main()

@@ -1,4 +1,4 @@
-"""``python -m train.marker_solver --out models/NAME``: the solve of one rig and one marker layout, ready to load.
+"""``torchface train marker_solver --out models/NAME``: the solve of one rig and one marker layout, ready to load.
 
 Without a rig it is that of the embedded performer with 100 markers.
 """
@@ -18,7 +18,8 @@ from torchface.shape_names import mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.weight_curves import perform
-from train.runner import metric_lines, run
+
+from .runner import Recipe, metric_lines
 
 
 @dataclass(frozen=True)
@@ -105,5 +106,9 @@ def measure(solver: MarkerSolver, rig: BlendshapeRig, settings: Settings) -> dic
     }
 
 
+RECIPE = Recipe(
+    Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics)
+)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda settings, _: metric_lines(zoo.describe(settings.out.resolve()).metrics))
+    RECIPE.main()

@@ -1,4 +1,4 @@
-"""``python -m train.morphable --scans DIR --out models/NAME``: a head model, shape and colour, of registered meshes.
+"""``torchface train morphable --scans DIR --out models/NAME``: a head model, shape and colour, of registered meshes.
 
 ``--ict FaceXModel`` makes one of ICT-FaceKit's identity modes, which come from light-stage scans of people, with its 53
 expressions as the rig; ``--performers 200`` learns from so many embedded performers, and needs no file. Killed and
@@ -21,10 +21,11 @@ from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.streamed_training import fit_sequence
 from torchface.progress import Progress, silent
-from train.head_figures import draw
-from train.head_samples import Source, balanced_colors, gather, laid, performers, registered
-from train.head_templates import ict_head_model, load_template
-from train.runner import metric_lines, run
+
+from .head_figures import draw
+from .head_samples import Source, balanced_colors, gather, laid, performers, registered
+from .head_templates import ict_head_model, load_template
+from .runner import Recipe, metric_lines
 
 _TESTED_PERFORMERS = 20
 _MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
@@ -300,5 +301,7 @@ def _spread(numbers: range, most: int = 60) -> list[int]:
     return sorted({numbers[round(i)] for i in torch.linspace(0, len(numbers) - 1, most).tolist()})
 
 
+RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics))
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics))
+    RECIPE.main()

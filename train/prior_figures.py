@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchface.capture.priors import DynamicsPrior, windows_of
 from torchface.files.whole_files import make_folder, write_file
-from train.prior_trials import OneStep
+
+from .prior_trials import OneStep
 
 _SHOWN = 4
 _FRAMES = 240

@@ -17,7 +17,8 @@ from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
-from train.kept_takes import KeptTake, TakesRead, TakeStore
+
+from .kept_takes import KeptTake, TakesRead, TakeStore
 
 _METHOD = "takes of priors/1"
 _SUFFIXES = (".csv", ".c3d", ".trc")

@@ -1,4 +1,4 @@
-"""``python -m train.priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
+"""``torchface train priors --takes DIR --out models/NAME``: which weights faces have, and how they go on.
 
 From weight takes (Live Link Face, CSV), or from marker takes (C3D, TRC, CSV) with ``--rig`` and ``--attachment``: they
 are laid on the rig and solved first. ``--performances 12`` learns from synthetic takes of the embedded performer
@@ -31,10 +31,11 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.progress import Progress, silent
 from torchface.synthetic import performer
-from train.prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
-from train.prior_takes import PriorTakes, read_takes, renamed, split, synthetic_takes
-from train.prior_trials import one_step, solve_error, synthetic_video, with_strength
-from train.runner import metric_lines, run
+
+from .prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
+from .prior_takes import PriorTakes, read_takes, renamed, split, synthetic_takes
+from .prior_trials import one_step, solve_error, synthetic_video, with_strength
+from .runner import Recipe, metric_lines
 
 Kind = Literal["shape", "reciprocal", "dynamics", "both"]
 _WINDOWS = (2, 3, 4, 6, 8)
@@ -399,5 +400,7 @@ def _lines(_: Settings, measured: dict[str, dict[str, float]]) -> list[str]:
     return [line for name, metrics in measured.items() for line in (name, *metric_lines(metrics, "8.4f"))]
 
 
+RECIPE = Recipe(Settings, train, __doc__, _lines)
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, _lines)
+    RECIPE.main()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import tyro
 
+from torchface.cli.exit_messages import plain_errors
 from torchface.cli.progress import progress_bars
-from torchface.errors import TorchfaceError
 from torchface.files.job_lock import job_lock
 from torchface.progress import Progress
 
@@ -26,28 +26,34 @@ Settings = TypeVar("Settings", bound=HasOut)
 Trained = TypeVar("Trained")
 
 
-def run(
-    settings: type[Settings],
-    train: Callable[[Settings, Progress], Trained],
-    description: str | None,
-    lines: Callable[[Settings, Trained], Iterable[str]],
-) -> None:
-    """Parses flags, trains, prints; a mistake of the user ends it with one line.
+@dataclass(frozen=True)
+class Recipe(Generic[Settings, Trained]):
+    """A recipe as a command.
 
     Args:
-        settings: the recipe's dataclass; ``out`` is held for this run.
+        settings: its dataclass; ``out`` is held for this run.
         train: learns, evaluates and saves.
-        description: of the recipe, for ``--help``.
+        description: for ``--help``.
         lines: what is printed of the settings and the trained model.
     """
-    chosen = tyro.cli(settings, description=description)
-    try:
-        with job_lock(chosen.out), progress_bars() as progress:
-            trained = train(chosen, progress)
-        for line in lines(chosen, trained):
-            print(line)
-    except TorchfaceError as error:
-        sys.exit(str(error))
+
+    settings: type[Settings]
+    train: Callable[[Settings, Progress], Trained]
+    description: str | None
+    lines: Callable[[Settings, Trained], Iterable[str]]
+
+    def main(self, arguments: Sequence[str] | None = None) -> None:
+        """Parses flags, trains, prints; a mistake of the user ends it with one line and status 2.
+
+        Args:
+            arguments: words of the command line; those of this process if absent.
+        """
+        with plain_errors():
+            chosen = tyro.cli(self.settings, description=self.description, args=arguments)
+            with job_lock(chosen.out), progress_bars() as progress:
+                trained = self.train(chosen, progress)
+            for line in self.lines(chosen, trained):
+                print(line)
 
 
 def metric_lines(metrics: Mapping[str, float], number: str = "8.3f") -> list[str]:

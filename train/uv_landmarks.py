@@ -1,4 +1,4 @@
-"""``python -m train.uv_landmarks --scans DIR --annotations FILE --out models/NAME``: landmarks of raw scans.
+"""``torchface train uv_landmarks --scans DIR --annotations FILE --out models/NAME``: landmarks of raw scans.
 
 ``--performers 30`` learns from scans of so many embedded performers instead, and needs no file.
 """
@@ -31,7 +31,8 @@ from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
-from train.runner import metric_lines, run
+
+from .runner import Recipe, metric_lines
 
 _TESTED_PERFORMERS = 20
 _VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
@@ -206,5 +207,7 @@ def _split(settings: Settings, progress: Progress) -> tuple[list[AnnotatedScan],
     return scans[:split], scans[split:]
 
 
+RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(error_table(trained.errors), "8.2f"))
+
 if __name__ == "__main__":
-    run(Settings, train, __doc__, lambda _, trained: metric_lines(error_table(trained.errors), "8.2f"))
+    RECIPE.main()

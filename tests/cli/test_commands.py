@@ -201,7 +201,7 @@ def test_help_is_a_short_line_a_command(capsys: pytest.CaptureFixture[str], monk
         main(["--help"])
     assert end.value.code == 0
     lines = [line.split(None, 1) for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    assert {line[0] for line in lines} == {*COMMANDS, *GROUPS}
+    assert {line[0] for line in lines} == {*COMMANDS, *GROUPS, "train"}
     assert all(10 < len(line[1].strip()) < 90 for line in lines)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from torchface.cli import main
 from torchface.files.job_lock import file_lock, job_lock
-from train.runner import run
+from train.runner import Recipe
 
 Lock = Callable[[Path], AbstractContextManager[Path]]
 
@@ -53,7 +53,7 @@ class Settings:
 
 
 def test_a_second_run_of_a_recipe_is_refused_and_the_lock_goes_with_the_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "model"
     monkeypatch.setattr(sys, "argv", ["recipe", "--out", str(out)])
@@ -62,8 +62,9 @@ def test_a_second_run_of_a_recipe_is_refused_and_the_lock_goes_with_the_first(
     def first(settings: Settings, _: object) -> str:
         calls.append("first")
         (settings.out / "model.toml").write_text("first")
-        with pytest.raises(SystemExit, match=r"another run writing into .*model \(process"):
-            run(Settings, second, None, lambda *_: [])
+        with pytest.raises(SystemExit):
+            Recipe(Settings, second, None, lambda *_: []).main()
+        assert f"another run writing into {out} (process" in " ".join(capsys.readouterr().err.split())
         return "trained"
 
     def second(settings: Settings, _: object) -> str:
@@ -71,7 +72,7 @@ def test_a_second_run_of_a_recipe_is_refused_and_the_lock_goes_with_the_first(
         (settings.out / "model.toml").write_text("second")
         return "trained"
 
-    run(Settings, first, None, lambda *_: [])
+    Recipe(Settings, first, None, lambda *_: []).main()
     assert (calls, (out / "model.toml").read_text()) == (["first"], "first")
-    run(Settings, second, None, lambda *_: [])
+    Recipe(Settings, second, None, lambda *_: []).main()
     assert [path.name for path in out.iterdir()] == ["model.toml"]

@@ -24,7 +24,6 @@ from torchface.workflows.fit.fit_model import load_head_model, matching
 from train import morphable as recipe
 from train.head_samples import registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train
-from train.runner import run
 
 
 def people(count: int) -> list[Mesh]:
@@ -155,11 +154,11 @@ def test_a_killed_run_goes_on_where_it_was(
     assert torch.equal(again.model.shape.components, trained[0].model.shape.components)
 
 
-def test_another_run_into_the_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_run_into_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "people"
-    monkeypatch.setattr("sys.argv", ["train.morphable", "--performers", "6", "--out", str(out)])
-    with held(out) as process, pytest.raises(SystemExit, match=rf"another run writing into .* \(process {process} on "):
-        run(Settings, train, None, lambda settings, trained: ())
+    with held(out) as process, pytest.raises(SystemExit):
+        recipe.RECIPE.main(["--performers", "6", "--out", str(out)])
+    assert f"another run writing into {out} (process {process} on " in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / ".people.training").exists()
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,10 +151,9 @@ def test_annotations_that_cannot_be_used_are_named(folder: Path, tmp_path: Path)
         load_annotations(tmp_path / "else.json")
 
 
-def test_the_command_says_what_it_wants(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["train.uv_landmarks", "--help"])
+def test_the_command_says_what_it_wants(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(recipe.__file__, run_name="__main__")
+        recipe.RECIPE.main(["--help"])
     assert not ended.value.code
     shown = capsys.readouterr().out
     assert "--scans" in shown

@@ -40,6 +40,7 @@ from torchface.cli.retarget import retarget
 from torchface.cli.rig import rig
 from torchface.cli.solve import solve
 from torchface.cli.track import track
+from torchface.cli.train import train
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
 from torchface.cli.zoo import ZOO
@@ -111,6 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(0 if words else 2)
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
+        elif words[0] == "train":
+            train(words[1:])
         elif words[0] in GROUPS:
             group = GROUPS[words[0]]
             tyro.extras.subcommand_cli_from_dict(
@@ -128,7 +131,7 @@ def _overview() -> None:
     """A line a command; tyro would print the whole of each."""
     table = Table(box=None, show_header=False, padding=(0, 2))
     summaries = {name: (command.__doc__ or "").partition("\n\n")[0] for name, command in COMMANDS.items()}
-    summaries |= {name: group.summary for name, group in GROUPS.items()}
+    summaries |= {name: group.summary for name, group in GROUPS.items()} | {"train": train.__doc__ or ""}
     for name, text in summaries.items():
         summary = " ".join(text.split())
         table.add_row(Text(name, "bold"), re.split(r"[:;,.](?:\s|$)", summary)[0])

@@ -1,0 +1,64 @@
+"""``torchface train`` finds recipes by name or as a file; what it cannot find it says in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from torchface.cli import main
+from train import marker_solver
+
+OWN = '''"""``torchface train own``: nothing."""
+from dataclasses import dataclass
+from pathlib import Path
+
+from .runner import Recipe
+
+@dataclass(frozen=True)
+class Settings:
+    out: Path
+
+RECIPE = Recipe(Settings, lambda settings, _: settings.out.name, __doc__, lambda _, made: [f"{made} done"])
+'''
+
+
+def test_every_recipe_is_listed_with_what_it_makes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "--help"])
+    assert ended.value.code == 0
+    rows = {line.split()[0]: line.split(None, 1)[1] for line in capsys.readouterr().out.splitlines() if line[:1] == " "}
+    files = Path(marker_solver.__file__).parent.glob("*.py")
+    assert {path.stem for path in files if "RECIPE = " in path.read_text()} <= set(rows)
+    assert rows["marker_solver"].startswith("the solve of one rig")
+
+
+def test_a_recipe_takes_its_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "marker_solver", "--help"])
+    assert ended.value.code == 0
+    assert "--sparsity" in capsys.readouterr().out
+
+
+def test_a_file_is_a_recipe_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own = tmp_path / "own_recipe.py"
+    own.write_text(OWN)
+    main(["train", str(own), "--out", str(tmp_path / "model")])
+    assert capsys.readouterr().out == "model done\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("morphables", "found the recipe 'morphables', expected one of action_units"),
+        ("none.py", "none.py: found no such file"),
+    ],
+)
+def test_what_is_no_recipe_is_named(name: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["train", name])
+    assert ended.value.code == 2
+    assert message in " ".join(capsys.readouterr().err.split())
