@@ -14,7 +14,7 @@ from pathlib import Path
 from torch import Tensor
 
 from torchface import TorchfaceError, zoo
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
@@ -96,18 +96,18 @@ def train(settings: Settings, progress: Progress | None = None) -> EnhancementMo
     progress(f"{len(known)} frames of {learned} sequences to learn from, {0 if test is None else len(test)} to test on")
     mesh = capture.neutral
     model = EnhancementModel.fit(
-        known.truth,
-        mesh.faces,
-        numbers,
-        mesh.vertices,
-        coarse=known.coarse,
-        fps=settings.fps,
-        wavelength=settings.wavelength,
+        CapturedPerformance(
+            known.truth,
+            mesh.faces,
+            numbers,
+            mesh.vertices,
+            coarse=known.coarse,
+            landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
+        ),
+        EnhancementSettings(fps=settings.fps, wavelength=settings.wavelength, detail=settings.detail),  # type: ignore[arg-type]
         patch_size=settings.patch,
         region_count=settings.regions,
         rank=settings.rank,
-        landmarks=None if mesh.annotations is None else mesh.annotations.landmarks,
-        detail=settings.detail,  # type: ignore[arg-type]
         seed=settings.seed,
         folder=work,
         progress=progress,

@@ -23,8 +23,8 @@ from enhancement_peers import (
 from enhancement_scenes import FPS, Scene, make_scene
 from torch import Tensor
 
-from torchface.enhancement import EnhancementModel
-from torchface.enhancement.enhancement_model import Matching
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
+from torchface.enhancement.enhancement_settings import Matching
 from torchface.geometry.meshes.operators import triangle_areas
 
 VERTICES, FRAMES = 20_000, 200
@@ -90,9 +90,16 @@ def bench_of(kind: str, data: Path) -> Bench:
 
 def fitted(scene: Scene, coarse: Tensor | None) -> EnhancementModel:
     return EnhancementModel.fit(
-        scene.frames, scene.faces, scene.sequences, scene.neutral, coarse=coarse, fps=FPS,
-        landmarks=scene.performer.neutral.landmarks,
-    )  # fmt: skip
+        CapturedPerformance(
+            scene.frames,
+            scene.faces,
+            scene.sequences,
+            scene.neutral,
+            coarse=coarse,
+            landmarks=scene.performer.neutral.landmarks,
+        ),
+        EnhancementSettings(fps=FPS),
+    )
 
 
 def ours(model: EnhancementModel) -> dict[str, Method]:

@@ -12,7 +12,7 @@ from enhancement_pictures import compared
 from enhancement_scenes import FPS, Scene, scene_of
 from torch import Tensor
 
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.low_pass import LowPass
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
@@ -36,9 +36,16 @@ def actors(data: Path, seed: int) -> tuple[Scene, Scene]:
 
 def fitted(scene: Scene, pairs: bool) -> EnhancementModel:
     return EnhancementModel.fit(
-        scene.frames, scene.faces, scene.sequences, scene.neutral, coarse=scene.rigged if pairs else None, fps=FPS,
-        landmarks=scene.performer.neutral.landmarks,
-    )  # fmt: skip
+        CapturedPerformance(
+            scene.frames,
+            scene.faces,
+            scene.sequences,
+            scene.neutral,
+            coarse=scene.rigged if pairs else None,
+            landmarks=scene.performer.neutral.landmarks,
+        ),
+        EnhancementSettings(fps=FPS),
+    )
 
 
 @pytest.mark.parametrize(("seed", "places"), [(0, "in the same places"), (1, "elsewhere")])

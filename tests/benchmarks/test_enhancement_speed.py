@@ -16,7 +16,7 @@ from enhancement_pictures import FOLDER, save
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.propagation import ThinShell
 from torchface.rendering.compositing import from_figure
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
@@ -47,7 +47,13 @@ def seconds(run: Callable[[], object]) -> float:
 def fitted(performer: WrinkledPerformer, frames: Tensor) -> EnhancementModel:
     sequences = torch.arange(len(frames)) * 4 // len(frames)
     return EnhancementModel.fit(
-        frames, performer.neutral.faces, sequences, performer.neutral.vertices, landmarks=performer.neutral.landmarks
+        CapturedPerformance(
+            frames,
+            performer.neutral.faces,
+            sequences,
+            performer.neutral.vertices,
+            landmarks=performer.neutral.landmarks,
+        )
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.synthetic.head.performer import performer
 
@@ -48,5 +48,7 @@ def database() -> Database:
 def model(database: Database) -> EnhancementModel:
     """Learned of the database with as many components as frames."""
     return EnhancementModel.fit(
-        database.frames, database.faces, database.sequences, database.neutral, rank=36, patch_size=20
+        CapturedPerformance(database.frames, database.faces, database.sequences, database.neutral),
+        rank=36,
+        patch_size=20,
     )

@@ -9,7 +9,7 @@ import math
 import pytest
 import torch
 
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
@@ -43,7 +43,10 @@ def test_frames_of_the_database_come_back(model, database):
 
 def test_what_an_input_shows_itself_is_kept_where_pairs_are_known(database):
     paired = EnhancementModel.fit(
-        database.frames, database.faces, database.sequences, database.neutral, coarse=database.smooth, rank=36
+        CapturedPerformance(
+            database.frames, database.faces, database.sequences, database.neutral, coarse=database.smooth
+        ),
+        rank=36,
     )
     found = paired(database.smooth)
     given = (database.frames - database.smooth).square().mean().sqrt()
@@ -105,7 +108,8 @@ def test_another_actor_gets_the_detail_in_its_own_place_and_scale(model, databas
 def test_colours_blend_as_the_detail_does(database):
     shades = torch.rand(4, 1, 3).repeat_interleave(9, dim=0).expand(-1, len(database.neutral), -1)
     colored = EnhancementModel.fit(
-        database.frames, database.faces, database.sequences, database.neutral, rank=4, colors=shades
+        CapturedPerformance(database.frames, database.faces, database.sequences, database.neutral, colors=shades),
+        rank=4,
     )
     weights = torch.zeros(1, len(colored.region_names), 36)
     weights[..., 20] = 1.0
@@ -129,7 +133,12 @@ def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
     given = database.frames, database.faces, database.sequences, database.neutral
     projected = copy.deepcopy(model)
     projected.matching = "projection"
-    other = EnhancementModel.fit(*given, rank=36, patch_size=20, detail="gradients", matching="projection")
+    other = EnhancementModel.fit(
+        CapturedPerformance(*given),
+        EnhancementSettings(detail="gradients", matching="projection"),
+        rank=36,
+        patch_size=20,
+    )
     left = other(database.smooth[3:6]) - projected(database.smooth[3:6])
     detail = (database.frames - database.smooth)[3:6]
     assert float(left.square().mean().sqrt()) < 0.3 * float(detail.square().mean().sqrt())
@@ -139,7 +148,7 @@ def test_a_run_that_is_killed_continues_to_the_same_model(database, tmp_path, mo
     monkeypatch.setattr("torchface.enhancement.model_training._SECONDS", 0.0)
     monkeypatch.setattr("torchface.enhancement.model_training._LARGEST_BLOCK", 5)
     given = database.frames, database.faces, database.sequences, database.neutral
-    whole = EnhancementModel.fit(*given, rank=6, patch_size=20)
+    whole = EnhancementModel.fit(CapturedPerformance(*given), rank=6, patch_size=20)
     steps = []
 
     def killed(step, done=0, total=0):
@@ -148,10 +157,14 @@ def test_a_run_that_is_killed_continues_to_the_same_model(database, tmp_path, mo
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        EnhancementModel.fit(*given, rank=6, patch_size=20, folder=tmp_path, progress=killed)
+        EnhancementModel.fit(CapturedPerformance(*given), rank=6, patch_size=20, folder=tmp_path, progress=killed)
     first, steps = steps, []
     again = EnhancementModel.fit(
-        *given, rank=6, patch_size=20, folder=tmp_path, progress=lambda step, done=0, total=0: steps.append(done)
+        CapturedPerformance(*given),
+        rank=6,
+        patch_size=20,
+        folder=tmp_path,
+        progress=lambda step, done=0, total=0: steps.append(done),
     )
     assert max(first) == 20
     assert min(done for done in steps if done) == 20
@@ -165,12 +178,7 @@ def test_frames_on_disk_give_the_same_model(model, database, tmp_path):
         writer.append(database.frames)
     sequence = MeshSequence(tmp_path / "frames.safetensors")
     found = EnhancementModel.fit(
-        sequence,
-        database.faces,
-        database.sequences,
-        database.neutral,
-        rank=36,
-        patch_size=20,
+        CapturedPerformance(sequence, database.faces, database.sequences, database.neutral), rank=36, patch_size=20
     )
     assert torch.equal(found(database.smooth[3:5]), model(database.smooth[3:5]))
 
@@ -184,7 +192,9 @@ def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monke
     monkeypatch.setattr("torchface.files.whole_files.os.write", full)
     with pytest.raises(FileFormatError, match="the disk is full"):
         EnhancementModel.fit(
-            database.frames, database.faces, database.sequences, database.neutral, rank=6, folder=tmp_path
+            CapturedPerformance(database.frames, database.faces, database.sequences, database.neutral),
+            rank=6,
+            folder=tmp_path,
         )
 
 
@@ -210,7 +220,7 @@ def test_what_is_not_of_this_mesh_or_unit_is_refused(model, database):
 
 def test_a_database_that_cannot_be_learned_from_is_told(database):
     def fit(frames=database.frames, sequences=database.sequences):
-        return EnhancementModel.fit(frames, database.faces, sequences, database.neutral, rank=4)
+        return EnhancementModel.fit(CapturedPerformance(frames, database.faces, sequences, database.neutral), rank=4)
 
     broken = database.frames.clone()
     broken[5, 7] = math.nan
@@ -238,7 +248,10 @@ def test_a_loose_eye_and_a_vertex_of_no_triangle_come_through_as_they_are(databa
 
     faces = torch.cat([database.faces, sides + count])
     own = EnhancementModel.fit(
-        with_ball(database.frames), faces, database.sequences, with_ball(database.neutral[None])[0], rank=8
+        CapturedPerformance(
+            with_ball(database.frames), faces, database.sequences, with_ball(database.neutral[None])[0]
+        ),
+        rank=8,
     )
     asked = with_ball(database.smooth[4:5], 0.4)
     found = own(asked)

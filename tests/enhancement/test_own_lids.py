@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.low_pass import LowPass
 from torchface.enhancement.own_lids import OwnLids
 from torchface.synthetic.head.performer import performer
@@ -17,7 +17,7 @@ UPPER, LOWER = {"right": (37, 38), "left": (43, 44)}, {"right": (41, 40), "left"
 def model(database) -> EnhancementModel:
     """As that of all tests, with regions for the eyes."""
     given = database.frames, database.faces, database.sequences, database.neutral
-    return EnhancementModel.fit(*given, rank=36, patch_size=20, landmarks=database.landmarks)
+    return EnhancementModel.fit(CapturedPerformance(*given, landmarks=database.landmarks), rank=36, patch_size=20)
 
 
 @pytest.fixture(scope="module")

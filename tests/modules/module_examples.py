@@ -20,7 +20,7 @@ from torchface.capture.webcam import ExampleSolver, WebcamSolver
 from torchface.capture.webcam.examples.example_shapes import ExampleShapes
 from torchface.capture.webcam.examples.landmark_model import LandmarkModel
 from torchface.capture.webcam.webcam_state import WebcamControls
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.box_network import BoxNetwork
@@ -202,7 +202,9 @@ def enhancement_model(number: int) -> EnhancementModel:
     waves = 0.1 * ((2.1 - number) * neutral[:, 1]).sin() * (smooth - neutral).norm(dim=-1)
     frames = smooth + waves[..., None] * vertex_normals(smooth, faces)
     sequences = torch.arange(3).repeat_interleave(6)
-    return EnhancementModel.fit(frames, faces, sequences, neutral, rank=6, patch_size=60, region_count=3)
+    return EnhancementModel.fit(
+        CapturedPerformance(frames, faces, sequences, neutral), rank=6, patch_size=60, region_count=3
+    )
 
 
 def action_unit_classifier(number: int) -> ActionUnitClassifier:

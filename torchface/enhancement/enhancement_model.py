@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchface.enhancement.actor_timing import ActorTiming
 from torchface.enhancement.aligned_frames import FrameAlignment
+from torchface.enhancement.captured_performance import CapturedPerformance
 from torchface.enhancement.detail_basis import StreamingBasis, blended, region_products
 from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.enhancement_settings import (
+    DEFAULT_SETTINGS,
+    DetailKind,
+    EnhancementSettings,
+    EnhancementSizes,
+    Matching,
+)
 from torchface.enhancement.gradient_detail import GradientDetail
 from torchface.enhancement.learned_map import LearnedMap, map_shares
-from torchface.enhancement.low_pass import WAVELENGTH, LowPass, vertex_areas
+from torchface.enhancement.low_pass import LowPass, vertex_areas
 from torchface.enhancement.model_training import (
     Encoder,
-    check_sequences,
-    check_topology,
     learn_frames,
     warn_without_neutral,
 )
@@ -30,11 +36,10 @@ from torchface.enhancement.patches import grow_patches
 from torchface.enhancement.projection import RegionProjection
 from torchface.enhancement.regions import Regions, regions_of_motion
 from torchface.enhancement.surface_frames import SurfaceFrames
-from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.errors import TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import triangle_areas
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.io.meshes.mesh_sequence import MeshSequence
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
@@ -45,10 +50,6 @@ _COLOR_RANK = 32
 # Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
 # motion that the smooth part lacks far, for that goes on linearly; with wrinkles alone not so, for they saturate.
 _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
-DetailKind = Literal["displacements", "gradients"]
-Matching = Literal["projection", "learned"]
-_MATCHINGS: tuple[Matching, ...] = ("projection", "learned")
-_DETAILS: tuple[DetailKind, ...] = ("displacements", "gradients")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +82,11 @@ class EnhancementModel(nn.Module):
     Made by :meth:`fit`. The constructor makes an empty model for a state to be loaded into.
 
     Args:
-        vertices, triangles, patches, frames, rank: V, F, P, K and r.
+        sizes: of what it holds.
         region_names: of the R regions.
         voluntary: whether the actor moves each at will.
-        fps: of the database.
-        wavelength: of the low-pass filter, millimetres.
-        color_rank: components of the colours; 0 without colours.
-        detail: how detail is encoded: as "displacements" from the smooth part or as "gradients" of its triangles.
+        settings: how frames are split and detail is found.
         lost_share: of the details' energy, by their compression.
-        matching: how detail is found: by the "projection" onto the database alone, or with what a "learned" map adds
-            for frames beyond it.
-        temporal: how much weights hold on to those of the frame before, see ``RegionProjection``.
         keeps_input: whether detail goes onto the coarse frames themselves and not onto their smooth part.
         scale: how much of what is added to the coarse frames, see :meth:`on_actor`.
 
@@ -106,7 +101,8 @@ class EnhancementModel(nn.Module):
         >>> weights[:, smiles] = torch.linspace(0, 1, 6).repeat(2)[:, None].to(weights)
         >>> takes = torch.arange(2).repeat_interleave(6)  # two sequences from rest to a smile
         >>> frames, faces = rig(weights), rig.neutral.faces
-        >>> model = EnhancementModel.fit(frames, faces, takes, rig.vertices, patch_size=200, region_count=2)
+        >>> performance = CapturedPerformance(frames, faces, takes, rig.vertices)
+        >>> model = EnhancementModel.fit(performance, patch_size=200, region_count=2)
         >>> bool((model(frames[3:4]) - frames[3:4]).norm(dim=-1).mean() < 0.1)  # what was captured comes back
         True
     """
@@ -127,37 +123,24 @@ class EnhancementModel(nn.Module):
 
     def __init__(
         self,
-        vertices: int,
-        triangles: int,
-        patches: int,
-        frames: int,
-        rank: int,
+        sizes: EnhancementSizes,
         region_names: Sequence[str],
         voluntary: Sequence[bool],
-        fps: float = 30.0,
-        wavelength: float = WAVELENGTH,
-        color_rank: int = 0,
-        detail: DetailKind = "displacements",
+        settings: EnhancementSettings = DEFAULT_SETTINGS,
         lost_share: float = 0.0,
         keeps_input: bool = False,
-        matching: Matching = "learned",
-        temporal: float = 0.0,
         scale: float = 1.0,
     ) -> None:
         super().__init__()
-        if detail not in _DETAILS:
-            raise ValueRangeError(f"detail: found {detail!r:.40}, expected one of {', '.join(_DETAILS)}")
+        vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
         self.region_names = tuple(region_names)
         self.voluntary = tuple(bool(value) for value in voluntary)
-        self.fps = checked_number("fps", fps, MIN_FPS, MAX_FPS)
-        self.wavelength = checked_number("wavelength", wavelength, above=True, most=1e6)
-        self.detail: DetailKind = detail
+        self.fps, self.wavelength = settings.fps, settings.wavelength
+        self.detail: DetailKind = settings.detail
+        self.matching: Matching = settings.matching
+        self.temporal = settings.temporal
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
-        if matching not in _MATCHINGS:
-            raise ValueRangeError(f"matching: found {matching!r:.40}, expected one of {', '.join(_MATCHINGS)}")
-        self.matching: Matching = matching
-        self.temporal = checked_number("temporal", temporal)
         self.scale = checked_number("scale", scale)
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
@@ -168,10 +151,11 @@ class EnhancementModel(nn.Module):
         # From which distance on a frame is outside of the database, and how much of the learned map counts.
         self.register_buffer("limits", torch.ones(regions, dtype=torch.float64))
         self.register_buffer("map_shares", torch.ones(regions, dtype=torch.float64))
-        self.register_buffer("database_features", torch.zeros(frames, patches, 9))
-        size = 3 * vertices if detail == "displacements" else 9 * triangles
-        self.register_buffer("components", torch.zeros(rank, size, dtype=torch.float16))
-        self.register_buffer("coefficients", torch.zeros(frames, rank))
+        self.register_buffer("database_features", torch.zeros(frames, sizes.patches, 9))
+        size = 3 * vertices if self.detail == "displacements" else 9 * triangles
+        self.register_buffer("components", torch.zeros(sizes.rank, size, dtype=torch.float16))
+        self.register_buffer("coefficients", torch.zeros(frames, sizes.rank))
+        color_rank = sizes.color_rank
         colored = vertices if color_rank else 0
         self.register_buffer("mean_color", torch.zeros(colored, 3))
         self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
@@ -185,7 +169,7 @@ class EnhancementModel(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What the constructor needs: plain values only."""
+        """What :meth:`from_config` needs: plain values only."""
         return {
             "vertices": len(self.neutral),
             "triangles": len(self.faces),
@@ -216,27 +200,20 @@ class EnhancementModel(nn.Module):
             raise ValueRangeError(
                 "found a model of an earlier version, which had no limits in its state: learn it again"
             )
-        return cls(**config)
+        given = dict(config)
+        sizes = EnhancementSizes(**{one.name: given.pop(one.name) for one in fields(EnhancementSizes)})
+        settings = EnhancementSettings(**{one.name: given.pop(one.name) for one in fields(EnhancementSettings)})
+        return cls(sizes, settings=settings, **given)
 
     @classmethod
     def fit(
         cls,
-        frames: Tensor | MeshSequence,
-        faces: Tensor,
-        sequences: Tensor,
-        neutral: Tensor,
+        performance: CapturedPerformance,
+        settings: EnhancementSettings = DEFAULT_SETTINGS,
         *,
-        coarse: Tensor | MeshSequence | None = None,
-        fps: float = 30.0,
-        wavelength: float = WAVELENGTH,
         patch_size: int = 100,
         region_count: int = 13,
         rank: int = 64,
-        colors: Tensor | None = None,
-        landmarks: Tensor | None = None,
-        detail: DetailKind = "displacements",
-        matching: Matching = "learned",
-        temporal: float = 0.0,
         seed: int = 0,
         folder: str | Path | None = None,
         progress: Progress | None = None,
@@ -244,24 +221,11 @@ class EnhancementModel(nn.Module):
         """Learns from a captured performance.
 
         Args:
-            frames: (K,V,3), millimetres, each in any rigid place; or on disk.
-            faces: (F,3) int64.
-            sequences: the number of each frame's sequence, (K,) int64; a sequence goes from the neutral to an extreme
-                expression and back.
-            neutral: (V,3), millimetres.
-            coarse: what the coarse animation shows of the same frames in the same places, (K,V,3), where it is known:
-                the actor's rig fitted to them, or the thin shell through their markers. Then the detail is what such an
-                animation lacks, and what it has itself beyond the smooth part stays. Absent, the smooth part's detail
-                takes the place of the input's own.
-            fps: of the frames.
-            wavelength: of which the smooth part keeps half the amplitude, millimetres.
+            performance: K frames of the actor.
+            settings: how frames are split and detail is found.
             patch_size: vertices a patch.
             region_count: how many regions are looked for.
             rank: components of the detail.
-            colors: of the frames' vertices, in [0,1], (K,V,3).
-            landmarks: vertex ids of the 68 iBUG landmarks, which name the regions and set the eyes apart.
-            detail: how detail is encoded.
-            matching, temporal: how it is found, see :class:`EnhancementModel`.
             seed: of patches and regions.
             folder: where a run that is killed finds what it has learned; of this run alone.
             progress: told of frames.
@@ -270,50 +234,53 @@ class EnhancementModel(nn.Module):
             The model. ``lost_share`` says what part of the details' energy its components do not hold.
 
         Raises:
-            TopologyError: frames are of another mesh, or their vertices in another order.
-            ValueRangeError: NaN, no frames, sequences in pieces.
+            TopologyError: vertices of frames are in another order.
+            ValueRangeError: NaN.
             AlignmentError: frames of another unit.
             FileFormatError: the disk is full.
         """
         progress = silent if progress is None else progress
-        check_topology(frames, faces, neutral)
-        if coarse is not None:
-            check_topology(coarse, faces, neutral)
-            if len(coarse) != len(frames):
-                raise ShapeError(f"coarse: found {len(coarse)} frames, expected {len(frames)}, one for each")
-        check_sequences(sequences, len(frames))
         checked_count("rank", rank, 1)
-        if colors is not None and colors.shape != (len(frames), len(neutral), 3):
-            raise ShapeError(f"colors: found {tuple(colors.shape)}, expected {(len(frames), len(neutral), 3)}")
-        neutral = neutral.detach().float()
+        frames, faces, sequences, colors = (
+            performance.frames,
+            performance.faces,
+            performance.sequences,
+            performance.colors,
+        )
+        neutral = performance.neutral.detach().float()
         progress("preparing the mesh")
         patches = grow_patches(faces, len(neutral), patch_size, seed)
-        encoder = _encoder(neutral, faces, patches, wavelength, detail)
-        settings = content_key(
-            "enhancement/2", neutral=neutral, faces=faces, patches=patches, wavelength=wavelength, detail=detail
+        encoder = _encoder(neutral, faces, patches, settings.wavelength, settings.detail)
+        key = content_key(
+            "enhancement/2",
+            neutral=neutral,
+            faces=faces,
+            patches=patches,
+            wavelength=settings.wavelength,
+            detail=settings.detail,
         )
         folder = None if folder is None else Path(folder)
-        size = 3 * len(neutral) if detail == "displacements" else 9 * len(faces)
-        learned = learn_frames(frames, coarse, encoder, rank, size, settings, folder, progress)
+        size = 3 * len(neutral) if settings.detail == "displacements" else 9 * len(faces)
+        learned = learn_frames(frames, performance.coarse, encoder, rank, size, key, folder, progress)
         warn_without_neutral(learned.motion)
-        regions = regions_of_motion(learned.motion, patches, neutral, faces, region_count, landmarks, seed=seed)
+        marks = performance.landmarks
+        regions = regions_of_motion(learned.motion, patches, neutral, faces, region_count, marks, seed=seed)
         hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
-        model = cls(
+        sizes = EnhancementSizes(
             len(neutral),
             len(faces),
             learned.features.shape[1],
             len(frames),
             len(learned.basis.components),
+            0 if hue is None else hue.rank,
+        )
+        model = cls(
+            sizes,
             regions.names,
             regions.voluntary.tolist(),
-            fps,
-            wavelength,
-            0 if hue is None else hue.rank,
-            detail,
+            settings,
             learned.basis.lost_share,
-            coarse is not None,
-            matching,
-            temporal,
+            performance.coarse is not None,
         )
         model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
         model.region_weights, model.sequences = regions.weights.float(), sequences.clone()

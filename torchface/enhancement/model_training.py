@@ -16,7 +16,7 @@ from torchface.enhancement.displacement_detail import DisplacementDetail
 from torchface.enhancement.gradient_detail import GradientDetail
 from torchface.enhancement.low_pass import LowPass
 from torchface.enhancement.surface_frames import PatchGradients, SurfaceFrames
-from torchface.errors import TopologyError, ValueRangeError
+from torchface.errors import ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key
 from torchface.io.meshes.mesh_sequence import MeshSequence
@@ -154,46 +154,3 @@ def _identity(frames: Tensor | MeshSequence | None) -> object:
     # A thousand dense meshes take a minute to read: their file is known by name, size and time.
     told = frames.path.stat()
     return [str(frames.path.resolve()), frames.key, list(frames.shape), told.st_size, told.st_mtime_ns]
-
-
-def check_sequences(sequences: Tensor, count: int) -> None:
-    """Raises or warns where the sequences (K,) do not fit a database.
-
-    Raises:
-        ValueRangeError: not one number a frame, or a sequence in pieces.
-    """
-    if sequences.shape != (count,) or sequences.is_floating_point():
-        raise ValueRangeError(
-            f"sequences: found {sequences.dtype} {tuple(sequences.shape)}, expected ({count},) int64: the number of "
-            "each frame's sequence"
-        )
-    pieces = 1 + int((sequences[1:] != sequences[:-1]).sum())
-    found = len(sequences.unique())
-    if pieces != found:
-        raise ValueRangeError(f"sequences: found {found} sequences in {pieces} pieces, expected each in one piece")
-    if found < 2:
-        warnings.warn(
-            f"sequences: found 1 of {count} frames, expected several, from the neutral to an extreme and back each: "
-            "detail and timing of what it does not show are missing",
-            stacklevel=3,
-        )
-
-
-def check_topology(frames: Tensor | MeshSequence, faces: Tensor, neutral: Tensor) -> None:
-    """Raises where frames, triangles and neutral are not of one topology.
-
-    Raises:
-        TopologyError: they are not.
-        ValueRangeError: there are fewer than two frames, or the neutral is not finite.
-    """
-    shape = tuple(frames.shape)
-    if neutral.ndim != 2 or neutral.shape[1] != 3 or not bool(torch.isfinite(neutral).all()):
-        raise ValueRangeError(f"neutral: found {tuple(neutral.shape)}, expected (V,3), finite")
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or int(faces.max()) >= len(neutral):
-        raise TopologyError(f"faces: found {tuple(faces.shape)}, expected (F,3) between {len(neutral)} vertices")
-    if len(shape) != 3 or shape[1:] != (len(neutral), 3):
-        raise TopologyError(f"frames: found {shape}, expected (K,{len(neutral)},3) as the neutral's vertices")
-    if isinstance(frames, MeshSequence) and not torch.equal(frames.faces, faces.cpu()):
-        raise TopologyError(f"{frames.path}: found other triangles than the neutral's, expected the same")
-    if shape[0] < 2:
-        raise ValueRangeError(f"frames: found {shape[0]}, expected sequences of frames, 2 at the very least")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.attachment import Attachment
-from torchface.enhancement import EnhancementModel
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.io import save_rig, save_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -68,7 +68,9 @@ def actor(tmp_path_factory: pytest.TempPathFactory) -> Actor:
     with torch.no_grad():
         database = folded(rig(learned), rig.vertices)
     sequences = torch.arange(4).repeat_interleave(4)
-    model = EnhancementModel.fit(database, rig.neutral.faces, sequences, rig.vertices, fps=FPS, rank=8)
+    model = EnhancementModel.fit(
+        CapturedPerformance(database, rig.neutral.faces, sequences, rig.vertices), EnhancementSettings(fps=FPS), rank=8
+    )
     zoo.save_model(model, folder / "model", zoo.ModelCard("MIT", "made", {}, "here"))
     weights = torch.linspace(0, 1, FRAMES)[:, None] * (0.6 * extremes[0] + 0.4 * extremes[1])
     attachment = place_markers(rig, 60)
