@@ -29,7 +29,7 @@ from torchface.landmarks.images.network import LandmarkNetwork
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression
-from torchface.modeling.rigging.expression_training import fit_expressions
+from torchface.modeling.rigging.expression_training import ExpressionSettings, fit_expressions
 from torchface.onnx import HybridGraph, SolverGraph
 from torchface.optim import BoxQP
 from torchface.synthetic import performer
@@ -189,7 +189,7 @@ def expression_regression(number: int) -> ExpressionRegression:
     whole = rig(number)
     neutrals = whole(0.3 * random(6, len(NAMES), seed=number).float())
     sizes = 1 + 0.2 * random(6, 1, 1, 1, seed=number).float()
-    return fit_expressions(neutrals, neutrals[:, None] + sizes * whole.deltas[:2], 3, 3, names=NAMES[:2])
+    return fit_expressions(neutrals, neutrals[:, None] + sizes * whole.deltas[:2], ExpressionSettings(3, 3), NAMES[:2])
 
 
 @cache
@@ -231,8 +231,7 @@ def network(kind: Callable[[], nn.Module]) -> Callable[[int], nn.Module]:
 
 def box_qp(number: int) -> BoxQP:
     A = random(12, 6, seed=number).float()
-    H = A.T @ A
-    return BoxQP(0.5 * (H + H.T))
+    return BoxQP(A.T @ A)  # as symmetric as rounding leaves it
 
 
 def prior_energy(prior: ShapePrior, weights: Tensor) -> tuple[Tensor, ...]:
@@ -254,7 +253,7 @@ def helmet(solver: HelmetSolver, markers: Tensor) -> tuple[Tensor, ...]:
 
 
 EXAMPLES: dict[str, Example] = {
-    "BoxQP": Example(box_qp, lambda: (random(20, 6, seed=3).float() - 1,), cells={**SOLVER, "torch.export": "no"}),
+    "BoxQP": Example(box_qp, lambda: (random(10, 6, seed=3).float() - 1,), cells={**SOLVER, "torch.export": "no"}),
     "MarkerSolver": Example(
         marker_solver, lambda: (seen_markers(rig()),), cells={**SOLVER, "torch.export": "SolverGraph"}
     ),
@@ -267,6 +266,10 @@ EXAMPLES: dict[str, Example] = {
     ),
     "HybridSolver": Example(
         lambda n: HybridSolver(marker_solver(n)), pulled_markers, cells={**SOLVER, "torch.export": "HybridGraph"}
+    ),
+    "HybridSolver with correctives": Example(
+        lambda n: HybridSolver(corrected_solver(n)), pulled_markers,
+        cells={**SOLVER, "torch.export": "HybridCorrectiveGraph"},
     ),
     "WholeTakeSolver": Example(
         lambda n: WholeTakeSolver(marker_solver(n)), lambda: (seen_markers(rig()),),
@@ -283,9 +286,9 @@ EXAMPLES: dict[str, Example] = {
     "ExampleSolver with LandmarkModel": Example(
         projecting_example_solver, lambda: (seen_landmarks(),), cells={**SOLVER, "torch.export": "ONNX"}
     ),
-    "SolverGraph": Example(lambda n: SolverGraph(marker_solver(n), 9, 9), graph_inputs, cells={"vmap": "no"}),
+    "SolverGraph": Example(lambda n: SolverGraph(marker_solver(n), 3, 3), graph_inputs, cells={"vmap": "no"}),
     "HybridGraph": Example(
-        lambda n: HybridGraph(marker_solver(n), 9, 9),
+        lambda n: HybridGraph(marker_solver(n), 3, 3),
         lambda: (*graph_inputs(), *(x.float() for x in pulled_markers()[1:])), cells={"vmap": "no"},
     ),
     "ShapePrior": Example(shape_prior, lambda: (random(3, len(NAMES)),), prior_energy),

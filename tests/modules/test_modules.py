@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import copy
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from module_examples import (
+    CAMERA,
     EXAMPLES,
     NAMES,
     Example,
     corrected_rig,
     corrected_solver,
+    rig,
     seen_landmarks,
     seen_markers,
-    video_solver,
 )
 from pretended_device import pretended
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
+from torchface.capture.video import VideoSolver
 from torchface.errors import TraceError
 from torchface.onnx import VideoGraph
-from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "modules.md"
 COLUMNS = (
@@ -226,14 +229,29 @@ def test_exported_it_computes_the_same(name: str) -> None:
         assert_same(list(program.module()(*inputs)), outputs(example, module, *inputs), 1e-5)
 
 
-@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph"])
+def exported_graphs() -> dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]]]]:
+    """Those that stand in for solvers in the table and have no row of their own, of few steps."""
+    none = torch.zeros(4, len(NAMES))
+    return {
+        "VideoGraph": (
+            lambda: VideoGraph(VideoSolver(rig(), None, CAMERA)),
+            lambda: (seen_landmarks()[0].float(), torch.ones(68), torch.zeros(6), torch.eye(3), torch.ones(3)),
+        ),
+        "CorrectiveGraph": (
+            lambda: CorrectiveGraph(corrected_solver(0), steps=1),
+            lambda: (seen_markers(corrected_rig()).float(), none),
+        ),
+        "HybridCorrectiveGraph": (
+            lambda: HybridCorrectiveGraph(corrected_solver(0), steps=1),
+            lambda: (seen_markers(corrected_rig()).float(), none, none + 0.5, none + 1.0),
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", ["VideoGraph", "CorrectiveGraph", "HybridCorrectiveGraph"])
 def test_graphs_of_solvers_are_exported(kind: str) -> None:
-    if kind == "VideoGraph":
-        graph: nn.Module = VideoGraph(video_solver(0))
-        inputs: tuple[Tensor, ...] = (seen_landmarks()[0].float(), torch.ones(68), *graph.start())
-    else:
-        graph = CorrectiveGraph(corrected_solver(0), steps=1)
-        inputs = seen_markers(corrected_rig()).float(), torch.zeros(4, len(NAMES))
+    make, given = exported_graphs()[kind]
+    graph, inputs = make(), given()
     with torch.no_grad():
         program = torch.export.export(graph, inputs, strict=False)
         assert_same(tree_leaves(program.module()(*inputs)), tree_leaves(graph(*inputs)), 1e-5)

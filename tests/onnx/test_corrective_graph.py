@@ -7,15 +7,21 @@ from pathlib import Path
 import onnxruntime
 import pytest
 import torch
+from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
-from torchface.capture import MarkerSolver
+from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
-from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
 from torchface.onnx.corrective_model import corrective_model
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.onnx.solver_graph import SolverGraph
-from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames
+from torchface.onnx.solver_graph_export import (
+    export_hybrid_solver,
+    export_marker_solver,
+    hide_markers,
+    random_frames,
+)
 from torchface.synthetic import performer
 from torchface.synthetic.head.planted_correctives import planted_correctives
 
@@ -63,6 +69,55 @@ def test_onnx_runtime_computes_the_graph(solver: MarkerSolver) -> None:
     start = torch.rand(3, 10, generator=torch.Generator().manual_seed(1))
     (found,) = session.run(None, {"markers": shown.numpy(), "previous": start.numpy()})
     assert (torch.from_numpy(found) - graph(shown, start)).abs().max() < 1e-5
+
+
+def predictions(frames: int) -> tuple[Tensor, Tensor]:
+    """Of a third of the weights; the others' are NaN, which no one may look at."""
+    generator = torch.Generator().manual_seed(3)
+    predicted = torch.rand(frames, 10, generator=generator)
+    gamma = 4 * torch.rand(predicted.shape, generator=generator) * (predicted > 0.66)
+    return torch.where(gamma > 0, predicted, torch.nan), gamma
+
+
+def test_fixed_steps_come_near_the_hybrid_solve(solver: MarkerSolver) -> None:
+    markers, (predicted, gamma), cold = random_frames(solver, 30), predictions(30), torch.zeros(30, 10)
+    graph, exact = HybridCorrectiveGraph(solver), HybridSolver(solver)
+    for shown in (markers, hide_markers(markers, 0.2)):
+        energy, optimum = exact.energy(shown, predicted.nan_to_num(0), gamma), exact(shown, predicted, gamma)
+        least = energy.value(optimum.double())
+        gap = (energy.value(graph(shown, cold, predicted, gamma).double()) - least) / least
+        assert gap.median() < 1e-4
+        assert gap.max() < 0.05
+        alone = (energy.value(solver(shown).double()) - least) / least
+        assert alone.median() > 10 * gap.median().clamp(min=1e-6)
+    assert torch.equal(graph(markers, cold, cold + torch.nan, cold), CorrectiveGraph(solver)(markers, cold))
+
+
+def test_onnx_runtime_computes_the_hybrid_graph(solver: MarkerSolver) -> None:
+    graph = HybridCorrectiveGraph(solver, steps=3)
+    session = onnxruntime.InferenceSession(
+        corrective_model(graph).SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    assert session.get_modelmeta().custom_metadata_map["task"] == "hybrid_solver"
+    shown, (predicted, gamma) = hide_markers(random_frames(solver, 4), 0.2), predictions(4)
+    shown[2], gamma[3] = torch.nan, 0.0
+    start = torch.rand(4, 10, generator=torch.Generator().manual_seed(1))
+    given = {"markers": shown, "previous": start, "predicted": predicted, "gamma": gamma}
+    (found,) = session.run(None, {name: value.numpy() for name, value in given.items()})
+    assert (torch.from_numpy(found) - graph(shown, start, predicted, gamma)).abs().max() < 1e-5
+    torch.testing.assert_close(torch.from_numpy(found)[2], start[2])
+
+
+@pytest.mark.bench
+def test_a_hybrid_file_is_written_and_checked(tmp_path: Path) -> None:
+    whole = performer(texture=False)
+    rig = whole.select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
+    rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 3))
+    report = export_hybrid_solver(
+        rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks), tmp_path / "a.onnx"
+    )
+    assert all(gap.parity < 1e-5 for gap in report.gaps)
+    print(report)
 
 
 @pytest.mark.bench

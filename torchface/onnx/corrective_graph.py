@@ -40,6 +40,8 @@ class CorrectiveGraph(nn.Module):
     rest: Tensor
     rows: Tensor
     identity: Tensor
+    penalty: Tensor
+    curvature: Tensor
     scale: Tensor
     rotation: Tensor
     translation: Tensor
@@ -61,6 +63,9 @@ class CorrectiveGraph(nn.Module):
             ("rest", solver.rest.double()),
             ("rows", solver.every_basis.double().flatten(0, 1)),
             ("identity", torch.eye(shapes, dtype=torch.float64)),
+            # Of the weights' own terms, the slope at zero and the second derivative.
+            ("penalty", torch.full((1, shapes), self.sparsity).double()),
+            ("curvature", torch.full((1, shapes), 2 * self.ridge).double()),
             ("scale", torch.ones(1).double() if given is None else given.scale.double()),
             ("rotation", torch.eye(3).double() if given is None else given.rotation[0].double()),
             ("translation", torch.zeros(3).double() if given is None else given.translation[0].double()),
@@ -73,11 +78,19 @@ class CorrectiveGraph(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
+        self._check(markers, previous)
+        return self._solved(markers, previous, self.penalty, self.curvature)
+
+    def _check(self, markers: Tensor, previous: Tensor) -> None:
         if markers.shape[1:] != self.rest.shape or previous.shape[1:] != (len(self.names),):
             raise ShapeError(
                 f"corrective graph: found markers {tuple(markers.shape)} and previous {tuple(previous.shape)}, "
                 f"expected (B,{len(self.rest)},3) and (B,{len(self.names)})"
             )
+
+    def _solved(self, markers: Tensor, previous: Tensor, penalty: Tensor, curvature: Tensor) -> Tensor:
+        """With the weights' own terms as they are in each frame, (B,N) or (1,N)."""
+        own = penalty, curvature
         missing = torch.isnan(markers).to(markers).amax(-1, keepdim=True)  # (B,M,1)
         placed = self.scale * (torch.where(missing > 0, 0.0, markers).double() @ self.rotation.T) + self.translation
         seen = 1 - missing.double()
@@ -89,31 +102,49 @@ class CorrectiveGraph(nn.Module):
         shapes = len(self.names)
         J = self.rows[:, :shapes].expand(len(w), -1, -1)
         residual = (offset + w @ self.rows[:, :shapes].T) * mask
-        w = w + self._step(w, J, residual, mask, share, LINEAR_SPLITTING)
+        w = w + self._step(w, J, residual, mask, share, own, LINEAR_SPLITTING)
         for number in range(self.steps):
             activation = self.rounded if number < ROUNDED_STEPS else self.activation
             residual = (offset + torch.cat([w, activation(w)], 1) @ self.rows.T) * mask
             J = self.rows[:, :shapes] + self.rows[:, shapes:] @ activation.jacobian(w)
-            step = self._step(w, J, residual, mask, share, SPLITTING)
+            step = self._step(w, J, residual, mask, share, own, SPLITTING)
             # The whole way to the least of the linear model may lead uphill: the best of some lengths.
-            best, least = w, self._energy(w, offset, mask, share, activation)
+            best, least = w, self._energy(w, offset, mask, share, own, activation)
             for length in LENGTHS:
                 there = w + length * step
-                value = self._energy(there, offset, mask, share, activation)
+                value = self._energy(there, offset, mask, share, own, activation)
                 best, least = torch.where(value < least, there, best), torch.minimum(value, least)
             w = best
         return torch.where(count > 0, w, previous.double().clamp(0, 1)).to(markers)
 
-    def _energy(self, w: Tensor, offset: Tensor, mask: Tensor, share: Tensor, activation: nn.Module) -> Tensor:
+    def _energy(
+        self,
+        w: Tensor,
+        offset: Tensor,
+        mask: Tensor,
+        share: Tensor,
+        own: tuple[Tensor, Tensor],
+        activation: nn.Module,
+    ) -> Tensor:
         """(B,1)."""
         residual = (offset + torch.cat([w, activation(w)], 1) @ self.rows.T) * mask
         data = 0.5 * share * residual.square().sum(1, keepdim=True)
-        return data + (self.sparsity * w + self.ridge * w.square()).sum(1, keepdim=True)
+        return data + (w * (own[0] + 0.5 * own[1] * w)).sum(1, keepdim=True)
 
-    def _step(self, w: Tensor, J: Tensor, residual: Tensor, mask: Tensor, share: Tensor, steps: int) -> Tensor:
+    def _step(
+        self,
+        w: Tensor,
+        J: Tensor,
+        residual: Tensor,
+        mask: Tensor,
+        share: Tensor,
+        own: tuple[Tensor, Tensor],
+        steps: int,
+    ) -> Tensor:
         """From w to the least of the linearised energy in the box, (B,N); see ``SolverGraph`` for the splitting."""
-        H = share[..., None] * ((J * mask[..., None]).transpose(1, 2) @ J) + 2 * self.ridge * self.identity
-        slope = share * (residual[:, None] @ J)[:, 0] + self.sparsity + 2 * self.ridge * w
+        penalty, curvature = own
+        H = share[..., None] * ((J * mask[..., None]).transpose(1, 2) @ J) + curvature[:, None] * self.identity
+        slope = share * (residual[:, None] @ J)[:, 0] + penalty + curvature * w
         diagonal = (H * self.identity).sum(1, keepdim=True)
         diagonal = torch.maximum(diagonal, SMALLEST_DIAGONAL * diagonal.amax(2, keepdim=True)).clamp(min=1e-12)
         scale = diagonal.rsqrt()
@@ -130,3 +161,36 @@ class CorrectiveGraph(nn.Module):
             v = constant + v @ minus_step + z @ double_step
             z = v.clamp(0.0, 1.0)
         return z[:, 0] - w
+
+
+class HybridCorrectiveGraph(CorrectiveGraph):
+    r"""``HybridSolver`` of a rig with correctives as operators that ONNX has.
+
+    What a classifier predicts pulls the weights as a ridge about its predictions does, so the steps are those of
+    ``CorrectiveGraph``. A frame without a marker gives ``previous``, whatever is predicted.
+    """
+
+    inputs = ("markers", "previous", "predicted", "gamma")
+
+    def forward(  # type: ignore[override]
+        self, markers: Tensor, previous: Tensor, predicted: Tensor, gamma: Tensor
+    ) -> Tensor:
+        r"""Weights in [0,1], (B,N).
+
+        Args:
+            markers, previous: as ``CorrectiveGraph`` takes them.
+            predicted: :math:`\tilde w`, (B,N); looked at where :math:`\gamma > 0`.
+            gamma: :math:`\gamma`, (B,N), mm² over all markers; zero for the markers alone.
+
+        Raises:
+            ShapeError: the shapes do not fit.
+        """
+        if predicted.shape != previous.shape or gamma.shape != previous.shape:
+            raise ShapeError(
+                f"hybrid graph: found predicted {tuple(predicted.shape)} and gamma {tuple(gamma.shape)}, expected "
+                f"{tuple(previous.shape)}"
+            )
+        self._check(markers, previous)
+        pull = (2 / len(self.labels)) * gamma.double()
+        target = torch.where(gamma > 0, predicted.clamp(0.0, 1.0), 0.0).double()
+        return self._solved(markers, previous, self.penalty - pull * target, self.curvature + pull)

@@ -17,6 +17,7 @@ from torchface.onnx.corrective_graph import (
     SMALLEST_DIAGONAL,
     SPLITTING,
     CorrectiveGraph,
+    HybridCorrectiveGraph,
 )
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.solver_graph import NEWTON_SCALE
@@ -30,15 +31,15 @@ def corrective_model(graph: CorrectiveGraph, facts: Mapping[str, object] | None 
 
     Built node by node, as that one is: the exporter takes minutes for as many.
     """
-    markers, shapes = len(graph.labels), len(graph.names)
+    markers, shapes, hybrid = len(graph.labels), len(graph.names), isinstance(graph, HybridCorrectiveGraph)
     writer = _Writer(graph)
     writer.write()
     return writer.build.model(
-        "marker_solver",
-        {"markers": ("batch", markers, 3), "previous": ("batch", shapes)},
+        "hybrid_solver" if hybrid else "marker_solver",
+        {name: ("batch", shapes) if name != "markers" else ("batch", markers, 3) for name in graph.inputs},
         {"weights": ("batch", shapes)},
         {
-            "task": "solver",
+            "task": "hybrid_solver" if hybrid else "solver",
             "shape_names": list(graph.names),
             "marker_labels": list(graph.labels),
             "correctives": len(graph.activation.definitions),
@@ -92,6 +93,7 @@ class _Writer:
         self.share = op("Div", self.scalar(2.0), op("Max", count, self.one))
         self.deep_share = op("Reshape", self.share, "cell")
         self.offset = op("Mul", op("Reshape", op("Sub", self.number(graph.rest), placed), "all"), self.mask)
+        self._write_own_terms()
         before = op("Clip", op("Cast", "previous", to=_DOUBLE), self.zero, self.one)
         w = before
         moved = op("MatMul", w, self.number(graph.rows[:, : len(graph.names)].T))
@@ -102,6 +104,19 @@ class _Writer:
             w = self._gauss_newton(w, rounded)
         told = op("Greater", count, self.zero)
         op("Cast", op("Where", told, w, before), to=onnx.TensorProto.FLOAT, output="weights")
+
+    def _write_own_terms(self) -> None:
+        """Of the weights: slope at zero, second derivative, and the latter as matrices."""
+        op, graph = self.op, self.graph
+        self.penalty, self.curvature = self.number(graph.penalty), self.number(graph.curvature)
+        if isinstance(graph, HybridCorrectiveGraph):
+            gamma, zero = op("Cast", "gamma", to=_DOUBLE), self.zero
+            pull = op("Mul", gamma, self.scalar(2 / len(graph.labels)))
+            predicted = op("Clip", op("Cast", "predicted", to=_DOUBLE), zero, self.one)
+            target = op("Where", op("Greater", gamma, zero), predicted, zero)
+            self.penalty = op("Sub", self.penalty, op("Mul", pull, target))
+            self.curvature = op("Add", self.curvature, pull)
+        self.own_matrices = op("Mul", op("Reshape", self.curvature, "row"), self.identity)
 
     def _gauss_newton(self, w: str, rounded: bool) -> str:
         op = self.op
@@ -123,7 +138,8 @@ class _Writer:
         op, residual = self.op, self._residual(w, rounded)
         squared = op("ReduceSum", op("Mul", residual, residual), "last", keepdims=1)
         data = op("Mul", op("Mul", self.share, self.scalar(0.5)), squared)
-        own = op("Mul", w, op("Add", self.scalar(self.graph.sparsity), op("Mul", w, self.scalar(self.graph.ridge))))
+        slope = op("Add", self.penalty, op("Mul", op("Mul", w, self.curvature), self.scalar(0.5)))
+        own = op("Mul", w, slope)
         return op("Add", data, op("ReduceSum", own, "last", keepdims=1))
 
     def _factors(self, w: str) -> list[str]:
@@ -210,10 +226,10 @@ class _Writer:
 
         masked = turned(op("Mul", J, self.deep_mask))
         H = op("Mul", self.deep_share, op("MatMul", masked, J))
-        H = op("Add", H, self.number(2 * graph.ridge * graph.identity))
+        H = op("Add", H, self.own_matrices)
         slope = op("MatMul", op("Reshape", residual, "wide"), J)
         slope = op("Mul", self.deep_share, slope)
-        own = op("Add", op("Mul", w, self.scalar(2 * graph.ridge)), self.scalar(graph.sparsity))
+        own = op("Add", op("Mul", w, self.curvature), self.penalty)
         slope = op("Add", slope, op("Reshape", own, "row"))
         diagonal = op("ReduceSum", op("Mul", H, self.identity), "last", keepdims=1)
         least = op("Mul", op("ReduceMax", diagonal, axes=[2], keepdims=1), self.scalar(SMALLEST_DIAGONAL))

@@ -80,7 +80,9 @@ class SolverGraph(nn.Module):
     ) -> None:
         super().__init__()
         if solver.activation is not None:
-            raise ValueRangeError("solver graph: found a rig with correctives, expected none; see CorrectiveGraph")
+            raise ValueRangeError(
+                "solver graph: found a rig with correctives, expected none; see torchface.onnx.corrective_graph"
+            )
         self.names, self.labels = solver.names, solver.labels
         self.steps, self.steps_with_gaps, self.rho = steps, steps_with_gaps, rho
         self.sparsity, self.ridge = penalty_value(solver.sparsity), penalty_value(solver.ridge)

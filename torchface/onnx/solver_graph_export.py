@@ -21,7 +21,7 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.similarity import Similarity
 from torchface.number_checks import checked_count
-from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph
 from torchface.onnx.corrective_model import corrective_model
 from torchface.onnx.hybrid_graph import HybridGraph
 from torchface.onnx.solver_graph import STEPS, STEPS_WITH_GAPS, SolverGraph
@@ -204,7 +204,7 @@ def export_hybrid_solver(
     says, and ``gamma`` (B,N), how much that counts, mm² over all markers. Where gamma is zero in a whole batch it
     computes what the other graph does. It is checked with random predictions for a seventh of the weights.
 
-    Args, Raises: as :func:`export_solver`.
+    Args, Raises: as :func:`export_solver`; a rig with correctives takes ``HybridCorrectiveGraph``'s steps.
 
     Example:
         >>> from torchface.synthetic import performer
@@ -214,13 +214,18 @@ def export_hybrid_solver(
         'hybrid.onnx'
     """
     solver = MarkerSolver(rig, attachment, alignment, sparsity, ridge).cpu().float()
-    frames = random_frames(solver, _TEST_FRAMES) if markers is None else markers.cpu().float()
-    graph = HybridGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
+    count = _TEST_FRAMES if solver.activation is None else _CORRECTIVE_FRAMES
+    frames = random_frames(solver, count) if markers is None else markers.cpu().float()
     generator = torch.Generator().manual_seed(1)
     shape = (len(frames), len(solver.names))
     predicted, strength = torch.rand(shape, generator=generator), GAMMA * torch.rand(shape, generator=generator)
     gamma = torch.where(torch.rand(shape, generator=generator) < 1 / 7, strength, 0.0)
-    return _export(solver_model(graph), graph, HybridSolver(solver), frames, (predicted, gamma), path)
+    more = predicted, gamma
+    if solver.activation is not None:
+        corrected = HybridCorrectiveGraph(solver)
+        return _export(corrective_model(corrected), corrected, HybridSolver(solver), frames, more, path)
+    graph = HybridGraph(solver, steps.seen, steps.with_gaps, choose_rho(solver, steps.seen, frames))
+    return _export(solver_model(graph), graph, HybridSolver(solver), frames, more, path)
 
 
 def _export(
