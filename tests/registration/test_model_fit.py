@@ -18,7 +18,7 @@ from torchface.mesh import Mesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register
 from torchface.registration.model_fit import LinearShape, shape_model
-from torchface.workflows.register.register_scans import register_scans
+from torchface.workflows.register.register_scans import ScanSettings, register_scans
 from torchface.workflows.register.scan_job import ScanJob
 
 
@@ -111,7 +111,7 @@ def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned:
         points = {"points": face[mask.landmarks].tolist()}
         (tmp_path / "scans" / f"{number}.ljson").write_text(json.dumps({"version": 2, "landmarks": points}))
     settings = {"landmarks": tmp_path / "scans", "schedule": short, "texture_size": 0}
-    done = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
+    done = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", ScanSettings(model=waves, **settings))
     assert len(done.done) == 2
     sent = pickle.loads(pickle.dumps(ScanJob(mask, short, 0, model=LinearShape.of(waves))))
     assert torch.equal(sent.model.modes, waves.modes.float())
@@ -119,8 +119,8 @@ def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned:
         marks = load_scan_landmarks(tmp_path / "scans" / f"{entry.name}.ljson", mask, entry.item.path)
         alone = register(mask, load_mesh(entry.item.path), marks, model=LinearShape.of(waves), schedule=short)
         assert (load_mesh(entry.results[0]).vertices - alone.mesh.vertices).abs().max() < 1e-3
-    again = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=waves, **settings)
+    again = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", ScanSettings(model=waves, **settings))
     assert all(entry.reused for entry in again.outcomes)
     other = Waves(waves.mean, 1.1 * waves.modes)
-    changed = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", model=other, **settings)
+    changed = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", ScanSettings(model=other, **settings))
     assert not any(entry.reused for entry in changed.outcomes)

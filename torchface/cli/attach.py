@@ -67,24 +67,25 @@ def attach(
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock
+    from torchface.workflows.attach.attach_markers import AttachSettings
     from torchface.workflows.attach.attach_markers import attach as find_sites
     from torchface.workflows.attach.motion_job import MOTIONS, MotionJob
     from torchface.workflows.batch.batch_items import check_folder, find_items, is_batch
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MarkerOptions
 
-    options = MarkerOptions(unit, labels, frames, flip)
+    settings = AttachSettings(initial, standoff, part, MarkerOptions(unit, labels, frames, flip), insist)
     if cluster is not None or is_batch(rom, MOTIONS):
         check_folder(out)
         if picture is not None:
             raise ValueRangeError("--picture: found many takes, of which each gets OUT/NAME.png without it")
-        job = MotionJob(rig, initial, standoff, part, options, insist)
+        job = MotionJob(rig, settings)
         with progress_bars(quiet) as progress:
             where = BatchOptions(jobs, cluster, time_limit)
             batch = run_batch(job, MOTIONS, find_items(rom, MOTIONS), out, where, progress, skipped_lines(quiet))
         show_batch(batch, _COLUMNS, "error_mm")
         return
     with file_lock(out), progress_bars(quiet) as progress:
-        report = find_sites(rig, rom[0], out, initial, standoff, picture, part, progress, options, insist)
+        report = find_sites(rig, rom[0], out, settings, picture, progress)
     print_lines(report.lines())
     print_path(out)

@@ -51,21 +51,24 @@ def register(
     """
     from torchface.files.job_lock import job_lock
     from torchface.workflows.batch.run_batch import BatchOptions
-    from torchface.workflows.register.register_scans import load_shape_model, load_template, register_scans
+    from torchface.workflows.register.register_scans import (
+        ScanSettings,
+        load_shape_model,
+        load_template,
+        register_scans,
+    )
 
     with job_lock(out), progress_bars(quiet) as progress:
+        heads = None if model is None else load_shape_model(model)
+        settings = ScanSettings(landmarks, unit, texture_size=texture_size, detector=detector, model=heads)
         done = register_scans(
             load_template(template, part),
             scans,
             out,
+            settings,
             BatchOptions(jobs, cluster, time_limit),
             progress,
-            finished=skipped_lines(quiet),
-            landmarks=landmarks,
-            unit=unit,
-            texture_size=texture_size,
-            detector=detector,
-            model=None if model is None else load_shape_model(model),
+            skipped_lines(quiet),
         )
     # The worst first: those are the ones to look at.
     show_batch(

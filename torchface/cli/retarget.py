@@ -44,9 +44,11 @@ def retarget(
         quiet: Show no progress.
     """
     from torchface.workflows.retarget_weights import retarget_weights
+    from torchface.workflows.weight_files import WeightFiles
 
     with progress_bars(quiet) as progress:
-        done = retarget_weights(weights, to, from_, table, out, animation, part, live_link, progress)
+        files = WeightFiles(out, animation, live_link)
+        done = retarget_weights(weights, to, files, from_, table, part, progress)
     driven = len(done.shapes.to_names) - len(done.shapes.undriven)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
     for what, names in (("nothing drives", done.shapes.undriven), ("drives nothing:", done.shapes.unused)):

@@ -100,7 +100,7 @@ def solve(
     from torchface.workflows.batch.run_batch import BatchOptions, run_batch
     from torchface.workflows.marker_input import MARKER_TAKES, MarkerOptions
     from torchface.workflows.solve.head_camera import HeadCamera
-    from torchface.workflows.solve.solve_take import SolveSettings, solve_take
+    from torchface.workflows.solve.solve_take import SolveSettings, TakeInputs, TakeOutputs, solve_take
     from torchface.workflows.solve.take_job import TakeJob
 
     if labels is not None and labels.suffix.lower() == ".toml":
@@ -127,20 +127,7 @@ def solve(
         show_batch(batch, _COLUMNS, "rmse_mm")
         return
     with file_lock(out), progress_bars(quiet) as progress:
-        done = solve_take(
-            rig,
-            take[0],
-            attachment,
-            out,
-            animation,
-            settings,
-            part,
-            report,
-            stream,
-            camera,
-            progress,
-            options,
-            live_link,
-        )
+        inputs = TakeInputs(rig, take[0], attachment, part, camera, options)
+        done = solve_take(inputs, TakeOutputs(out, animation, live_link, report, stream), settings, progress)
     print_lines(done.lines())
     print_path(out)

@@ -36,7 +36,7 @@ class CapturedPerformance:
     Example:
         >>> from torchface.synthetic import performer
         >>> rig = performer(texture=False).select(["jawOpen"])
-        >>> frames = rig(torch.tensor([[0.0], [1.0], [0.0], [0.5]]))
+        >>> frames = rig(rig.vertices.new_tensor([[0.0], [1.0], [0.0], [0.5]]))
         >>> performance = CapturedPerformance(frames, rig.neutral.faces, torch.tensor([0, 0, 1, 1]), rig.vertices)
         >>> len(performance.frames), performance.coarse is None
         (4, True)

@@ -16,14 +16,13 @@ from torchface.capture.mouth_close import (
 )
 from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_take, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.files.whole_files import make_folder
 from torchface.io import load_rig, load_take, save_animation
-from torchface.io.animation_files import check_animation_ending
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_sources
 from torchface.take import Take, Track
-from torchface.workflows.weight_files import check_live_link, write_weights
+from torchface.workflows.weight_files import WeightFiles, check_live_link, write_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +43,10 @@ class Retargeted:
 def retarget_weights(
     weights: Path,
     to: Path,
-    source: Path | None,
-    table: Path | None,
-    out: Path,
-    animation: Path | None = None,
+    files: WeightFiles,
+    source: Path | None = None,
+    table: Path | None = None,
     part: str | None = None,
-    live_link: Path | None = None,
     progress: Progress | None = None,
 ) -> Retargeted:
     """Reads, maps, writes; see ``torchface retarget --help`` for the arguments.
@@ -60,15 +57,13 @@ def retarget_weights(
         TorchfaceError: any file is broken.
     """
     progress = progress or silent
-    check_writable(out, live_link, animation)
-    if animation is not None:
-        check_animation_ending(animation)
+    files.check()
     progress("reading")
     played = load_take(weights)
     if played.weights is None:
         raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
     target = load_rig(to, part=part)
-    check_live_link(target.names, live_link)
+    check_live_link(target.names, files.live_link)
     rig = None
     if source is not None:
         rig = load_rig(source)
@@ -82,10 +77,10 @@ def retarget_weights(
         raise NameMismatchError(f"{table or weights}: {error}") from error
     moved, told = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
     progress("writing")
-    written = [*told, *write_weights(moved, out, live_link)]
-    if animation is not None:
-        make_folder(animation.parent)
-        save_animation(target, moved, animation)
+    written = [*told, *write_weights(moved, files.out, files.live_link)]
+    if files.animation is not None:
+        make_folder(files.animation.parent)
+        save_animation(target, moved, files.animation)
     return Retargeted(moved, shapes, tuple(written))
 
 

@@ -3,16 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from torchface.errors import NameMismatchError
-from torchface.files.whole_files import all_or_none, make_folder
+from torchface.files.whole_files import all_or_none, check_writable, make_folder
+from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take
 
 _SHOWN = 8
+
+
+@dataclass(frozen=True)
+class WeightFiles:
+    """What is written of a take's weights.
+
+    Args:
+        out: the weights, see :func:`write_weights`.
+        animation: the rig with this animation, ``.glb`` or USD, if wanted.
+        live_link: Live Link Face's CSV whatever the names are, if wanted.
+    """
+
+    out: Path
+    animation: Path | None = None
+    live_link: Path | None = None
+
+    def check(self, folder: Path | None = None) -> None:
+        """Raises where one of them, or a folder beside, cannot be written to or has another ending than it may have."""
+        check_writable(self.out, self.live_link, self.animation, folder=folder)
+        if self.animation is not None:
+            check_animation_ending(self.animation)
 
 
 def check_live_link(names: Sequence[str], target: Path | str | None) -> None:

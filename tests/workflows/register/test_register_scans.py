@@ -28,7 +28,7 @@ from torchface.registration.model_fit import LinearShape
 from torchface.workflows.batch.batch_items import BatchItem, find_items
 from torchface.workflows.batch.outcomes import Outcome
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport
-from torchface.workflows.register.register_scans import SCANS, register_scans
+from torchface.workflows.register.register_scans import SCANS, ScanSettings, register_scans
 from torchface.workflows.register.scan_job import ScanJob
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -61,7 +61,7 @@ def scans(
 
 
 def run(template: Mesh, scans: Path, out: Path, **more: object) -> BatchReport:
-    return register_scans(template, [scans], out, landmarks=scans, schedule=SHORT, texture_size=0, **more)  # type: ignore[arg-type]
+    return register_scans(template, [scans], out, ScanSettings(landmarks=scans, schedule=SHORT, texture_size=0), **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
     out, chance = tmp_path / "out", random.Random(0)
     kept: dict[str, int] = {}
     kills = 0
-    settings = {"landmarks": scans, "schedule": SHORT, "texture_size": 0}
+    settings = {"settings": ScanSettings(landmarks=scans, schedule=SHORT, texture_size=0)}
     for number in range(1, 11):
         process = context.Process(target=register_scans, args=(template, [scans], out), kwargs=settings)
         process.start()
@@ -251,13 +251,13 @@ def test_mistakes_are_told_before_anything_is_done(
     with pytest.raises(TopologyError, match="template: found 0 triangles"):
         register_scans(Mesh(template.vertices, template.faces[:0]), [scans], tmp_path / "out")
     with pytest.raises(ValueRangeError, match="jobs: found 0"):
-        register_scans(template, [scans], tmp_path / "out", BatchOptions(0))
+        register_scans(template, [scans], tmp_path / "out", options=BatchOptions(0))
     with pytest.raises(FileFormatError, match="landmarks: found no folder"):
-        register_scans(template, [scans], tmp_path / "out", landmarks=tmp_path / "none")
+        register_scans(template, [scans], tmp_path / "out", ScanSettings(landmarks=tmp_path / "none"))
     assert not (tmp_path / "out").exists()
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"-m pip install 'ray>=2.40'"):
-        register_scans(template, [scans], tmp_path / "out", BatchOptions(cluster="auto"))
+        register_scans(template, [scans], tmp_path / "out", options=BatchOptions(cluster="auto"))
 
 
 def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

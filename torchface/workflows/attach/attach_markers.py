@@ -144,44 +144,59 @@ def _usable(cleanup: Cleanup, take: Take) -> Take:
     return replace(take, markers=Track(take.markers.names, values, take.markers.confidence))
 
 
+@dataclass(frozen=True)
+class AttachSettings:
+    """How marker sites are found on a rig.
+
+    Args:
+        initial: a file of sites to begin from; found by the markers' shape if absent.
+        standoff: find how far the markers' centres lie above the skin.
+        part: an annotated region that the rig is cut to, such as ``"face"``.
+        options: how the take's markers are read.
+        insist: write the sites although the rig does not explain the markers, or the take leaves most uncertain.
+    """
+
+    initial: Path | None = None
+    standoff: bool = False
+    part: str | None = None
+    options: MarkerOptions = DEFAULT_OPTIONS
+    insist: bool = False
+
+
 def attach(
     rig: Path,
     rom: Path,
     out: Path,
-    initial: Path | None = None,
-    standoff: bool = False,
+    settings: AttachSettings = AttachSettings(),
     picture: Path | None = None,
-    part: str | None = None,
     progress: Progress | None = None,
-    options: MarkerOptions = DEFAULT_OPTIONS,
-    insist: bool = False,
 ) -> AttachReport:
-    """Reads, finds the sites, writes them; see ``torchface attach --help`` for the arguments.
+    """Reads, finds the sites, writes them, and a picture of them where one is wanted; see ``torchface attach --help``.
 
     Raises:
-        AlignmentError: the rig does not explain the markers, or they are mirrored, unless ``insist``.
-        ValueRangeError: the take leaves most sites or shapes uncertain, unless ``insist``.
+        AlignmentError: the rig does not explain the markers, or they are mirrored, unless the settings insist.
+        ValueRangeError: the take leaves most sites or shapes uncertain, unless the settings insist.
         TorchfaceError: a file is broken, the take shows no motion, or the files do not fit each other.
     """
     progress = progress or silent
     check_writable(out, picture)
     progress("reading the rig")
-    loaded = load_rig(rig, part=part)
+    loaded = load_rig(rig, part=settings.part)
     progress("reading the range of motion")
-    start = None if initial is None else load_sites(initial, loaded.neutral, rig)
-    take, start, notes = read_range_of_motion(rom, start, options)
+    start = None if settings.initial is None else load_sites(settings.initial, loaded.neutral, rig)
+    take, start, notes = read_range_of_motion(rom, start, settings.options)
     if start is None:
         progress("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
-    elif not insist:
+    elif not settings.insist:
         sites = start.on(loaded.neutral.faces, loaded.vertices)
         check_not_mirrored(marker_paths(take, start), sites, str(rom))
-    fit, cleanup = cleaned_fit(loaded, take, start, standoff, progress)
+    fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress)
     notes = [*notes, *pose_warnings(fit.alignment)]
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
-        if not insist:
+        if not settings.insist:
             raise type(error)(f"{rom}: {error}; {_INSIST}") from None
         notes = [*notes, str(error)]
     faces, vertices = loaded.neutral.faces, loaded.vertices

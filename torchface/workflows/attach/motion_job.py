@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 
 from torchface.files.content_keys import content_key
-from torchface.workflows.attach.attach_markers import attach
+from torchface.workflows.attach.attach_markers import AttachSettings, attach
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import small_picture
 from torchface.workflows.batch.outcomes import Made
-from torchface.workflows.marker_input import DEFAULT_OPTIONS, MARKER_TAKES, MarkerOptions
+from torchface.workflows.marker_input import MARKER_TAKES
 
 MOTIONS = replace(MARKER_TAKES, done="attached")
-_METHOD = "attach batch/1"
+_METHOD = "attach batch/2"
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,11 @@ class MotionJob:
     """How the sites of each take are found; ``{name}`` in a path is the take's name.
 
     Args:
-        rig, initial, standoff, part, options, insist: see :func:`attach`.
+        rig, settings: see :func:`attach`.
     """
 
     rig: Path
-    initial: Path | None = None
-    standoff: bool = False
-    part: str | None = None
-    options: MarkerOptions = DEFAULT_OPTIONS
-    insist: bool = False
+    settings: AttachSettings
 
     def key(self, item: BatchItem) -> str:
         """A key of all that the sites depend on."""
@@ -44,17 +40,7 @@ class MotionJob:
             TorchfaceError: they cannot be found.
         """
         own, sites, picture = item.owned(self), out / f"{item.name}.json", out / f"{item.name}.png"
-        done = attach(
-            own.rig,
-            item.path,
-            sites,
-            own.initial,
-            own.standoff,
-            picture,
-            own.part,
-            options=own.options,
-            insist=own.insist,
-        )
+        done = attach(own.rig, item.path, sites, own.settings, picture)
         last = done.fit.errors[-1]
         error = float(torch.as_tensor(last).mean())
         return Made(

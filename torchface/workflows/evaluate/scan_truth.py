@@ -15,7 +15,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_mesh
 from torchface.progress import Progress
 from torchface.workflows.animated_meshes import AnimatedMesh
-from torchface.workflows.register.register_scans import register_scans
+from torchface.workflows.register.register_scans import ScanSettings, register_scans
 
 NEAR = 2.0
 """Millimetres; a vertex that came to lie further from the scan, or on its border, only followed its neighbours."""
@@ -119,15 +119,8 @@ def scan_truth(
         raise TopologyError(
             f"{result.path}: found meshes without a rig, expected the rig whose neutral is laid on the scans (--rig)"
         )
-    report = register_scans(
-        result.neutral,
-        scans,
-        out,
-        progress=progress,
-        landmarks=landmarks,
-        unit=unit,
-        texture_size=0,
-    )
+    settings = ScanSettings(landmarks, unit, texture_size=0)
+    report = register_scans(result.neutral, scans, out, settings, progress=progress)
     lost = report.skipped
     if lost:
         raise AlignmentError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from torchface import zoo
@@ -34,30 +35,11 @@ def load_template(path: Path, part: str | None = None, unit: str | None = None) 
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh
 
 
-def register_scans(
-    template: Mesh,
-    scans: Sequence[str | Path],
-    out: str | Path,
-    options: BatchOptions = ONE_BY_ONE,
-    progress: Progress | None = None,
-    *,
-    finished: Callable[[Outcome], None] | None = None,
-    landmarks: str | Path | None = None,
-    unit: str | None = None,
-    schedule: Schedule = DEFAULT_SCHEDULE,
-    texture_size: int = 1024,
-    detector: str | Path | None = None,
-    model: ShapeModel | HasShape | None = None,
-) -> BatchReport:
-    """Registers scans one by one into a folder: ``NAME.glb`` and ``records/NAME.json`` of each, a table and a sheet.
+@dataclass(frozen=True, eq=False)
+class ScanSettings:
+    """What is known of scans, and how each is registered.
 
     Args:
-        template: a face, millimetres.
-        scans: files and folders; a folder stands for the scans in it, sorted by name.
-        out: the folder to write into, made where it is missing; not one that holds scans or landmarks.
-        options: how many processes, or which cluster, and how long each scan may take.
-        progress: called with how many scans are done, and of how many; those of an earlier run count at once.
-        finished: called with each scan's outcome, those of an earlier run first.
         landmarks: a folder of landmark files named as the scans are; see ``load_scan_landmarks``. A scan without one
             is registered without landmarks.
         unit: of the scans' files; if absent metres for glTF, millimetres for the others.
@@ -66,15 +48,50 @@ def register_scans(
         model: of faces in the template's topology, which each registration starts from; see ``register``.
 
     Raises:
+        ValueRangeError: an unknown unit, or a texture of a size that makes no sense.
+    """
+
+    landmarks: str | Path | None = None
+    unit: str | None = None
+    schedule: Schedule = DEFAULT_SCHEDULE
+    texture_size: int = 1024
+    detector: str | Path | None = None
+    model: ShapeModel | HasShape | None = None
+
+    def __post_init__(self) -> None:
+        if self.unit is not None:
+            millimetres_per(self.unit)
+        if self.texture_size < 0 or self.texture_size > _LARGEST_TEXTURE:
+            raise ValueRangeError(f"texture_size: found {self.texture_size}, expected 0 to {_LARGEST_TEXTURE}")
+
+
+def register_scans(
+    template: Mesh,
+    scans: Sequence[str | Path],
+    out: str | Path,
+    settings: ScanSettings = ScanSettings(),
+    options: BatchOptions = ONE_BY_ONE,
+    progress: Progress | None = None,
+    finished: Callable[[Outcome], None] | None = None,
+) -> BatchReport:
+    """Registers scans one by one into a folder: ``NAME.glb`` and ``records/NAME.json`` of each, a table and a sheet.
+
+    Args:
+        template: a face, millimetres.
+        scans: files and folders; a folder stands for the scans in it, sorted by name.
+        out: the folder to write into, made where it is missing; not one that holds scans or landmarks.
+        settings: where the scans' landmarks are, and how each is registered.
+        options: how many processes, or which cluster, and how long each scan may take.
+        progress: called with how many scans are done, and of how many; those of an earlier run count at once.
+        finished: called with each scan's outcome, those of an earlier run first.
+
+    Raises:
         FileFormatError: no scan is named or found, or ``out`` cannot be written to.
         TopologyError, ValueRangeError: a template that nothing can be registered with.
-        ValueRangeError: settings that make no sense, another run writing into ``out``, or no cluster there.
+        ValueRangeError: another run writing into ``out``, or no cluster there.
         MissingExtraError: a cluster is asked for and ray is not installed.
     """
-    if unit is not None:
-        millimetres_per(unit)
-    if texture_size < 0 or texture_size > _LARGEST_TEXTURE:
-        raise ValueRangeError(f"texture_size: found {texture_size}, expected 0 to {_LARGEST_TEXTURE}")
+    landmarks, detector, model = settings.landmarks, settings.detector, settings.model
     check_template(template)
     found = find_items(scans, SCANS)
     marks = None if landmarks is None else _folder("landmarks", landmarks)
@@ -82,10 +99,10 @@ def register_scans(
         raise ValueRangeError(f"out: found {out}, which holds landmarks; expected another folder")
     job = ScanJob(
         template,
-        schedule,
-        texture_size,
+        settings.schedule,
+        settings.texture_size,
         marks,
-        unit,
+        settings.unit,
         None if detector is None else _folder("detector", zoo.find(detector)),
         None if model is None else LinearShape.of(shape_model(model, template)),
     )

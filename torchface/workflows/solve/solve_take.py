@@ -23,10 +23,9 @@ from torchface.capture.markers import HelmetMotion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.errors import ValueRangeError
 from torchface.evaluation import marker_rmse
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, save_animation
-from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.udp_sending import find_receiver
 from torchface.onnx.live_solver import LiveMarkerSolver
 from torchface.progress import Progress, silent
@@ -38,7 +37,7 @@ from torchface.workflows.solve.head_camera import HeadCamera, Predicted, predict
 from torchface.workflows.solve.solution import Solution, SolveReport
 from torchface.workflows.solve.take_check import check_coverage, check_explained, fit_warnings
 from torchface.workflows.solve.weight_stream import StreamReport, stream_markers, stream_weights
-from torchface.workflows.weight_files import check_live_link, write_weights
+from torchface.workflows.weight_files import WeightFiles, check_live_link, write_weights
 
 _SHOWN_SPANS = 6
 
@@ -169,43 +168,68 @@ def _without_slip(
     return replace(take, markers=Track(take.markers.names, motion.undo(values).to(take.markers.values))), motion
 
 
+@dataclass(frozen=True)
+class TakeInputs:
+    """What is solved.
+
+    Args:
+        rig: a file or folder of the performer's rig.
+        take: a file of markers.
+        attachment: a file that says where the markers sit on the rig.
+        part: an annotated region that the rig is cut to, such as ``"face"``.
+        camera: what a head camera saw of the take.
+        options: how the take's markers are read.
+    """
+
+    rig: Path
+    take: Path
+    attachment: Path
+    part: str | None = None
+    camera: HeadCamera | None = None
+    options: MarkerOptions = DEFAULT_OPTIONS
+
+
+@dataclass(frozen=True)
+class TakeOutputs(WeightFiles):
+    """What becomes of a solved take.
+
+    Args:
+        out, animation, live_link: see :class:`~torchface.workflows.weight_files.WeightFiles`.
+        report: a folder for a page, if wanted.
+        stream: an address that the weights are sent to in their own time, if wanted.
+    """
+
+    report: Path | None = None
+    stream: str | None = None
+
+
 def solve_take(
-    rig: Path,
-    take: Path,
-    attachment: Path,
-    out: Path,
-    animation: Path | None = None,
+    inputs: TakeInputs,
+    outputs: TakeOutputs,
     settings: SolveSettings = SolveSettings(),
-    part: str | None = None,
-    report: Path | None = None,
-    stream: str | None = None,
-    camera: HeadCamera | None = None,
     progress: Progress | None = None,
-    options: MarkerOptions = DEFAULT_OPTIONS,
-    live_link: Path | None = None,
 ) -> SolveReport:
-    """Reads, solves, writes; see ``torchface solve --help`` for the arguments.
+    """Reads, solves, writes; see ``torchface solve --help``.
 
     Raises:
         ValueRangeError: the take holds no markers.
         TorchfaceError: any file is broken or does not fit the others.
     """
     progress = progress or silent
-    check_writable(out, live_link, animation, folder=report)
-    if animation is not None:
-        check_animation_ending(animation)
+    report, stream, camera = outputs.report, outputs.stream, inputs.camera
+    outputs.check(report)
     if stream is not None:
         find_receiver(stream)
     progress("reading the rig")
-    loaded = load_rig(rig, part=part)
-    check_live_link(loaded.names, live_link)
+    loaded = load_rig(inputs.rig, part=inputs.part)
+    check_live_link(loaded.names, outputs.live_link)
     if stream is not None:
         check_live_link(loaded.names, stream)
-    where = Attachment.load(attachment)
-    where.check(loaded.neutral, attachment, rig)
+    where = Attachment.load(inputs.attachment)
+    where.check(loaded.neutral, inputs.attachment, inputs.rig)
     progress("reading the take")
-    played, notes = read_markers(take, where.labels or (), options)
-    span = frame_span(options.frames, len(played))
+    played, notes = read_markers(inputs.take, where.labels or (), inputs.options)
+    span = frame_span(inputs.options.frames, len(played))
     if settings.neutral is not None:
         settings = replace(settings, neutral=_within(settings.neutral, span))
     predicted = None if camera is None else predicted_curves(camera, played, loaded.names, progress).frames(span)
@@ -216,10 +240,10 @@ def solve_take(
     solved = solution.take
     assert solved.weights is not None
     progress("writing")
-    written = write_weights(solved, out, live_link)
-    if animation is not None:
-        make_folder(animation.parent)
-        save_animation(loaded, solved, animation)
+    written = write_weights(solved, outputs.out, outputs.live_link)
+    if outputs.animation is not None:
+        make_folder(outputs.animation.parent)
+        save_animation(loaded, solved, outputs.animation)
     sites = solution.attachment
     offset = torch.zeros(len(sites.triangles), 3) if sites.residual is None else sites.residual
     rmse = marker_rmse(loaded, sites, solved.weights.values[..., 0], solution.markers - offset.to(solution.markers))
@@ -239,7 +263,7 @@ def solve_take(
         from torchface.workflows.solve.solve_page import write_solve_page  # matplotlib takes its time
 
         progress("writing the report")
-        write_solve_page(report, take.name, done, loaded, solution)
+        write_solve_page(report, inputs.take.name, done, loaded, solution)
     if stream is not None:
         progress(f"sending to {stream}")
         done = replace(done, sent=_sent(loaded, solution, settings, stream, predicted is not None))

@@ -13,7 +13,7 @@ from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.outcomes import Made
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
 from torchface.workflows.solve.head_camera import HeadCamera
-from torchface.workflows.solve.solve_take import SolveSettings, solve_take
+from torchface.workflows.solve.solve_take import SolveSettings, TakeInputs, TakeOutputs, solve_take
 
 _METHOD = "solve/1"
 
@@ -59,18 +59,12 @@ class TakeJob:
             TorchfaceError: it cannot be solved.
         """
         weights, animation, live_link = out / f"{item.name}.csv", item.own(self.animation), item.own(self.live_link)
+        camera = None if self.camera is None else item.owned(self.camera)
+        rig, attachment, options = item.own(self.rig), item.own(self.attachment), item.owned(self.options)
         done = solve_take(
-            item.own(self.rig),
-            item.path,
-            item.own(self.attachment),
-            weights,
-            animation,
+            TakeInputs(rig, item.path, attachment, self.part, camera, options),
+            TakeOutputs(weights, animation, live_link, item.own(self.report)),
             self.settings,
-            self.part,
-            item.own(self.report),
-            camera=None if self.camera is None else item.owned(self.camera),
-            options=item.owned(self.options),
-            live_link=live_link,
         )
         assert done.rig is not None
         assert done.take.weights is not None
