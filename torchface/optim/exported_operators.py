@@ -76,9 +76,8 @@ def split_box_program(
         steps: of operator splitting.
     """
     diagonal = (H * identity).sum(0)
-    return _split(
-        symmetric_inverse(H + rho * diagonal * identity), H, gradient, lower, upper, dual, identity, rho, steps
-    )
+    inverse = symmetric_inverse(H + rho * diagonal * identity)
+    return _split(_prepared(inverse, H, gradient, identity, rho), (lower, upper), dual, steps, H.dtype)
 
 
 def split_box_program_quickly(
@@ -86,24 +85,19 @@ def split_box_program_quickly(
 ) -> tuple[Tensor, Tensor]:
     """As :func:`split_box_program`, its steps in single precision, in a tenth of the operators of a graph."""
     inverse = shifted_inverse(H, rho)
-    z, dual = _split(inverse, H, gradient, lower, upper, dual, identity, rho, steps, torch.float32)
+    z, dual = _split(_prepared(inverse, H, gradient, identity, rho), (lower, upper), dual, steps, torch.float32)
     return z.to(H), dual.to(H)
 
 
-def _split(
-    inverse: Tensor,
-    H: Tensor,
-    gradient: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    dual: Tensor,
-    identity: Tensor,
-    rho: float,
-    steps: int,
-    dtype: torch.dtype | None = None,
-) -> tuple[Tensor, Tensor]:
+def _prepared(inverse: Tensor, H: Tensor, gradient: Tensor, identity: Tensor, rho: float) -> tuple[Tensor, ...]:
+    """What every step of a program takes: its constant and two matrices."""
     offset = -RELAXATION * inverse
     step = -rho * (H * identity).sum(0)[:, None] * offset - identity
-    given = gradient[None] @ offset, step, 2 * step + (2 - RELAXATION) * identity, lower, upper, dual[None]
-    v, z = box_splitting(*(value.to(dtype or H.dtype) for value in given), steps)
+    return gradient[None] @ offset, step, 2 * step + (2 - RELAXATION) * identity
+
+
+def _split(
+    prepared: tuple[Tensor, ...], box: tuple[Tensor, Tensor], dual: Tensor, steps: int, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    v, z = box_splitting(*(value.to(dtype) for value in (*prepared, *box, dual[None])), steps)
     return z, (v - z)[0]

@@ -55,6 +55,27 @@ class DynamicsSettings:
             raise ValueRangeError(f"dynamics settings: found {self}, expected positive numbers")
 
 
+@dataclass(frozen=True, eq=False)
+class UsualMotion:
+    """How N shapes move each on its own, and the sizes that a dynamics prior's G processes work in.
+
+    Args:
+        center: the takes' mean, against which places count, (N,).
+        coefficients: A, the autoregression over the window, (J,N).
+        feature_scale: usual sizes of place, slope and curvature, (O,N).
+        target_scale: s, (N,).
+        gain: by what the mean of each process is multiplied, (G,).
+        limits: smallest and largest weight, (2,).
+    """
+
+    center: Tensor
+    coefficients: Tensor
+    feature_scale: Tensor
+    target_scale: Tensor
+    gain: Tensor
+    limits: Tensor
+
+
 class DynamicsPrior(nn.Module):
     r"""Mean and variance of the next frame's weights.
 
@@ -73,12 +94,7 @@ class DynamicsPrior(nn.Module):
         groups: rows of ``names``, one tuple a process; every shape in one group.
         processes: of the G groups, over place, slope and curvature of all shapes.
         noise: of the next frame.
-        center: the takes' mean, against which places count, (N,).
-        coefficients: A, (J,N).
-        feature_scale: usual sizes of place, slope and curvature, (O,N).
-        target_scale: s, (N,).
-        gain: by what the mean of each process is multiplied, (G,).
-        limits: smallest and largest weight, (2,).
+        motion: the autoregression, and what the processes' inputs and outputs are measured in.
         fps: frames a second of the takes.
         input_noise: standard deviation of the weights in the windows that it has learned from; 0 for true ones.
 
@@ -115,13 +131,7 @@ class DynamicsPrior(nn.Module):
         groups: Sequence[Sequence[int]],
         processes: GaussianProcesses,
         noise: MotionNoise,
-        *,
-        center: Tensor,
-        coefficients: Tensor,
-        feature_scale: Tensor,
-        target_scale: Tensor,
-        gain: Tensor,
-        limits: Tensor,
+        motion: UsualMotion,
         fps: float,
         input_noise: float = 0.0,
     ) -> None:
@@ -129,14 +139,14 @@ class DynamicsPrior(nn.Module):
         count = len(names)
         if sorted(i for group in groups for i in group) != list(range(count)):
             raise ShapeError(f"dynamics prior: found groups {groups}, expected each of {count} shapes in one of them")
-        basis = motion_basis(window).to(center.dtype)
+        basis = motion_basis(window).to(motion.center.dtype)
         shapes = {
-            "center": (center, (count,)),
-            "coefficients": (coefficients, (window, count)),
-            "feature_scale": (feature_scale, (basis.shape[1], count)),
-            "target_scale": (target_scale, (count,)),
-            "gain": (gain, (len(groups),)),
-            "limits": (limits, (2,)),
+            "center": (motion.center, (count,)),
+            "coefficients": (motion.coefficients, (window, count)),
+            "feature_scale": (motion.feature_scale, (basis.shape[1], count)),
+            "target_scale": (motion.target_scale, (count,)),
+            "gain": (motion.gain, (len(groups),)),
+            "limits": (motion.limits, (2,)),
         }
         for name, (value, shape) in shapes.items():
             if tuple(value.shape) != shape:
@@ -242,12 +252,14 @@ class DynamicsPrior(nn.Module):
             groups,
             processes,
             noise,
-            center=torch.zeros(n),
-            coefficients=torch.zeros(window, n),
-            feature_scale=torch.ones(orders, n),
-            target_scale=torch.ones(n),
-            gain=torch.ones(g),
-            limits=torch.zeros(2),
+            UsualMotion(
+                center=torch.zeros(n),
+                coefficients=torch.zeros(window, n),
+                feature_scale=torch.ones(orders, n),
+                target_scale=torch.ones(n),
+                gain=torch.ones(g),
+                limits=torch.zeros(2),
+            ),
             fps=fps,
             input_noise=input_noise,
         )

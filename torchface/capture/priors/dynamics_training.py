@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.priors.autoregression import Autoregression
-from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings
+from torchface.capture.priors.dynamics_prior import DynamicsPrior, DynamicsSettings, UsualMotion
 from torchface.capture.priors.gaussian_process import GaussianProcesses
 from torchface.capture.priors.kernel_training import fitted_kernel
 from torchface.capture.priors.left_out_process import LeftOutProcess
@@ -150,12 +150,14 @@ def fit_dynamics_prior(
                 [process.kernel for process in processes],
             ),
             noise,
-            center=found.center,
-            coefficients=found.coefficients,
-            feature_scale=scales.feature,
-            target_scale=scales.target,
-            gain=torch.tensor([process.gain for process in processes], dtype=torch.float64),
-            limits=found.limits,
+            UsualMotion(
+                center=found.center,
+                coefficients=found.coefficients,
+                feature_scale=scales.feature,
+                target_scale=scales.target,
+                gain=torch.tensor([process.gain for process in processes], dtype=torch.float64),
+                limits=found.limits,
+            ),
             fps=fps,
             input_noise=input_noise,
         )

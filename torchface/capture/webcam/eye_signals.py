@@ -115,10 +115,21 @@ def look_weights(gaze: Tensor) -> Tensor:
     return torch.stack(made).clamp(0, 1)
 
 
+@dataclass(frozen=True, eq=False)
+class EyesRead:
+    """What a picture shows of both eyes, each (2,), NaN where nobody said.
+
+    Args:
+        openness, closed, visibility: as of a ``FaceReading``.
+    """
+
+    openness: Tensor
+    closed: Tensor
+    visibility: Tensor
+
+
 def eye_signals(
-    openness: Tensor,
-    closed: Tensor,
-    visibility: Tensor,
+    read: EyesRead,
     gaze: Tensor,
     usual: Tensor,
     looking: Tensor,
@@ -130,7 +141,7 @@ def eye_signals(
     """A frame's signals, beside what has been learned of the person's eyes, and what that becomes.
 
     Args:
-        openness, closed, visibility: of the frame, (2,), NaN where nobody said.
+        read: of the frame.
         gaze: where the eyes seem to look, (2,2), NaN where nobody said.
         usual: openness of eyes at rest, (2,).
         looking: what looking up or down adds to the rig's openness at weights (8,) of ``LOOKS``, (2,8).
@@ -139,6 +150,7 @@ def eye_signals(
         pose: what the person has been asked to hold, () of ``POSES``.
         learns: 0 where nothing is to be learned, ().
     """
+    openness, closed, visibility = read.openness, read.closed, read.visibility
     known = ~torch.isnan(openness)
     found = torch.where(known, openness, usual)
     shut = torch.where(torch.isnan(closed), 0.0, closed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -19,6 +19,7 @@ from torchface.capture.video.weight_walk import faded, relative_trust, unseen_ti
 from torchface.capture.webcam.eye_signals import (
     CORNERS,
     LOOKS,
+    EyesRead,
     eye_signals,
     look_weights,
     openness_rows,
@@ -63,6 +64,25 @@ _LID_MOTION = 3.0
 _LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
 _MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
 _CONSTANTS = ("landmark_weights", "identity", "camera", "look_eyes", "upright", "damping", "filter_units")
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a frame shows of a face.
+
+    Args:
+        rays: to the landmarks, (68,2), at a depth of 1.
+        trust: in each, (68,).
+        spread: of each, standard deviation of a coordinate, (68,), at a depth of 1.
+        iris: rays to the irises, (2,2).
+        eyes: how open they are.
+    """
+
+    rays: Tensor
+    trust: Tensor
+    spread: Tensor
+    iris: Tensor
+    eyes: EyesRead
 
 
 class WebcamSolver(nn.Module):
@@ -242,7 +262,7 @@ class WebcamSolver(nn.Module):
             )
             return self.layout.unpack(self(*given).clone())
 
-    def forward(
+    def forward(  # noqa: PLR0913  # the inputs of a graph are tensors by their names
         self,
         landmarks: Tensor,
         deviation: Tensor,
@@ -274,28 +294,15 @@ class WebcamSolver(nn.Module):
         trust = torch.where(found, trust, 1.0)
         rays = torch.where(seen[:, None] & found, rays, self.rest[:LANDMARKS, :2] * self.upright)
         spread = _known(deviation.double(), 0.0).clamp(0, 1e3) / focal
-        solved = self._solved(
-            rays, trust, spread, iris_rays, openness, closed, eye_visibility, before, interval, pose, freeze
-        )
+        eyes = EyesRead(openness.double(), closed.double(), eye_visibility.double())
+        solved = self._solved(_Seen(rays, trust, spread, iris_rays, eyes), before, interval, pose, freeze)
         lost = self._lost(before, interval)
         after = _chosen(found, solved, lost)
         return self._shown(after, before, found, present, interval, gain, smoothing).pack()
 
-    def _solved(
-        self,
-        rays: Tensor,
-        trust: Tensor,
-        spread: Tensor,
-        iris: Tensor,
-        openness: Tensor,
-        closed: Tensor,
-        eye_visibility: Tensor,
-        before: WebcamState,
-        interval: Tensor,
-        pose: Tensor,
-        freeze: Tensor,
-    ) -> WebcamState:
+    def _solved(self, seen: _Seen, before: WebcamState, interval: Tensor, pose: Tensor, freeze: Tensor) -> WebcamState:
         """The state of a frame with a face, its outputs not yet calmed."""
+        rays, trust, spread = seen.rays, seen.trust, seen.spread
         points = self.personal_points(before.person)
         K = self.camera
         start_rotation, start_translation = affine_pose(points.rest[:LANDMARKS], rays, trust)
@@ -309,11 +316,9 @@ class WebcamSolver(nn.Module):
             torch.stack([0.5 * (points.rest[a] + points.rest[b]) for a, b in CORNERS]) @ rotation[2] + translation[2]
         )
         learns = (freeze <= 0) * (before.learned < self.settings.learning)
-        gaze = seen_gaze(rays, iris, rotation, depth)
+        gaze = seen_gaze(rays, seen.iris, rotation, depth)
         signals = eye_signals(
-            openness.double(),
-            closed.double(),
-            eye_visibility.double(),
+            seen.eyes,
             gaze,
             self.usual_openness,
             self.open_rows @ self.look_shapes,
@@ -452,7 +457,7 @@ class WebcamSolver(nn.Module):
             return torch.cond(learns, self._updated_person, self._same_person, (*frame, *known))
         return (self._updated_person if bool(learns) else self._same_person)(*frame, *known)
 
-    def _updated_person(
+    def _updated_person(  # noqa: PLR0913  # torch.cond hands tensors on
         self,
         residual: Tensor,
         jacobian: Tensor,

@@ -67,15 +67,27 @@ class _Batches(IterableDataset):
             yield self.draw(torch.Generator().manual_seed(1_000_003 * self.settings.seed + step))
 
 
+@dataclass(frozen=True)
+class KeptDescent:
+    """What a run goes on from.
+
+    Args:
+        key: of all that decides the result; a checkpoint of another key is not taken up.
+        file: that is kept while it runs, and taken up by the next run with the same key; none if absent.
+    """
+
+    key: str
+    file: Path | None = None
+
+
 def descend(
     network: Network,
     draw: Callable[[torch.Generator], Any],
     loss: Callable[[Any, float], tuple[Tensor, float]],
     settings: DescentSettings,
-    key: str,
     what: str,
     progress: Progress,
-    checkpoint: Path | None = None,
+    kept: KeptDescent,
     device: str | torch.device = "cpu",
 ) -> Network:
     """Trains a network by AdamW; the rate rises over a twentieth of the steps and falls as a cosine.
@@ -85,10 +97,9 @@ def descend(
         draw: a batch, of nothing but the generator.
         loss: of a batch and the share of steps done; with the mean distance from the truth, pixels, for the progress.
         settings: how many steps, and how.
-        key: of all that decides the result; a checkpoint of another key is not taken up.
         what: it does, for the progress.
         progress: called with each step and how far it is.
-        checkpoint: a file that is kept while it runs, and taken up by the next run with the same key.
+        kept: where a run that is killed finds what it has learned.
         device: where the network computes.
 
     Returns:
@@ -97,7 +108,7 @@ def descend(
     network = network.to(device).to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     mean = {name: value.detach().clone() for name, value in network.state_dict().items()}
     optimiser = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
-    first = _resume(checkpoint, key, network, mean, optimiser)
+    first = _resume(kept.file, kept.key, network, mean, optimiser)
     workers = settings.workers
     loader = DataLoader(
         _Batches(draw, first, settings), batch_size=None, num_workers=workers, prefetch_factor=4 if workers else None
@@ -120,8 +131,8 @@ def descend(
                     mean[name].copy_(value)
         shown = error if not shown else 0.98 * shown + 0.02 * error
         progress(f"{what}, {shown:.2f} pixels off", step + 1, settings.steps)
-        if checkpoint is not None and (step + 1) % _CHECK == 0:
-            _keep(checkpoint, key, step + 1, network, mean, optimiser, time.monotonic() - begin)
+        if kept.file is not None and (step + 1) % _CHECK == 0:
+            _keep(kept.file, kept.key, step + 1, network, mean, optimiser, time.monotonic() - begin)
     network.load_state_dict(mean)
     return network.to("cpu").to(memory_format=torch.contiguous_format).eval()  # type: ignore[call-overload]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
-from torchface.landmarks.images.network_descent import DescentSettings, descend
+from torchface.landmarks.images.network_descent import DescentSettings, KeptDescent, descend
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, Crops, augmented
 from torchface.progress import Progress, silent
 
@@ -143,7 +143,9 @@ def fit_network_rows(
 
     key = content_key(_METHOD, settings=settings, config=network.config)
     draw = partial(_crops, pictures, network.size, network.margin, settings)
-    return descend(network, draw, loss, settings, key, "training the network", progress, checkpoint, device)
+    return descend(
+        network, draw, loss, settings, "training the network", progress, KeptDescent(key, checkpoint), device
+    )
 
 
 def _crops(

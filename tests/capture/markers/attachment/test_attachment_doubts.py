@@ -14,7 +14,7 @@ from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import fit_attachment
 from torchface.capture.markers import AttachmentFit, SiteUncertainty
 from torchface.capture.markers.attachment.attachment_check import check_sites
-from torchface.capture.markers.attachment.site_curvature import TakeCurvature, pose_columns
+from torchface.capture.markers.attachment.site_curvature import SitesOnTake, TakeCurvature, pose_columns
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import draw_identities, performer
@@ -160,7 +160,7 @@ def test_the_curvature_is_that_of_all_unknowns_with_the_weights_eliminated(slips
     frames = 3 if slips else 1
     pose = Similarity(torch.ones(frames), torch.eye(3).repeat(frames, 1, 1), torch.zeros(frames, 3))
     columns = pose_columns(torch.einsum("mcn,tn->tmc", here[..., 1:], weights) + here[..., 0], pose)
-    found = TakeCurvature.of(here, tangents, moved, weights, columns, ridge, slips)
+    found = TakeCurvature.of(SitesOnTake(here, tangents, moved, weights, columns, slips), ridge)
     outer, motions = len(found.gradient), 6 if slips else 0
     inner = 4 + motions
 

@@ -28,6 +28,27 @@ ARM = 50.0
 
 
 @dataclass(frozen=True, eq=False)
+class SitesOnTake:
+    """Sites, pose and weights of a take's frames, and how the markers move with them.
+
+    Args:
+        affine: affine maps of the sites, (M,3,N+1), millimetres.
+        tangents: affine maps of two unit tangents of the skin at each site, (M,2,3,N+1).
+        moved: markers in rig space, (T,M,3), NaN where not seen.
+        weights: (T,N).
+        pose_columns: how a unit of each pose parameter moves each marker, (T,M,3,G).
+        slips: six columns of rigid motion a frame follow the weights.
+    """
+
+    affine: Tensor
+    tangents: Tensor
+    moved: Tensor
+    weights: Tensor
+    pose_columns: Tensor
+    slips: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class TakeCurvature:
     """Second order of half the squared distance over the given frames, in mm².
 
@@ -46,28 +67,15 @@ class TakeCurvature:
     weight_gradient: Tensor
 
     @staticmethod
-    def of(
-        affine: Tensor,
-        tangents: Tensor,
-        moved: Tensor,
-        weights: Tensor,
-        pose_columns: Tensor,
-        ridge: float,
-        slips: bool = False,
-        bounded: bool = True,
-    ) -> TakeCurvature:
+    def of(fit: SitesOnTake, ridge: float, bounded: bool = True) -> TakeCurvature:
         """At sites, pose and weights.
 
         Args:
-            affine: affine maps of the sites, (M,3,N+1), millimetres.
-            tangents: affine maps of two unit tangents of the skin at each site, (M,2,3,N+1).
-            moved: markers in rig space, (T,M,3), NaN where not seen.
-            weights: (T,N).
-            pose_columns: how a unit of each pose parameter moves each marker, (T,M,3,G).
+            fit: where they are.
             ridge: mm² a marker for a squared weight of 1.
-            slips: six columns of rigid motion a frame follow the weights.
             bounded: weights at 0 or 1 are in the active set.
         """
+        affine, moved, weights, slips = fit.affine, fit.moved, fit.weights, fit.slips
         markers, frames = len(affine), len(moved)
         rest, basis = affine[..., 0], affine[..., 1:]
         extended = with_one(weights)
@@ -83,10 +91,10 @@ class TakeCurvature:
             ridges = torch.cat([ridges, ridges.new_full((6,), _FREE_RIDGE)])
             free = torch.cat([free, free.new_ones(frames, 6)], dim=1)
             weight_gradient = torch.cat([weight_gradient, torch.einsum("mcn,tmc->tn", rigid, residual)], dim=1)
-        site_motion = torch.einsum("mkcn,tn->tmck", tangents, extended) * shown
-        columns = -pose_columns * shown
+        site_motion = torch.einsum("mkcn,tn->tmck", fit.tangents, extended) * shown
+        columns = -fit.pose_columns * shown
 
-        size, poses = 2 * markers, pose_columns.shape[-1]
+        size, poses = 2 * markers, fit.pose_columns.shape[-1]
         information = affine.new_zeros(size + poses, size + poses)
         row = torch.arange(markers)
         sites = affine.new_zeros(markers, 2, markers, 2)

@@ -18,7 +18,7 @@ from torchface.capture.markers.attachment.frame_poses import (
     solve_frames,
     without_motion,
 )
-from torchface.capture.markers.attachment.site_curvature import ARM, TakeCurvature, pose_columns
+from torchface.capture.markers.attachment.site_curvature import ARM, SitesOnTake, TakeCurvature, pose_columns
 from torchface.capture.markers.attachment.site_search import SiteSearch
 from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, SiteUncertainty, site_uncertainty
 from torchface.capture.markers.rest_pose import transformed_pose
@@ -124,7 +124,7 @@ class SiteSolver:
         columns = pose_columns(on_rig, pose)
         moved = pose.apply(paths[:, rows])
         slips = len(pose.scale) > 1
-        curvature = TakeCurvature.of(affine[rows], tangents, moved, weights, columns, LAST_RIDGE, slips)
+        curvature = TakeCurvature.of(SitesOnTake(affine[rows], tangents, moved, weights, columns, slips), LAST_RIDGE)
         offset = torch.einsum("mkc,mc->mk", tangents[..., 0], self.initial[rows] - affine[rows, :, 0])
         precision = affine.new_zeros(len(curvature.gradient))
         precision[: 2 * len(rows)] = self._prior_weight(state)
@@ -172,17 +172,15 @@ class SiteSolver:
         affine = self.at(state)
         assert state.weights is not None
         on_rig = torch.einsum("mcn,tn->tmc", affine, with_one(state.weights))
-        return site_uncertainty(
+        fit = SitesOnTake(
             affine,
             self._tangents(state),
             state.pose.apply(paths),
             state.weights,
             pose_columns(on_rig, state.pose),
-            seconds,
-            names,
-            state.sites.labels or (),
             len(state.pose.scale) > 1,
         )
+        return site_uncertainty(fit, seconds, names, state.sites.labels or ())
 
     def on_frames(self, paths: Tensor, state: FitState) -> FitState:
         """The state for other frames: weights to be solved again, and a pose a frame where the helmet slips."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.attachment.site_curvature import TakeCurvature
+from torchface.capture.markers.attachment.site_curvature import SitesOnTake, TakeCurvature
 
 # Prior standard deviations: of a site about its initial guess in each direction along the skin, mm, and of a shape's
 # mean weight over a take.
@@ -81,17 +81,7 @@ class SiteUncertainty:
         return tuple(names[i] for i in order if float(deviations[i]) > limit)
 
 
-def site_uncertainty(
-    affine: Tensor,
-    tangents: Tensor,
-    moved: Tensor,
-    weights: Tensor,
-    pose_columns: Tensor,
-    seconds: float,
-    names: Sequence[str],
-    labels: Sequence[str],
-    slips: bool = False,
-) -> SiteUncertainty:
+def site_uncertainty(fit: SitesOnTake, seconds: float, names: Sequence[str], labels: Sequence[str]) -> SiteUncertainty:
     r"""The posterior covariance of sites and shapes' levels, from the curvature of the fit.
 
     With :math:`\sigma` the residual of a coordinate, :math:`\Sigma = (S / \sigma^2 + P)^{-1}` is that of sites and
@@ -103,11 +93,12 @@ def site_uncertainty(
     pulls all weights to zero; how far levels move in one Newton step without it is added in quadrature.
 
     Args:
-        affine, tangents, moved, weights, pose_columns, slips: as in ``TakeCurvature.of``, spread over the take.
+        fit: sites, pose and weights, spread over the take.
         seconds: how long the take is.
         names: of the shapes.
         labels: of the markers.
     """
+    affine, moved, weights = fit.affine, fit.moved, fit.weights
     residual = moved - torch.einsum("mcn,tn->tmc", affine[..., 1:], weights) - affine[..., 0]
     # The median over markers is robust to one that is not on the skin.
     noise = float(residual.square().nanmean((0, 2)).nanmedian().sqrt().clamp(min=_MIN_NOISE))
@@ -117,7 +108,7 @@ def site_uncertainty(
     count = noise**2 / (noise**2 / count + bias)
     markers, shapes = len(affine), len(names)
     ridge = noise**2 / (LEVEL_PRIOR**2 * count * markers)
-    curvature = TakeCurvature.of(affine, tangents, moved, weights, pose_columns, ridge, slips, bounded=False)
+    curvature = TakeCurvature.of(fit, ridge, bounded=False)
     precision = affine.new_zeros(len(curvature.gradient))
     precision[: 2 * markers] = SITE_PRIOR**-2
     precision[2 * markers :] = 1e-6  # a metre: no prior
@@ -127,7 +118,7 @@ def site_uncertainty(
     sensitivity = (inverse @ curvature.cross).mean(0)[:shapes]
     weight_variance = noise**2 / count * inverse.mean(0).diagonal()[:shapes]
     levels = ((sensitivity @ covariance) * sensitivity).sum(1) + weight_variance
-    bounded = TakeCurvature.of(affine, tangents, moved, weights, pose_columns, ridge, slips)
+    bounded = TakeCurvature.of(fit, ridge)
     change = bounded.step(noise**2 * precision, torch.zeros_like(precision))[1][:, :shapes]
     levels = levels + ((weights + change).clamp(0, 1) - weights).mean(0).square()
     sites = covariance.diagonal()[: 2 * markers].unflatten(0, (markers, 2)).sum(1)

@@ -14,7 +14,7 @@ from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, EyeCrops, EyeLabels, augmented_eyes
 from torchface.landmarks.images.eyes.eye_network import STRIDE, EyeFindings, EyeNetwork
-from torchface.landmarks.images.network_descent import DescentSettings, descend
+from torchface.landmarks.images.network_descent import DescentSettings, KeptDescent, descend
 from torchface.progress import Progress, silent
 
 _METHOD = "eye network/1"
@@ -91,7 +91,7 @@ def fit_eyes(
 
     key = content_key(_METHOD, settings=settings, config=network.config)
     draw = partial(_crops, rgba, labels, (network.width, network.height), settings)
-    return descend(network, draw, loss, settings, key, "training on eyes", progress, checkpoint, device)
+    return descend(network, draw, loss, settings, "training on eyes", progress, KeptDescent(key, checkpoint), device)
 
 
 def _crops(

@@ -71,7 +71,8 @@ def render_person(
     material = scene.material[triangle]
     free = openness(caster, points + 0.3 * normals, normals, rays or generator, 2, 45.0)
     free = _smooth(free, seen.view(height, width))
-    light = _lit(caster, camera, points, normals, ways, material, to_linear(color), gloss, free, generator)
+    surface = _SeenSurface(points, normals, ways, material, to_linear(color), gloss, free)
+    light = _lit(caster, camera, surface, generator)
     if exposure is None:
         exposure = _exposure(light.mean(1), material, uniform(0.07, 0.42, generator))
     shown = to_srgb((light * exposure).clamp(0, 1))
@@ -131,28 +132,39 @@ def _normals(scene: Surface, triangle: Tensor, barycentric: Tensor, ways: Tensor
     return torch.where((normals * ways).sum(-1, keepdim=True) > 0, -normals, normals)
 
 
-def _lit(
-    caster: RayCaster,
-    camera: Camera,
-    points: Tensor,
-    normals: Tensor,
-    ways: Tensor,
-    material: Tensor,
-    albedo: Tensor,
-    gloss: Tensor,
-    free: Tensor,
-    generator: torch.Generator,
-) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class _SeenSurface:
+    """What R rays of a camera meet.
+
+    Args:
+        points, normals, ways: places, outward normals and the rays' directions, (R,3).
+        material: (R,).
+        albedo: linear, (R,3).
+        gloss: how much light is mirrored, (R,).
+        free: how much of the sky is open, (R,).
+    """
+
+    points: Tensor
+    normals: Tensor
+    ways: Tensor
+    material: Tensor
+    albedo: Tensor
+    gloss: Tensor
+    free: Tensor
+
+
+def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch.Generator) -> Tensor:
     """Linear light (R,3) under coloured lamps from anywhere in front, above or beside, and a sky."""
+    points, normals, ways, gloss = seen.points, seen.normals, seen.ways, seen.gloss
     right, down, _ = camera.rotation.double()
     toward_camera = -camera.rotation[2].double()
     starts = points + 0.3 * normals
     sky = torch.nn.functional.normalize(torch.randn(3, generator=generator).double() - 0.8 * down, dim=0)
     even = uniform(0.15, 1.0, generator) * (1 + uniform(0, 0.9, generator) * (normals @ sky))
-    even = even * free
+    even = even * seen.free
     light = even[:, None].float() * _tint(generator, 0.12)
     mirrored = torch.zeros(len(points), 3)
-    sharp = torch.where((material == EYEBALL), 220.0, uniform(8, 45, generator)).double()
+    sharp = torch.where((seen.material == EYEBALL), 220.0, uniform(8, 45, generator)).double()
     for number in range(int(uniform(0.5, 3.6, generator))):
         x, y = torch.randn(2, generator=generator).tolist()
         toward = x * right - (0.4 + y) * down + uniform(-0.2, 1.6, generator) * toward_camera
@@ -169,7 +181,7 @@ def _lit(
         shine = (normals * half).sum(-1).clamp(min=0) ** sharp * (falls > 0)
         mirrored = mirrored + strength * shine[:, None].float() * tint
     # Blood under the skin softens and reddens where light ends.
-    return albedo.float() * light + gloss[:, None] * mirrored * 0.6
+    return seen.albedo.float() * light + gloss[:, None] * mirrored * 0.6
 
 
 def _tint(generator: torch.Generator, spread: float) -> Tensor:
