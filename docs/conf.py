@@ -23,6 +23,7 @@ myst_heading_anchors = 3
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE.parent / "out" / "docs_cache")
 nb_execution_timeout = 300
+nb_execution_in_temp = True  # notebooks write files
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 

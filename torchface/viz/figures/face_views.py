@@ -106,5 +106,10 @@ def color_bar(
 
 
 def clay_colors(mesh: Mesh) -> Tensor:
-    """One plain colour (V,3), which shows form where texture would hide it."""
+    """One plain colour (V,3) in [0,1], which shows form where texture would hide it.
+
+    Example:
+        >>> clay_colors(Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))).unique(dim=0).shape
+        torch.Size([1, 3])
+    """
     return torch.tensor(CLAY).expand(len(mesh.vertices), 3)
