@@ -253,7 +253,9 @@ def helmet(solver: HelmetSolver, markers: Tensor) -> tuple[Tensor, ...]:
 
 
 EXAMPLES: dict[str, Example] = {
-    "BoxQP": Example(box_qp, lambda: (random(10, 6, seed=3).float() - 1,), cells={**SOLVER, "torch.export": "no"}),
+    "BoxQP": Example(
+        box_qp, lambda: (random(10, 6, seed=3).float() - 1,), cells={"torch.compile": "gap", "torch.export": "no"}
+    ),
     "MarkerSolver": Example(
         marker_solver, lambda: (seen_markers(rig()),), cells={**SOLVER, "torch.export": "SolverGraph"}
     ),

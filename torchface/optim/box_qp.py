@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchface.errors import TraceError
 from torchface.optim.batched_program import solve_in_chunks
 from torchface.optim.box_checks import TOLERANCE, check_vectors, checked_tolerance
-from torchface.optim.data_dependent import data_dependent
+from torchface.optim.data_dependent import data_dependent, is_transformed
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.prepared_program import PreparedProgram
 from torchface.optim.prepared_tensors import Prepared
@@ -27,7 +27,8 @@ def box_qp(
     .. math:: x = \arg\min_{l \le x \le u} \tfrac12 x^\top H x + f^\top x
 
     Solved by splitting (one factorisation, then products and clamps), then by projected Newton steps where digits are
-    missing, all in float64 inside. Differentiable once in H and f, by implicit differentiation at the solution.
+    missing, all in float64 inside. Differentiable in H and f as often as one likes, by implicit
+    differentiation at the solution, and under the transforms of ``torch.func``.
 
     Args:
         H: symmetric and positive semidefinite, (N,N) or (B,N,N), float32 or float64; only its symmetric part counts.
@@ -54,10 +55,10 @@ def box_qp(
         >>> box_qp(H, torch.tensor([[-1.0, -8.0], [2.0, -2.0]])).round(decimals=4).tolist()
         [[0.5, 1.0], [0.0, 0.5]]
     """
-    with torch.no_grad():
-        prepared = PreparedProgram.of(H, lower, upper)
-        tolerance = checked_tolerance(tolerance, H.dtype)
-    return _minimiser(H, prepared, f, start, tolerance)
+    if is_transformed():
+        return _transformed_minimiser(H, f, lower, upper, tolerance)
+    prepared = PreparedProgram.of(H, lower, upper)
+    return _minimiser(H, prepared, f, start, checked_tolerance(tolerance, H.dtype))
 
 
 class BoxQP(nn.Module):
@@ -106,9 +107,14 @@ class BoxQP(nn.Module):
         self._prepared: Prepared[PreparedProgram] = Prepared()
         self._prepared.get((self.H, self.lower, self.upper), lambda: prepared)
 
-    @data_dependent("torchface.onnx.SolverGraph, or steps of torchface.optim.exported_operators, which are fixed")
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
+        if is_transformed():
+            return _transformed_minimiser(self.H, f, self.lower, self.upper, self.tolerance)
+        return self._solved(f, start)
+
+    @data_dependent("torchface.onnx.SolverGraph, or steps of torchface.optim.exported_operators, which are fixed")
+    def _solved(self, f: Tensor, start: Tensor | None) -> Tensor:
         H, lower, upper = self.H, self.lower, self.upper
         prepared = self._prepared.get((H, lower, upper), lambda: PreparedProgram.of(H, lower, upper))
         return _minimiser(H, prepared, f, start, TOLERANCE[H.dtype] if self.tolerance is None else self.tolerance)
@@ -133,7 +139,22 @@ def _minimiser(H: Tensor, prepared: PreparedProgram, f: Tensor, start: Tensor | 
     check_vectors(H, f, start)
     if differentiable:
         solution: Tensor = BoxSolution.apply(
-            H, f, prepared.lower, prepared.upper, lambda: solve_in_chunks(prepared, f, start, tolerance)
+            H, f, prepared.lower, prepared.upper, lambda _, f, *bounds: solve_in_chunks(prepared, f, start, tolerance)
         )
         return solution
     return solve_in_chunks(prepared, f, start, tolerance)
+
+
+def _transformed_minimiser(
+    H: Tensor, f: Tensor, lower: float | Tensor, upper: float | Tensor, tolerance: float | None
+) -> Tensor:
+    """The minimisers under ``torch.func``'s transforms; what is prepared of tensors that they wrap is not kept."""
+
+    def solve(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+        prepared = PreparedProgram.of(H, lower, upper)
+        check_vectors(H, f, None)
+        return solve_in_chunks(prepared, f, None, checked_tolerance(tolerance, H.dtype))
+
+    bounds = (torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach() for bound in (lower, upper))
+    solution: Tensor = BoxSolution.apply(H, f, *bounds, solve)
+    return solution

@@ -39,7 +39,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
     """
 
     def marked(method: Callable[Given, Result]) -> Callable[Given, Result]:
-        name = method.__qualname__.removesuffix(".forward")
+        name = method.__qualname__.partition(".")[0]
 
         @functools.wraps(method)
         def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
@@ -50,8 +50,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
                     f"{name}: iterates until every problem is solved, and a trace would repeat one frame's path for "
                     f"all; expected {instead}"
                 )
-            # There is no public name for it.
-            if torch._C._functorch.peek_interpreter_stack() is not None:
+            if is_transformed():
                 raise TraceError(
                     f"{name}: found one of torch.func's transforms, expected a batch in place of vmap, and "
                     "torch.autograd.functional.jacobian in place of jacrev"
@@ -61,3 +60,14 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
         return call
 
     return marked
+
+
+def is_transformed() -> bool:
+    """Whether one of ``torch.func``'s transforms is at work, other than within ``torch.compile``.
+
+    Example:
+        >>> torch.func.vmap(lambda x: x + is_transformed())(torch.zeros(2)).tolist(), is_transformed()
+        ([1.0, 1.0], False)
+    """
+    # There is no public name for it.
+    return not torch.compiler.is_dynamo_compiling() and torch._C._functorch.peek_interpreter_stack() is not None

@@ -9,8 +9,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchface.errors import TraceError
 from torchface.optim.box_problem import metric
 from torchface.optim.free_variables import solve_free
+
+Solve = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""Of H, f and the bounds, tensors that no transform wraps."""
 
 
 class BoxSolution(torch.autograd.Function):
@@ -26,32 +30,114 @@ class BoxSolution(torch.autograd.Function):
     .. math:: \partial L/\partial f = -s, \qquad \partial L/\partial H = -\tfrac12 (s x^\top + x s^\top),
 
     the second symmetrised because H only acts through its symmetric part. One H for all problems collects their sum.
+    Derivatives of derivatives are those of these formulas, in which the free variables stay the same ones. The form is
+    what the transforms of ``torch.func`` ask for: what ``vmap`` goes along joins the batch.
 
     Source: Amos and Kolter 2017, OptNet, specialised to a box.
     """
 
     @staticmethod
-    def forward(ctx: Any, H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, solve: Callable[[], Tensor]) -> Tensor:
-        x = solve()
-        ctx.save_for_backward(H, x, lower, upper)
-        return x
+    def forward(H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, solve: Solve) -> Tensor:
+        return solve(H, f, lower, upper)
 
     @staticmethod
-    @once_differentiable
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        H, _, lower, upper, _ = inputs
+        ctx.save_for_backward(H, output, lower, upper)
+        ctx.save_for_forward(H, output, lower, upper)
+
+    @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         H, x, lower, upper = ctx.saved_tensors
-        exact = H.detach().double()
-        exact = 0.5 * (exact + exact.transpose(-1, -2))
-        wide = x.double()
-        free = (x > lower.to(x)) & (x < upper.to(x))
-        s = solve_free(exact, metric(exact), free, gradients[0].double())
-        to_H = to_f = None
-        if ctx.needs_input_grad[0]:
-            outer = s.T @ wide if H.ndim == 2 else s[:, :, None] * wide[:, None, :]
-            to_H = (-0.5 * (outer + outer.transpose(-1, -2))).to(H.dtype)
-        if ctx.needs_input_grad[1]:
-            to_f = (-s).to(x.dtype)
-        return to_H, to_f, None, None, None
+        s = _FreeSolution.apply(_symmetric(H.double()), _free(x, lower, upper), gradients[0].double())
+        to_H = -_by_matrix(s, x.double(), H).to(H.dtype) if ctx.needs_input_grad[0] else None
+        return to_H, -s.to(x.dtype), None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        H, x, lower, upper = ctx.saved_tensors
+        moved = _times(_symmetric(tangents[0].double()), x.double()) + tangents[1].double()
+        return -_FreeSolution.apply(_symmetric(H.double()), _free(x, lower, upper), moved).to(x.dtype)
+
+    @staticmethod
+    def vmap(
+        info: Any, dims: tuple[int | None, ...], H: Tensor, f: Tensor, lower: Tensor, upper: Tensor, solve: Solve
+    ) -> tuple[Tensor, int]:
+        """A batch of batches is one batch."""
+        if dims[2] is not None or dims[3] is not None:
+            raise TraceError("box_qp: found bounds that vmap goes along, expected the same ones for all")
+        f = _in_front(f, dims[1], info.batch_size)
+        H = _one_each(H, dims[0], info.batch_size, f.shape[1])
+        x: Tensor = BoxSolution.apply(H, f.flatten(0, 1), lower, upper, solve)
+        return x.unflatten(0, f.shape[:2]), 0
+
+
+class _FreeSolution(torch.autograd.Function):
+    r"""The solutions s of :math:`H_{FF} s_F = v_F`, :math:`s_A = 0`, float64, with all their derivatives.
+
+    With :math:`w = \partial L/\partial s` and :math:`t_F = H_{FF}^{-1} w_F`: :math:`\partial L/\partial v = t`,
+    :math:`\partial L/\partial H = -\tfrac12 (t s^\top + s t^\top)`.
+    """
+
+    @staticmethod
+    def forward(H: Tensor, free: Tensor, v: Tensor) -> Tensor:
+        return solve_free(H, metric(H), free, v)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        H, free, _ = inputs
+        ctx.save_for_backward(H, free, output)
+        ctx.save_for_forward(H, free, output)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None, Tensor]:
+        H, free, s = ctx.saved_tensors
+        t = _FreeSolution.apply(H, free, gradients[0])
+        return -_by_matrix(t, s, H) if ctx.needs_input_grad[0] else None, None, t
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        H, free, s = ctx.saved_tensors
+        moved: Tensor = _FreeSolution.apply(H, free, tangents[2] - _times(_symmetric(tangents[0]), s))
+        return moved
+
+    @staticmethod
+    def vmap(info: Any, dims: tuple[int | None, ...], H: Tensor, free: Tensor, v: Tensor) -> tuple[Tensor, int]:
+        free, v = (_in_front(rows, dim, info.batch_size) for rows, dim in ((free, dims[1]), (v, dims[2])))
+        H = _one_each(H, dims[0], info.batch_size, v.shape[1])
+        s: Tensor = _FreeSolution.apply(H, free.flatten(0, 1), v.flatten(0, 1))
+        return s.unflatten(0, v.shape[:2]), 0
+
+
+def _free(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    return (x > lower.to(x)) & (x < upper.to(x))
+
+
+def _symmetric(H: Tensor) -> Tensor:
+    return 0.5 * (H + H.transpose(-1, -2))
+
+
+def _times(H: Tensor, x: Tensor) -> Tensor:
+    """Products with (B,N) of a symmetric H, (N,N) or (B,N,N)."""
+    return x @ H if H.ndim == 2 else (H @ x[..., None])[..., 0]
+
+
+def _by_matrix(s: Tensor, x: Tensor, H: Tensor) -> Tensor:
+    """The symmetric part of the products of rows (B,N), summed where one H (N,N) is of all problems."""
+    return _symmetric(s.T @ x if H.ndim == 2 else s[:, :, None] * x[:, None, :])
+
+
+def _in_front(values: Tensor, dim: int | None, count: int) -> Tensor:
+    """With the dimension that vmap goes along first."""
+    return values.expand(count, *values.shape) if dim is None else values.movedim(dim, 0)
+
+
+def _one_each(H: Tensor, dim: int | None, count: int, problems: int) -> Tensor:
+    """One matrix for all, (N,N), or one for each problem of each batch, (K*B,N,N)."""
+    if dim is None and H.ndim == 2:
+        return H
+    H = _in_front(H, dim, count)
+    return (H[:, None].expand(-1, problems, -1, -1) if H.ndim == 3 else H).flatten(0, 1)
 
 
 class SimplexSolution(torch.autograd.Function):
