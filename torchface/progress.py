@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-__all__ = ["Progress", "silent"]
+__all__ = ["Progress", "ValueLog", "silent"]
 
 
 class Progress(Protocol):
@@ -34,3 +34,24 @@ def silent(step: str, done: int = 0, total: int = 0) -> None:
     Example:
         >>> silent("rendering", 3, 20)
     """
+
+
+class ValueLog(Protocol):
+    """Called with what is measured while something is learned: ``log(300, "loss", 0.25)``.
+
+    Example:
+        >>> def tell(step: int, name: str, value: float) -> None:
+        ...     print(f"{name} {value} at step {step}")
+        >>> log: ValueLog = tell
+        >>> log(300, "loss", 0.25)
+        loss 0.25 at step 300
+    """
+
+    def __call__(self, step: int, name: str, value: float) -> None:
+        """Keeps a value.
+
+        Args:
+            step: at which it was measured; steps rise.
+            name: of the value.
+            value: as measured.
+        """

@@ -6,7 +6,7 @@ intensity are found without labels.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -19,14 +19,15 @@ from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.action_units.classifier_evaluation import cross_validation, labelled_intensities, level_agreement
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
-from torchface.progress import Progress, silent
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
 
-from .runner import Recipe, metric_lines
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
@@ -34,10 +35,8 @@ class Settings:
         labels: What is in each of them, as TOML.
         test_video: Videos of performers to test on.
         test_labels: What is in each of those.
-        out: Folder for the model, its card and its picture.
         size: Pixels a side that every region is brought to.
         folds: Into how many parts the frames are split for the cross-validation; 0 leaves it out.
-        licence: Under which the model may be used.
         training: How it is trained.
     """
 
@@ -48,7 +47,6 @@ class Settings:
     out: Path = Path("models/action_units")
     size: int = 48
     folds: int = 5
-    licence: str = "that of the videos"
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
 
@@ -60,13 +58,14 @@ class Trained:
     metrics: dict[str, float]
 
 
-def train(settings: Settings, progress: Progress | None = None) -> Trained:
+@recipe
+def train(settings: Settings, run: Run) -> Trained:
     """Reads, stabilises, aligns, labels, fits, evaluates and saves.
 
     Raises:
         TorchfaceError: there are not as many labels as videos, or a video or its labels cannot be used.
     """
-    progress = progress or silent
+    progress = run.progress
     labels = _labels(settings.video, settings.labels)
     test_labels = _labels(settings.test_video, settings.test_labels) if settings.test_video else []
     groups = performed_groups(labels)
@@ -133,27 +132,18 @@ def save(
     classifier: ActionUnitClassifier, settings: Settings, metrics: dict[str, float], labels: list[ActionLabels]
 ) -> None:
     """Writes the model with its effective settings, measured accuracy and card."""
-    effective = {
-        "video": [path.name for path in settings.video],
-        "labels": [path.name for path in settings.labels],
-        "size": settings.size,
-        "folds": settings.folds,
-        **{f"training.{name}": value for name, value in asdict(settings.training).items()},
-    }
     frames = sum(own.frames for own in labels)
-    flags = f"--video {' '.join(effective['video'])} --labels {' '.join(effective['labels'])}"
-    card = zoo.ModelCard(
-        licence=settings.licence,
+    card = model_card(
+        settings,
+        licence="that of the videos",
         data=f"{frames} frames of {len(labels)} head-camera videos.",
         metrics=metrics,
-        recipe=f"python -m train.action_units {flags} --out models/{settings.out.name}",
         text=(
             f"Action units {', '.join(classifier.units)} told from strokes of reflective paint in a head-camera video, "
             "frame by frame, each at one of a few levels of intensity. It knows no other units, and combinations only "
             "as far as they were performed. Accuracy is of unit and level together, whole repetitions left out; other "
             "performers' is the share of frames in which every unit is within a level of their own labels."
         ),
-        settings=effective,
     )
     zoo.save_model(classifier, settings.out, card)
 

@@ -5,7 +5,7 @@ The folder holds images with a ``.pts`` beside each, as ``torchface annotate`` s
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -16,10 +16,11 @@ from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.annotated_frames import AnnotatedFrame, load_annotated_frames
 from torchface.landmarks.images.appearance_level import sample_pixels
 from torchface.landmarks.images.shape_modes import planar_pose
-from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 
-from .runner import Recipe
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, recipe
 
 _OFF = 0.03
 _TO_REST = 0.5
@@ -27,25 +28,20 @@ _DOT = 2
 _ROOM = 0.75
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         data: Folder of images with iBUG's 68 landmarks as .pts beside each.
-        out: Folder for the model, its card and its images.
         folds: How many trial models are measured, each on the share of the frames that it has not seen; at most one a
             frame; 0 measures nothing.
-        seed: Draws the starts that left-out frames are refined from.
-        licence: Under which the model may be used; it shows the actor's face, so by default nobody may.
         model: How the model is made and fitted.
     """
 
     data: Path
     out: Path = Path("models/appearance")
     folds: int = 15
-    seed: int = 0
-    licence: str = "private: holds the looks of the person it learned from"
     model: AppearanceSettings = field(default_factory=AppearanceSettings)
 
 
@@ -59,13 +55,14 @@ class Trained:
     errors: Tensor
 
 
-def train(settings: Settings, progress: Progress | None = None) -> Trained:
+@recipe
+def train(settings: Settings, run: Run) -> Trained:
     """Loads, splits, fits, evaluates on left-out frames, fits on all, saves.
 
     Raises:
         TorchfaceError: the folder holds no annotated frames, or too few.
     """
-    progress = progress or silent
+    progress = run.progress
     frames = load_annotated_frames(settings.data)
     if settings.folds < 0 or settings.folds == 1:
         raise TorchfaceError(f"folds: found {settings.folds}, expected 0, or 2 and more")
@@ -119,21 +116,17 @@ def save(
             "left_out_worst": float(after.max()),
             "left_out_start": float(before.mean()),
         }
-    effective = asdict(settings)
-    effective |= {"data": settings.data.name, "out": settings.out.name}
-    effective["model"] = {**effective["model"], "resolutions": list(settings.model.resolutions)}
-    card = zoo.ModelCard(
-        licence=settings.licence,
+    card = model_card(
+        settings,
+        licence="private: holds the looks of the person it learned from",
         data=f"{len(frames)} annotated frames of {settings.data.name}.",
         metrics=metrics,
-        recipe=f"python -m train.appearance --data {settings.data.name} --out models/{settings.out.name}",
         text=(
             "Refines the 68 landmarks of one person, from the start that a detector gives. Errors are mean distances "
             "of landmarks in frames left out of trial models, of the distance between the eyes' outer corners; the "
             "starts lie half of the way to the person's usual face and are off by some hundredths besides. What only "
             "one frame shows, its trial model has never seen: on the video itself errors are smaller."
         ),
-        settings=effective,
     )
     zoo.save_model(model, settings.out, card)
 

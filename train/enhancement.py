@@ -7,8 +7,7 @@ so many vertices and planted wrinkles, and needs no file. Killed and started aga
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
@@ -17,17 +16,17 @@ from torchface import TorchfaceError, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder
-from torchface.progress import Progress, silent
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from .enhancement_figures import draw
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
 from .restored_frames import Shown, measured
-from .runner import Recipe, metric_lines
+from .runner import Recipe, Run, metric_lines, recipe
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
@@ -39,7 +38,6 @@ class Settings:
         neutral: The neutral as a mesh; with landmarks (see `torchface annotate`) regions are named and eyes set apart.
             neutral.* in the folder if absent.
         performer: Learn from the embedded performer with so many vertices instead.
-        out: Folder for the model, its card and its pictures.
         fps: Of the frames.
         held_out: How many sequences, the last, are kept for the test.
         wavelength: Of what counts as fine, millimetres: half of a wave of this length is detail.
@@ -47,8 +45,6 @@ class Settings:
         regions: How many regions are looked for.
         rank: Components of the detail that are kept.
         detail: As displacements of vertices, or as gradients of triangles (the paper's).
-        seed: Of patches and regions; of the performer's wrinkles and takes.
-        licence: Under which the model may be used; MIT for the performer, else what the capture allows, if absent.
     """
 
     frames: Path | None = None
@@ -63,18 +59,17 @@ class Settings:
     regions: int = 13
     rank: int = 64
     detail: str = "displacements"
-    seed: int = 0
-    licence: str | None = None
 
 
-def train(settings: Settings, progress: Progress | None = None) -> EnhancementModel:
+@recipe
+def train(settings: Settings, run: Run) -> EnhancementModel:
     """Gathers, learns, tests, saves and draws.
 
     Raises:
         TorchfaceError: neither frames nor performer, or both; files that cannot be used.
         ValueRangeError: no sequence is left to learn from.
     """
-    progress = progress or silent
+    progress = run.progress
     capture = _capture(settings)
     learned = len(capture.sequences) - settings.held_out
     if settings.held_out < 0 or learned < 1:
@@ -82,8 +77,7 @@ def train(settings: Settings, progress: Progress | None = None) -> EnhancementMo
             f"held_out: found {settings.held_out} of {len(capture.sequences)} sequences, expected at least one to "
             "learn from"
         )
-    work = settings.out.parent / f".{settings.out.name}.training"
-    make_folder(work)
+    work = run.work
     pairs = _pairs(settings, capture)
 
     def gathered(name: str, begin: int, end: int) -> tuple[Shown, Tensor]:
@@ -115,7 +109,6 @@ def train(settings: Settings, progress: Progress | None = None) -> EnhancementMo
     metrics = measured(model, known, test, progress)
     save(model, settings, metrics, len(known), learned)
     draw(model, mesh, known, test, settings.out / "pictures", progress)
-    shutil.rmtree(work, ignore_errors=True)
     return model
 
 
@@ -138,25 +131,16 @@ def _pairs(settings: Settings, capture: Capture) -> Capture | None:
 
 def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float], frames: int, sequences: int) -> None:
     """Writes the model with its effective settings, what was measured, and its card."""
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     if settings.frames is None:
-        source = f"--performer {settings.performer} --seed {settings.seed}"
         data = f"{frames} frames of {sequences} expressions of the embedded performer with planted wrinkles; no person."
     else:
-        source = f"--frames {settings.frames.name}"
-        if settings.coarse is not None:
-            source += f" --coarse {settings.coarse.name}"
         data = f"{frames} captured frames of {sequences} sequences."
     named = ", ".join(model.region_names)
-    card = zoo.ModelCard(
-        licence=settings.licence or ("MIT" if settings.frames is None else "that of the capture"),
+    card = model_card(
+        settings,
+        licence="MIT" if settings.frames is None else "that of the capture",
         data=data,
         metrics=metrics,
-        recipe=(
-            f"python -m train.enhancement {source} --held-out {settings.held_out} --rank {settings.rank} "
-            f"--patch {settings.patch} --regions {settings.regions} --out models/{settings.out.name}"
-        ),
         text=(
             f"Gives coarse animations on {len(model.neutral)} vertices the wrinkles, creases and timing of one actor: "
             "`torchface enhance INPUT --model THIS --out DIR`. Detail is what lies beyond a smooth part "
@@ -166,7 +150,6 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
             "database get the nearest detail."
             + (" Its detail is what one kind of coarse input lacks: it is for that kind." if model.keeps_input else "")
         ),
-        settings=effective,
     )
     zoo.save_model(model, settings.out, card, half=("database_features", "region_weights"))
 

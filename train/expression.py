@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,22 +16,24 @@ from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_expression_samples
-from torchface.progress import Progress, silent
+from torchface.progress import Progress
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
 
 from .expression_table import Comparison, compare, picture
+from .model_cards import model_card
 from .people_samples import People
 from .people_samples import gather as gather_people
-from .runner import Recipe
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, recipe
 
 _METHOD = "a person's expressions/1"
 # Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
 _HALF, _NOTHING = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
@@ -40,14 +41,11 @@ class Settings:
             of one topology, registered.
         performers: Learn from so many embedded performers instead.
         expressions: Which to learn, such as jawOpen mouthSmileLeft+mouthSmileRight; all that everyone has, if absent.
-        out: Folder for the model, its card and its picture.
         template: A rig whose shapes deformation transfer takes; the mean of the other people if absent.
         neutral_components: How many, at most; None chooses by leaving out one after the other.
         offset_components: Likewise.
         ridge: As a share of the neutrals' mean variance a component; None chooses it.
         align: Lay each expression onto its neutral by what does not move, rotation and translation only.
-        seed: Draws performers.
-        licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
         compared: Leave one out for the table of errors; of more than a hundred people the last fifty together.
         pictured: How many of those left out, the first, are shown with what each method makes of them.
     """
@@ -61,8 +59,6 @@ class Settings:
     offset_components: int | None = 13
     ridge: float | None = 0.0
     align: bool = True
-    seed: int = 0
-    licence: str = ""
     compared: bool = True
     pictured: int = 4
 
@@ -75,15 +71,15 @@ class Trained:
     comparison: Comparison | None
 
 
-def train(settings: Settings, progress: Progress | None = None) -> Trained:
+@recipe
+def train(settings: Settings, run: Run) -> Trained:
     """Gathers on disk, aligned, leaves one out after the other, fits, saves.
 
     Raises:
         TorchfaceError: there is neither a folder nor a number of performers, or people do not fit each other.
     """
-    progress = progress or silent
-    work = settings.out.parent / f".{settings.out.name}.training"
-    people = gather(settings, work, progress)
+    progress = run.progress
+    people = gather(settings, run.work, progress)
     progress(f"{len(people.who)} people, {len(people.names)} expressions")
     comparison = None
     if settings.compared:
@@ -91,7 +87,6 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
         comparison = compare(people, lambda rest: fit(rest, settings, progress), template, settings.pictured, progress)
     model = fit(people, settings, progress)
     save(model, people, comparison, settings)
-    shutil.rmtree(work, ignore_errors=True)
     return Trained(model, comparison)
 
 
@@ -175,32 +170,21 @@ def settle(neutral: Tensor, expression: Tensor) -> Tensor:
 
 def save(model: ExpressionRegression, people: People, comparison: Comparison | None, settings: Settings) -> None:
     """Writes the model with its table, card and picture."""
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     if settings.performers:
         data = f"{len(people.who)} embedded performers drawn by seed {settings.seed}; no person's face."
-        flags = f"--performers {settings.performers} --seed {settings.seed}"
     else:
         data = f"{len(people.who)} people of {settings.pairs and settings.pairs.name}."
-        flags = f"--pairs {settings.pairs and settings.pairs.name}" + " --no-align" * (not settings.align)
-    if settings.template is not None:
-        flags += f" --template {settings.template.name}"
-    if settings.expressions:
-        flags += f" --expressions {' '.join(settings.expressions)}"
-    for name in ("neutral_components", "offset_components", "ridge"):
-        flags += f" --{name.replace('_', '-')} {getattr(settings, name)}"
-    card = zoo.ModelCard(
-        licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
+    card = model_card(
+        settings,
+        licence="MIT" if settings.performers else "that of the scans",
         data=data,
         metrics={} if comparison is None else comparison.metrics(),
-        recipe=f"python -m train.expression {flags} --out models/{settings.out.name}",
         text=(
             f"Predicts {', '.join(people.names)} from a neutral face of the same topology: linear, "
             f"{len(model.neutral_components)} components of the part that moves to {len(model.offset_components)} of "
             "the offsets. Good for a first rig of a person of whom there is one scan; where there are scans of "
             f"expressions, learn from those. {_tested(comparison)}It knows only people like those it has learned from."
         ),
-        settings=effective,
     )
     zoo.save_model(model, settings.out, card, half=("neutral_components", "offset_mean", "offset_components"))
     if comparison is not None and comparison.predicted:

@@ -7,41 +7,40 @@ there is one. Killed and started again it goes on.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder, write_file
 from torchface.landmarks import agreement
 from torchface.landmarks.images.eyes import EyeNetwork
 from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, augmented_eyes
-from torchface.landmarks.images.eyes.eye_training import EyeSettings
-from torchface.progress import Progress, silent
+from torchface.landmarks.images.eyes.eye_training import EyeSettings, fit_eye_rows
 
-from .eye_pictures import PART, EyePictures, render_eye_pictures
-from .runner import Recipe, metric_lines
+from .eye_pictures import EACH, PART, StoredEyePictures, eye_picture_files
+from .model_cards import model_card
+from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _TEST_BATCH = 100
 _SIZES = {"600": 1.0, "120": 0.5, "60": 0.25}
 """Sides of faces' boxes, pixels, and pixels of such pictures in one of the crop."""
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
-        out: Folder for the model and its card.
         pictures: How many to render.
-        held_out: Of them, the first, of other people, kept for the test.
+        held_out: Of them, the first, of people whom it does not learn from, kept for the test.
         folder: Where pictures are kept.
         ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
-        seed: Draws people, gazes, poses and lamps.
-        renderers: Processes that render.
+        workers: Processes that render.
         network: How the network is trained.
     """
 
@@ -51,43 +50,35 @@ class Settings:
     folder: Path = Path("out/eye_pictures")
     ict: Path | None = None
     seed: int = 1
-    renderers: int = 2
+    workers: int = 2
     network: EyeSettings = field(default_factory=EyeSettings)
 
+    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
-def train(settings: Settings, progress: Progress | None = None) -> EyeNetwork:
+
+@recipe
+def train(settings: Settings, run: Run) -> EyeNetwork:
     """Renders, trains, evaluates and saves.
 
     Raises:
         ValueRangeError: fewer pictures than are held out and a part more.
     """
-    progress = progress or silent
+    progress = run.progress
     if settings.pictures < settings.held_out + PART:
         raise ValueRangeError(
             f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
         )
-    pictures = render_eye_pictures(
-        settings.folder, settings.pictures, settings.seed, settings.ict, settings.renderers, progress
+    files = eye_picture_files(
+        settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress
     )
-    learned = pictures.rows(slice(settings.held_out, None))
-    make_folder(settings.out)
-    checkpoint = settings.out / "checkpoint.safetensors"
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    curve: list[str] = ["step,pixels"]
-
-    def shown(step: str, done: int = 0, total: int = 0) -> None:
-        if done % 50 == 0 and "off" in step:
-            curve.append(f"{done},{step.split(', ')[1].split()[0]}")
-        progress(step, done, total)
-
-    model = EyeNetwork.fit(learned.rgba, learned.labels, None, settings.network, shown, checkpoint, device)
-    save(model, settings, evaluate(model, pictures.rows(slice(0, settings.held_out))))
-    write_file(settings.out / "curve.csv", ("\n".join(curve) + "\n").encode())
-    checkpoint.unlink(missing_ok=True)
+    held_out = EACH * -(-settings.held_out // EACH)  # whole people
+    learned = StoredEyePictures(files, held_out)
+    model = fit_eye_rows(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
+    save(model, settings, evaluate(model, StoredEyePictures(files, 0, held_out)))
     return model
 
 
-def evaluate(model: EyeNetwork, pictures: EyePictures) -> dict[str, float]:
+def evaluate(model: EyeNetwork, pictures: StoredEyePictures) -> dict[str, float]:
     """What the model does on both eyes of pictures of several sizes, blurred, noisy and compressed as in training."""
     found: dict[str, float] = {}
     for name, size in _SIZES.items():
@@ -97,12 +88,12 @@ def evaluate(model: EyeNetwork, pictures: EyePictures) -> dict[str, float]:
 
 
 @torch.no_grad()
-def measures(model: EyeNetwork, pictures: EyePictures, augmentation: EyeAugmentation) -> dict[str, float]:
+def measures(model: EyeNetwork, pictures: StoredEyePictures, augmentation: EyeAugmentation) -> dict[str, float]:
     """Of eyes that nothing hides: how well the lids' gap is told, how far off irises are, and which are called shut."""
     generator = torch.Generator().manual_seed(0)
     gaps, irises, shut, visible = [], [], [], []
     for start in range(0, len(pictures), _TEST_BATCH):
-        part = pictures.rows(slice(start, start + _TEST_BATCH))
+        part = pictures.some(torch.arange(start, min(start + _TEST_BATCH, len(pictures))))
         for eye in range(2):
             eyes = torch.full((len(part),), eye)
             crops = augmented_eyes(part.rgba, part.labels, eyes, model.width, model.height, generator, augmentation)
@@ -135,18 +126,12 @@ def _gap(points: Tensor) -> Tensor:
 
 def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> None:
     """Writes the model with its card."""
-    effective = asdict(settings) | {"ict": None if settings.ict is None else settings.ict.name}
-    effective |= {"out": settings.out.name, "folder": settings.folder.name}
     heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
-    flags = "" if settings.ict is None else f"--ict {settings.ict.name} "
-    card = zoo.ModelCard(
+    card = model_card(
+        settings,
         licence="MIT",
         data=f"{settings.pictures} rendered pictures of both eyes of {heads}; no person's photograph.",
         metrics=metrics,
-        recipe=(
-            f"python -m train.eye_network {flags}--pictures {settings.pictures} --seed {settings.seed} "
-            f"--network.steps {settings.network.steps} --out models/{settings.out.name}"
-        ),
         text=(
             "Reads an upright crop of a right eye, or of a left one in a mirror: six landmarks of the lids and the "
             "iris's centre with the deviation to be expected of each, how far the eye is open, whether it is shut and "
@@ -154,7 +139,6 @@ def save(model: EyeNetwork, settings: Settings, metrics: dict[str, float]) -> No
             "pixels an eye has a dozen, and half-closed lids are hard to tell from looking down. The figures are of "
             "rendered people that it had not seen; tests/benchmarks/test_real_faces.py measures it on real ones."
         ),
-        settings=effective,
     )
     zoo.save_model(
         model, settings.out, card, half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
+from torchface.files.shards import Shards
 from torchface.landmarks.images.eyes.eye_augmentation import EyeLabels
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
@@ -18,6 +19,8 @@ from .rendered_files import Rendering, rendered_files
 
 PART = 200
 """Pictures in a file: what a killed run loses at most."""
+EACH = 5
+"""Pictures of one person, in a row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +53,39 @@ class EyePictures:
         """What is known of them."""
         return EyeLabels(self.landmarks, self.visible, self.iris, self.openness, self.bare)
 
-    def rows(self, rows: slice | Tensor) -> EyePictures:
-        """Some of them."""
-        return EyePictures(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+class StoredEyePictures:
+    """Pictures of files, of which none is in memory but those that are asked for.
+
+    Args:
+        paths: of the files, in their order.
+        begin, end: which of the pictures; all to the last if ``end`` is absent.
+
+    Raises:
+        FileFormatError: a file is missing or holds something else.
+    """
+
+    def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:
+        self._shards = Shards(paths, [field.name for field in fields(EyePictures)])
+        self._begin, self._end = begin, len(self._shards) if end is None else end
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    def some(self, numbers: Tensor) -> EyePictures:
+        """The pictures of these numbers (B,), from 0."""
+        return EyePictures(**self._shards.rows(numbers + self._begin))
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, EyeLabels]:
+        """Pictures and what is known of them; see ``eye_training.LabelledEyes``."""
+        found = self.some(numbers)
+        return found.rgba, found.labels
 
 
-def render_eye_pictures(
+def eye_picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> EyePictures:
-    """Renders what a folder does not hold yet, and reads all; how many processes render does not change them.
+) -> list[Path]:
+    """Renders what a folder does not hold yet; how many processes render does not change the pictures.
 
     Args:
         folder: for the files; pictures of another seed or other heads lie beside each other there.
@@ -67,19 +94,15 @@ def render_eye_pictures(
         ict: ICT-FaceKit's ``FaceXModel``, whose heads are four in five; embedded performers alone without.
         workers: processes.
         progress: called with each step and how far it is.
+
+    Returns:
+        The files, in order, of :data:`PART` pictures each.
     """
     rendering = Rendering(_render, "eye pictures/1", "eyes", "eyes", PART)
-    paths = rendered_files(rendering, folder, count, seed, ict, workers, progress)
-    return read_eye_pictures(paths)
-
-
-def read_eye_pictures(paths: list[Path]) -> EyePictures:
-    """The pictures of files, in their order."""
-    read = [load_file(path) for path in paths]
-    return EyePictures(*(torch.cat([part[field.name] for part in read]) for field in fields(EyePictures)))
+    return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
-    pictures = draw_eye_pictures(*head_kinds(ict), first, count, seed)
+    pictures = draw_eye_pictures(*head_kinds(ict), first, count, seed, EACH)
     names = [field.name for field in fields(EyePictures)]
     return {name: torch.stack([getattr(one, name) for one in pictures]) for name in names}

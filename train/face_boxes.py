@@ -6,94 +6,93 @@ Its scenes are put together from rendered people, which are rendered once and ke
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
-from torchface import TorchfaceError, zoo
-from torchface.files.whole_files import make_folder
+from torchface import zoo
+from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
 from torchface.landmarks.images.face_box import overlaps
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.face_scenes import CutOuts, SceneSettings, face_scene
+from torchface.synthetic.stages.face_scenes import ScenePeople, SceneSettings, face_scene
 
-from .face_pictures import render_pictures
-from .runner import Recipe, metric_lines
+from .face_pictures import EACH, StoredCutOuts, StoredPictures, picture_files
+from .model_cards import model_card
+from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _SAME, _NOTHING = 0.4, 0.3  # overlaps from which a box is the face's, and under which it is none's
 _TEST_SIZE = 320  # pixels a side of the scenes that it is tested on
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
-        pictures: Folder of rendered people; what is missing is rendered into it.
-        people: Pictures of people that scenes are made of.
+        folder: Where pictures of people are kept, for other recipes too.
+        people: How many of them to render.
         ict: ICT-FaceKit's FaceXModel, whose heads are four people in five; embedded performers alone without.
-        out: Folder for the model and its card.
-        held_out: Share of the pictures that no scene it learns from shows.
+        held_out: Of them, the last, of people whom no scene that it learns from shows, kept for the test.
         tested: Scenes of those that are held out.
-        seed: Draws people, scenes and the first weights.
         workers: Processes that render, and that put scenes together; 0 for this one alone.
         scenes: What is in them.
         training: How it learns.
     """
 
-    pictures: Path = Path("out/face_pictures")
+    folder: Path = Path("out/face_pictures")
     people: int = 9600
     ict: Path | None = None
     out: Path = Path("models/face_boxes")
-    held_out: float = 0.1
+    held_out: int = 1056
     tested: int = 200
     seed: int = 1
     workers: int = 0
     scenes: SceneSettings = field(default_factory=SceneSettings)
     training: BoxTrainingSettings = field(default_factory=BoxTrainingSettings)
 
+    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
-def train(settings: Settings, progress: Progress | None = None) -> tuple[BoxNetwork, dict[str, float]]:
+
+@recipe
+def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
     """Renders, learns, tests and saves; the network, and what was measured on people held out.
-
-    A checkpoint is kept in ``out`` until the model is saved: a run that was killed goes on from there.
 
     Raises:
         TorchfaceError: too few people, or a file that cannot be used.
     """
-    progress = progress or silent
-    if not (0 < settings.held_out < 1 and settings.tested > 0):
-        raise TorchfaceError(
-            f"found held_out {settings.held_out}, tested {settings.tested}; expected a share in (0,1), and 1 at least"
+    progress = run.progress
+    if not (0 < settings.held_out < settings.people and settings.tested > 0):
+        raise ValueRangeError(
+            f"found held_out {settings.held_out} of {settings.people} people, tested {settings.tested}; expected some "
+            "people, not all, and 1 at least"
         )
-    rendered = render_pictures(
-        settings.pictures, settings.people, settings.seed, settings.ict, max(1, settings.workers), progress
+    files = picture_files(
+        settings.folder, settings.people, settings.seed, settings.ict, max(1, settings.workers), progress
     )
-    split = round(len(rendered) * (1 - settings.held_out))
-    people = CutOuts(rendered.rgba[:split], rendered.landmarks[:split])
-    others = CutOuts(rendered.rgba[split:], rendered.landmarks[split:])
+    split = EACH * ((len(StoredPictures(files)) - settings.held_out) // EACH)  # whole people
+    people, others = StoredCutOuts(files, 0, split), StoredCutOuts(files, split)
     progress(f"{len(people)} pictures of people to learn from, {len(others)} to test on")
-    make_folder(settings.out)
-    checkpoint = settings.out / "checkpoint.safetensors"
     model = BoxNetwork.fit(
         partial(_scene, people, settings.scenes, settings.seed),
-        settings.training,
+        replace(settings.training, seed=settings.seed, workers=settings.workers),
         progress,
-        checkpoint,
-        settings.seed,
-        settings.workers,
-        {"scenes": settings.scenes, "people": len(people), "ict": settings.ict is not None},
+        run.checkpoint,
+        {"scenes": settings.scenes, "people": len(people), "ict": settings.ict is not None, "seed": settings.seed},
+        run.device,
+        run.log,
     )
     measured = evaluate(model, others, settings.tested, settings.seed, progress)
     _save(model, settings, measured, len(people))
-    checkpoint.unlink(missing_ok=True)
     return model, measured
 
 
 def evaluate(
-    model: BoxNetwork, people: CutOuts, count: int, seed: int, progress: Progress | None = None
+    model: BoxNetwork, people: ScenePeople, count: int, seed: int, progress: Progress | None = None
 ) -> dict[str, float]:
     """What is found in scenes of these people: faces, boxes where there is none, how well they fit."""
     progress, detector = progress or silent, NetworkDetector(model)
@@ -123,21 +122,17 @@ def evaluate(
     }
 
 
-def _scene(people: CutOuts, settings: SceneSettings, seed: int, number: int) -> LabelledPicture:
+def _scene(people: ScenePeople, settings: SceneSettings, seed: int, number: int) -> LabelledPicture:
     return face_scene(people, number, settings, seed)
 
 
 def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], count: int) -> None:
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     heads = "ICT-FaceKit's heads (MIT) and the embedded performer" if settings.ict else "the embedded performer"
-    flags = f"--people {settings.people} --seed {settings.seed} --training.pictures {settings.training.pictures}"
-    card = zoo.ModelCard(
+    card = model_card(
+        settings,
         licence="MIT",
         data=f"Scenes of {count} rendered pictures of {heads}; no person's photograph.",
         metrics=measured,
-        recipe=f"python -m train.face_boxes {'--ict FaceXModel ' if settings.ict else ''}{flags} "
-        f"--out models/{settings.out.name}",
         text=(
             "Faces in whole colour or grey pictures: centre, side, score and roll angle of each. Boxes are those of "
             "`torchface.landmarks.images.ibug_68.turned_box`. Good for faces from 24 pixels in pictures of 640. Tested "
@@ -146,7 +141,6 @@ def _save(model: BoxNetwork, settings: Settings, measured: dict[str, float], cou
             "loosely, and faces turned by more than 40 degrees are found best in turned copies of the picture "
             "(`torchface.landmarks.images.turned_search.find_in_quarter_turns`)."
         ),
-        settings=effective,
     )
     zoo.save_model(
         model, settings.out, card, half=[name for name, value in model.state_dict().items() if value.ndim == 4]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from torchface.errors import FileFormatError
@@ -17,31 +16,16 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind
+from torchface.synthetic.stages.face_scenes import cut_out, upright_faces
 
 from .rendered_files import Rendering, rendered_files
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""
+EACH = 4
+"""Pictures of one person, in a row."""
 _TENSORS = ("rgba", "landmarks", "visible")
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
-
-
-@dataclass(frozen=True, eq=False)
-class FacePictures:
-    """Pictures in memory.
-
-    Args:
-        rgba: uint8 (M,4,S,S); the fourth channel is 0 on the background.
-        landmarks: iBUG's 68, (M,68,2) pixels.
-        visible: which of them nothing hides, (M,68) bool.
-    """
-
-    rgba: Tensor
-    landmarks: Tensor
-    visible: Tensor
-
-    def __len__(self) -> int:
-        return len(self.rgba)
 
 
 class StoredPictures:
@@ -74,6 +58,31 @@ class StoredPictures:
         return found["rgba"], found["landmarks"], found["visible"]
 
 
+class StoredCutOuts:
+    """People to put into scenes, of files: their landmarks are in memory, of their pictures the one that is asked for.
+
+    Args:
+        paths: of the files, in their order.
+        begin, end: which of the pictures; all to the last if ``end`` is absent.
+
+    Raises:
+        FileFormatError: a file is missing or holds something else.
+    """
+
+    def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:
+        self._pictures, self._begin = StoredPictures(paths), begin
+        marks = Shards(paths, ["landmarks"])
+        self.landmarks = marks.read(begin, len(marks) if end is None else end)["landmarks"]
+        self.faces = upright_faces(self.landmarks)
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+    def person(self, number: int) -> np.ndarray:
+        """One picture, (S,S,4), black where nobody is."""
+        return cut_out(self._pictures.rows(torch.tensor([self._begin + number]))[0][0])
+
+
 def picture_files(
     folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
 ) -> list[Path]:
@@ -94,31 +103,8 @@ def picture_files(
     return rendered_files(rendering, folder, count, seed, ict, workers, progress)
 
 
-def render_pictures(
-    folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> FacePictures:
-    """The pictures of :func:`picture_files`, in memory."""
-    return read_pictures(picture_files(folder, count, seed, ict, workers, progress))
-
-
-def read_pictures(paths: list[Path]) -> FacePictures:
-    """The pictures of files, in their order."""
-    size = load_file(paths[0])["rgba"].shape[1:]
-    total = PART * len(paths)
-    found = FacePictures(
-        torch.empty(total, *size, dtype=torch.uint8),
-        torch.empty(total, 68, 2),
-        torch.empty(total, 68, dtype=torch.bool),
-    )
-    for number, path in enumerate(paths):  # one at a time: together they take gigabytes twice
-        part, rows = load_file(path), slice(PART * number, PART * (number + 1))
-        for name in _TENSORS:
-            getattr(found, name)[rows] = part[name]
-    return found
-
-
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
-    pictures = draw_pictures(*head_kinds(ict), first, count, seed)
+    pictures = draw_pictures(*head_kinds(ict), first, count, seed, EACH)
     return {name: torch.stack([getattr(one, name) for one in pictures]) for name in _TENSORS}
 
 

@@ -7,40 +7,39 @@ core, 8,000 steps two hours; a GPU is used if there is one. Killed and started a
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder, write_file
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import INNER
 from torchface.landmarks.images.network_training import LabelledPictures, fit_network_rows
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
-from torchface.progress import Progress, silent
 
-from .face_pictures import PART, StoredPictures, picture_files
-from .runner import Recipe, metric_lines
+from .face_pictures import EACH, PART, StoredPictures, picture_files
+from .model_cards import model_card
+from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _TEST_BATCH = 64
 _LIDS = ((37, 41), (38, 40), (43, 47), (44, 46))
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
-        out: Folder for the model and its card.
         pictures: How many to render.
-        held_out: Of them, of other people, kept for the test.
+        held_out: Of them, the last, of people whom it does not learn from, kept for the test.
         folder: Where pictures are kept, for other recipes too.
         ict: ICT-FaceKit's FaceXModel folder; embedded performers alone without.
-        seed: Draws people, poses and lamps.
-        renderers: Processes that render.
+        workers: Processes that render.
         network: How the network is trained.
     """
 
@@ -50,38 +49,30 @@ class Settings:
     folder: Path = Path("out/face_pictures")
     ict: Path | None = None
     seed: int = 1
-    renderers: int = 2
+    workers: int = 2
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
+    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
 
-def train(settings: Settings, progress: Progress | None = None) -> LandmarkNetwork:
+
+@recipe
+def train(settings: Settings, run: Run) -> LandmarkNetwork:
     """Renders, trains, evaluates and saves.
 
     Raises:
         ValueRangeError: fewer pictures than are held out and a part more.
     """
-    progress = progress or silent
+    progress = run.progress
     if settings.pictures < settings.held_out + PART:
         raise ValueRangeError(
             f"pictures: found {settings.pictures}, expected {settings.held_out} to hold out and {PART} more at least"
         )
-    files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.renderers, progress)
+    files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress)
     pictures = StoredPictures(files)
-    count = len(pictures) - settings.held_out
-    make_folder(settings.out)
-    checkpoint = settings.out / "checkpoint.safetensors"
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    curve: list[str] = ["step,pixels"]
-
-    def shown(step: str, done: int = 0, total: int = 0) -> None:
-        if done % 50 == 0 and "off" in step:
-            curve.append(f"{done},{step.split(', ')[1].split()[0]}")
-        progress(step, done, total)
-
-    model = fit_network_rows(StoredPictures(files, count), None, settings.network, shown, checkpoint, device)
+    count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
+    learned = StoredPictures(files, count)
+    model = fit_network_rows(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
     save(model, settings, evaluate(model, pictures, count))
-    write_file(settings.out / "curve.csv", ("\n".join(curve) + "\n").encode())
-    checkpoint.unlink(missing_ok=True)
     return model
 
 
@@ -126,25 +117,18 @@ def measures(found: Tensor, truth: Tensor, visible: Tensor) -> dict[str, float]:
 
 def save(model: LandmarkNetwork, settings: Settings, metrics: dict[str, float]) -> None:
     """Writes the model with its card."""
-    effective = asdict(settings) | {"ict": None if settings.ict is None else settings.ict.name}
-    effective |= {"out": settings.out.name, "folder": settings.folder.name}
     heads = "embedded performers" if settings.ict is None else "ICT-FaceKit's heads (MIT) and embedded performers"
-    flags = "" if settings.ict is None else f"--ict {settings.ict.name} "
-    card = zoo.ModelCard(
+    card = model_card(
+        settings,
         licence="MIT",
         data=f"{settings.pictures} rendered pictures of {heads}; no person's photograph.",
         metrics=metrics,
-        recipe=(
-            f"python -m train.landmark_network {flags}--pictures {settings.pictures} --seed {settings.seed} "
-            f"--network.steps {settings.network.steps} --out models/{settings.out.name}"
-        ),
         text=(
             "iBUG's 68 landmarks of a face in a crop of a colour or grey image, with the deviation to be expected of "
             "each, whether something hides it, and whether there is a face at all. Good for faces within 60 degrees of "
             "frontal, from 24 pixels a box, at any roll that the crop is turned by. The figures are of rendered people "
             "that it had not seen; tests/benchmarks/test_real_faces.py measures it on photographs."
         ),
-        settings=effective,
     )
     zoo.save_model(
         model, settings.out, card, half=tuple(name for name, value in model.state_dict().items() if value.ndim > 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from torch import Tensor
 from torchface import TorchfaceError, zoo
 from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
-from torchface.files.whole_files import make_folder
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
@@ -28,7 +27,9 @@ from torchface.landmarks.images.ibug_68 import box_around, relative_errors
 from torchface.progress import Progress, silent
 from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 
-from .runner import Recipe, metric_lines
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway
@@ -36,17 +37,14 @@ _PART = 60  # images that a process renders at once
 _AROUND = 0.8  # of the box that is kept on every side
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         data: Folders of images with .pts files, or dlib .xml files.
         performers: So many rendered images of synthetic people.
-        out: Folder for the model and its card.
         held_out: Faces of the data, the last ones, or rendered images of other people, that are kept for the test.
-        seed: Draws people, poses and lights.
-        licence: Under which the model may be used; MIT for performers alone, else that of the data, if absent.
         workers: Processes that render.
         trees: How trees are grown.
         images: What is rendered how widely.
@@ -57,7 +55,6 @@ class Settings:
     out: Path = Path("models/face_landmarks")
     held_out: int = 0
     seed: int = 1
-    licence: str = ""
     workers: int = 1
     trees: TreeSettings = field(default_factory=TreeSettings)
     images: FaceImageSettings = field(default_factory=FaceImageSettings)
@@ -88,25 +85,21 @@ class Faces:
 NO_FACES = Faces([], torch.zeros(0, 4), torch.zeros(0, 68, 2))
 
 
-def train(settings: Settings, progress: Progress | None = None) -> tuple[LandmarkTrees, Tensor]:
+@recipe
+def train(settings: Settings, run: Run) -> tuple[LandmarkTrees, Tensor]:
     """Loads or renders, splits, fits, evaluates and saves; the model, and its errors on the faces held out.
-
-    A checkpoint is kept in ``out`` until the model is saved: a run that was killed goes on from there.
 
     Raises:
         TorchfaceError: neither data nor performers, too few faces, or a file that cannot be used.
     """
-    progress = progress or silent
+    progress = run.progress
     learn, test = split(settings, progress)
     progress(f"{len(learn)} faces to learn from, {len(test)} to test on")
-    make_folder(settings.out)
-    checkpoint = settings.out / "checkpoint.safetensors"
     model = LandmarkTrees.fit(
-        learn.images, learn.boxes, learn.landmarks, settings.trees, progress, checkpoint=checkpoint
+        learn.images, learn.boxes, learn.landmarks, settings.trees, progress, checkpoint=run.checkpoint
     )
     errors = evaluate(model, test)
     _save(model, settings, errors, len(learn))
-    checkpoint.unlink(missing_ok=True)
     return model, errors
 
 
@@ -233,16 +226,9 @@ def _cropped(grey: Tensor, landmarks: Tensor) -> Faces:
 
 
 def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) -> None:
-    effective = asdict(settings) | {"data": [path.name for path in settings.data], "out": settings.out.name}
     own = f"{settings.performers} rendered images of the embedded performer; no person's face."
     given = f"{count - settings.performers} faces of {', '.join(path.name for path in settings.data)}"
     data = own if not settings.data else (f"{given}, {own}" if settings.performers else f"{given}.")
-    flags = [f"--data {' '.join(path.name for path in settings.data)}"] if settings.data else []
-    flags += [f"--performers {settings.performers}"] if settings.performers else []
-    flags += [f"--held-out {settings.held_out} --seed {settings.seed}"]
-    for part in ("trees", "images"):  # a default a turn: what differs is said
-        usual, ours = asdict(type(getattr(settings, part))()), asdict(getattr(settings, part))
-        flags += [f"--{part}.{key.replace('_', '-')} {ours[key]}" for key in ours if ours[key] != usual[key]]
     metrics = {}
     if len(errors):
         metrics = {
@@ -250,11 +236,11 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
             "median error, %": 100 * float(errors.median()),
             "share of faces with more than 10 %, %": 100 * float((errors > 0.1).float().mean()),
         }
-    card = zoo.ModelCard(
-        licence=settings.licence or ("that of the data" if settings.data else "MIT"),
+    card = model_card(
+        settings,
+        licence="that of the data" if settings.data else "MIT",
         data=data,
         metrics=metrics,
-        recipe=f"python -m train.landmarks {' '.join(flags)} --out models/{settings.out.name}",
         text=(
             "iBUG's 68 landmarks of faces in grey images, from boxes as OpenCV's Haar cascade gives them or "
             "`landmarks.images.ibug_68.box_around` makes them of landmarks. Good for faces within 40 degrees of "
@@ -265,7 +251,6 @@ def _save(model: LandmarkTrees, settings: Settings, errors: Tensor, count: int) 
                 else " Learned from rendered people alone: expect two to three times the error on photographs."
             )
         ),
-        settings=effective,
     )
     zoo.save_model(model, settings.out, card, half=("offsets", "thresholds", "bases"))
 

@@ -5,7 +5,7 @@ Without a rig it is that of the embedded performer with 100 markers.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,31 +13,29 @@ import torch
 from torchface import Attachment, BlendshapeRig, load_rig, zoo
 from torchface.capture import MarkerSolver
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
-from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import place_markers
 from torchface.synthetic.stages.weight_curves import perform
 
-from .runner import Recipe, metric_lines
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         rig: A .glb, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder; the embedded performer if absent.
         attachment: Where the markers sit, as JSON; placed over the face if absent.
-        out: Folder for the model and its card.
         part: Keep this region of the rig only, such as face.
         markers: How many are placed.
         sparsity: Price of an active shape, mm² a marker.
         ridge: Price of a squared weight, mm² a marker.
         noise: Of the markers in the test, millimetres a coordinate.
         frames: Of the synthetic take of the test.
-        seed: Draws take and noise.
-        licence: Under which the model may be used; MIT for the performer, else that of the rig, if absent.
     """
 
     rig: Path | None = None
@@ -49,13 +47,12 @@ class Settings:
     ridge: float = RIDGE
     noise: float = 0.3
     frames: int = 600
-    seed: int = 0
-    licence: str = ""
 
 
-def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
+@recipe
+def train(settings: Settings, run: Run) -> MarkerSolver:
     """Builds the solver, tests it on a synthetic take, saves it."""
-    progress = progress or silent
+    progress = run.progress
     progress("reading the rig")
     rig = performer(texture=False) if settings.rig is None else load_rig(settings.rig, part=settings.part)
     attachment = (
@@ -64,17 +61,12 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     progress("solving a synthetic take")
     metrics = measure(solver, rig, settings)
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     own = "the embedded performer" if settings.rig is None else settings.rig.name
-    flags = f"--rig {settings.rig.name}" if settings.rig else f"--markers {settings.markers} --seed {settings.seed}"
-    flags += f" --attachment {settings.attachment.name}" if settings.attachment else ""
-    flags += f" --part {settings.part}" if settings.part else ""
-    card = zoo.ModelCard(
-        licence=settings.licence or ("MIT" if settings.rig is None else "that of the rig"),
+    card = model_card(
+        settings,
+        licence="MIT" if settings.rig is None else "that of the rig",
         data=f"The rig of {own}, {len(solver.names)} shapes, {len(solver.labels)} markers; no person's face.",
         metrics=metrics,
-        recipe=f"python -m train.marker_solver {flags} --out models/{settings.out.name}",
         text=(
             "Weights of blendshapes from 3D markers in millimetres, NaN for not seen; every frame on its own, the "
             "exact minimum. Good for takes of this rig with this layout, in its space; another actor needs another "
@@ -82,7 +74,6 @@ def train(settings: Settings, progress: Progress | None = None) -> MarkerSolver:
             f"Measured on a synthetic take of {settings.frames} frames with {settings.noise} mm of noise a coordinate. "
             "Shapes that no marker sees, such as where the eyes look, stay at rest."
         ),
-        settings=effective,
     )
     zoo.save_model(solver, settings.out, card)
     return solver

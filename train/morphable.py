@@ -7,25 +7,25 @@ started again, a run goes on where it was.
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from torchface import TorchfaceError, zoo
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import SampleRange, Samples, blocks
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.streamed_training import fit_sequence
-from torchface.progress import Progress, silent
+from torchface.progress import Progress
 
 from .head_figures import draw
 from .head_samples import Source, balanced_colors, gather, laid, performers, registered
 from .head_templates import ict_head_model, load_template
-from .runner import Recipe, metric_lines
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _TESTED_PERFORMERS = 20
 _MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
@@ -37,15 +37,14 @@ _MEASURES = (
 _HALF = ("shape.components", "color.components")
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         scans: Folder of registered meshes, all of one topology, in any place; what `torchface register` writes.
         ict: Take ICT-FaceKit's `FaceXModel` folder instead: its neutral, identity modes and expressions.
         performers: Learn from so many embedded performers instead of a folder's meshes.
-        out: Folder for the model, its card and its pictures.
         template: The template that the meshes were registered with, a mesh or a rig (.glb, a folder of OBJ files,
             `FaceXModel`): says where and how upright the heads are to stand, and brings annotations. A rig travels with
             the model, so that `torchface fit` needs no other. The first mesh where absent, set upright by its landmarks
@@ -59,8 +58,6 @@ class Settings:
         scale: Take the heads' sizes off as well as their places.
         white_balance: Free the colours from each scan's exposure and white balance; performers have none.
         half: Store components in half precision.
-        seed: Draws performers, and random heads for pictures and specificity.
-        licence: Under which the model may be used; MIT for performers, else what the scans allow, if absent.
         pictures: Folder for the pictures; OUT/pictures if absent.
     """
 
@@ -78,7 +75,6 @@ class Settings:
     white_balance: bool = True
     half: bool = False
     seed: int = 7
-    licence: str | None = None
     pictures: Path | None = None
 
 
@@ -91,21 +87,21 @@ class Trained:
     quality: ModelQuality | None
 
 
-def train(settings: Settings, progress: Progress | None = None) -> Trained:
+@recipe
+def train(settings: Settings, run: Run) -> Trained:
     """Loads, aligns, splits, fits, evaluates, saves, draws.
 
     Raises:
         TopologyError: a mesh has another topology than the first.
         TorchfaceError: neither scans nor performers, too few of them, all the same, or more components than they hold.
     """
-    progress = progress or silent
+    progress = run.progress
     _check_one_source(settings)
     if settings.ict is not None:
         return _ict(settings, settings.ict, progress)
     source, held_out = _source(settings)
     template, rig = (None, None) if settings.template is None else load_template(settings.template, settings.part)
-    work = settings.out.parent / f".{settings.out.name}.training"
-    make_folder(work)
+    work = run.work
     gathered = gather(source, held_out, work, template, progress)
     count = len(gathered.shapes) - gathered.held_out
     progress(f"{count} heads to learn from, {gathered.held_out} to test on")
@@ -144,7 +140,6 @@ def train(settings: Settings, progress: Progress | None = None) -> Trained:
         metrics |= cross_validated(learn, folds, settings.components)
     save(model, settings, metrics, count, gathered.held_out, folds)
     draw(model, settings.pictures or settings.out / "pictures", settings.seed, quality, learn, test, progress)
-    shutil.rmtree(work, ignore_errors=True)
     return Trained(model, metrics, quality)
 
 
@@ -215,24 +210,12 @@ def save(
     model: HeadModel, settings: Settings, metrics: dict[str, float], count: int, held_out: int, folds: int
 ) -> None:
     """Writes the model with its effective settings, measured errors and card."""
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     if settings.performers:
         data = f"{count} embedded performers, heads and complexions drawn by seed {settings.seed}; no person's face."
-        flags = f"--performers {settings.performers} --seed {settings.seed}"
     elif settings.ict is not None:
         data = f"{model.shape.count} identity modes of ICT-FaceKit's FaceXModel, made of light-stage scans of people."
-        flags = f"--ict {settings.ict.name}"
     else:
         data = f"{count} registered meshes of {settings.scans and settings.scans.name}."
-        flags = f"--scans {settings.scans and settings.scans.name}"
-    for name in ("template", "part", "held_out", "components", "color_components", "variance"):
-        value = getattr(settings, name)
-        value = value.name if isinstance(value, Path) else value
-        flags += "" if value is None else f" --{name.replace('_', '-')} {value}"
-    flags += (
-        " --scale" * settings.scale + " --no-white-balance" * (not settings.white_balance) + " --half" * settings.half
-    )
     colors = (
         "Colours are one a vertex, sRGB; a cast that the whole set shares remains, and so does light from the side."
         if model.color is not None
@@ -246,18 +229,17 @@ def save(
         tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
     carried = f"A rig of {len(model.rig_names)} shapes travels with it. " if model.rig_names else ""
     free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
-    card = zoo.ModelCard(
-        licence=settings.licence or free,
+    card = model_card(
+        settings,
+        licence=free,
         data=data,
         metrics=metrics,
-        recipe=f"python -m train.morphable {flags} --out models/{settings.out.name}",
         text=(
             f"Neutral heads as a linear model: a mean and {model.shape.count} components, coefficients in standard "
             "deviations, millimetres. Good for drawing heads, for holding a registration or a fit to photographs to "
             f"what heads look like, for filling in what a scan does not show. {colors} {carried}{tested} It "
             "knows no heads unlike those it has learned from: beyond 3 standard deviations it only guesses."
         ),
-        settings=effective,
     )
     zoo.save_model(
         model, settings.out, card, half=[name for name in _HALF if settings.half and name in model.state_dict()]

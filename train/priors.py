@@ -7,9 +7,8 @@ instead, and needs no file. ``--names`` and ``--rig`` make a prior for a rig's o
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,14 +27,15 @@ from torchface.capture.priors import (
 )
 from torchface.capture.priors.seen_frames import MOST_FRAMES, SeenFrames
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder
-from torchface.progress import Progress, silent
+from torchface.progress import Progress
 from torchface.synthetic import performer
 
+from .model_cards import model_card
 from .prior_figures import calibration_picture, choice_picture, curves_picture, save_figure
 from .prior_takes import PriorTakes, read_takes, renamed, split, synthetic_takes
 from .prior_trials import one_step, solve_error, synthetic_video, with_strength
-from .runner import Recipe, metric_lines
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 Kind = Literal["shape", "reciprocal", "dynamics", "both"]
 _WINDOWS = (2, 3, 4, 6, 8)
@@ -44,15 +44,14 @@ _BANDWIDTHS = (0.5, 1.0, 2.0)  # times the automatic one
 _TRIED = 20  # takes: of more that are held out, so many are solved and predicted for the card
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         takes: Folder of takes.
         performances: Learn from so many synthetic takes of the embedded performer instead.
         frames: Of each synthetic take.
-        out: Folder for the model, its card and its pictures; two folders, OUT_shape and OUT_dynamics, for both kinds.
         kind: shape (Student's t-distribution), reciprocal (the paper's 1/P over a Parzen window),
             dynamics, or both (shape and dynamics).
         rig: The rig that the priors are for: its names, and marker takes are solved with it.
@@ -69,8 +68,6 @@ class Settings:
         trial_frames: How many frames of each take are solved in a trial.
         inducing: How many windows stand for all others.
         iterations: Of the ascent on the marginal likelihood.
-        seed: Draws synthetic takes, windows and noise.
-        licence: Under which the model may be used; MIT for the performer, else that of the takes, if absent.
         pictures: Folder for the pictures; OUT/pictures if absent.
     """
 
@@ -93,8 +90,6 @@ class Settings:
     trial_frames: int = 60
     inducing: int = 100
     iterations: int = 50
-    seed: int = 0
-    licence: str | None = None
     pictures: Path | None = None
 
 
@@ -115,7 +110,8 @@ class Material:
     silent: tuple[str, ...]
 
 
-def train(settings: Settings, progress: Progress | None = None) -> dict[str, dict[str, float]]:
+@recipe
+def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
     """Loads, names, splits, chooses, fits, evaluates, saves, draws.
 
     Returns:
@@ -125,11 +121,9 @@ def train(settings: Settings, progress: Progress | None = None) -> dict[str, dic
         TorchfaceError: neither takes nor performances; too few takes, too short ones, ones with NaN or with different
             shapes; marker takes without rig and attachment.
     """
-    progress = progress or silent
-    work = settings.out.parent / f".{settings.out.name}.training"
+    progress = run.progress
     _check_one_source(settings)
-    make_folder(work)
-    material = _material(settings, work, progress)
+    material = _material(settings, run.work, progress)
     both = settings.kind == "both"
     measured = {}
     if settings.kind != "dynamics":
@@ -138,7 +132,6 @@ def train(settings: Settings, progress: Progress | None = None) -> dict[str, dic
     if settings.kind in ("dynamics", "both"):
         out = settings.out.with_name(f"{settings.out.name}_dynamics") if both else settings.out
         measured[out.name] = _dynamics(settings, out, material, progress)
-    shutil.rmtree(work, ignore_errors=True)
     return measured
 
 
@@ -363,35 +356,20 @@ def _save(
     card: str,
 ) -> None:
     """Writes the model with its effective settings, measured errors and card."""
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
-    effective["names"] = list(settings.names)
-    effective["out"] = out.name
     kind = settings.kind if settings.kind != "both" else "dynamics" if isinstance(prior, DynamicsPrior) else "shape"
-    effective["kind"] = kind
     learn, test = material.learn, material.test
     frames = sum(learn.frames)
     if settings.takes is None:
         source = f"{len(learn.weights)} synthetic takes of the embedded performer, {frames} frames; no person's."
-        flags = f"--performances {settings.performances} --frames {settings.frames}"
     else:
         solved = ", solved from markers" if learn.solved else ""
         source = f"{len(learn.weights)} takes of {settings.takes.name}, {frames} frames{solved}."
-        flags = f"--takes {settings.takes.name}"
-    standard = Settings()
-    for name in ("rig", "attachment", "part", "fps", "held_out", "window", "input_noise", "strength", "bandwidth",
-                 "pixel_noise", "trial_frames", "inducing", "iterations"):  # fmt: skip
-        value = getattr(settings, name)
-        if value != getattr(standard, name):
-            flags += f" --{name.replace('_', '-')} {value.name if isinstance(value, Path) else value}"
-    flags += f" --names {' '.join(settings.names)}" if settings.names else ""
-    known = zoo.ModelCard(
-        licence=settings.licence or ("MIT" if settings.takes is None else "that of the takes"),
+    known = model_card(
+        replace(settings, kind=kind, out=out),
+        licence="MIT" if settings.takes is None else "that of the takes",
         data=f"{source} {len(learn.names)} shapes; tested on {len(test.weights)} more takes.",
         metrics=metrics,
-        recipe=f"python -m train.priors {flags} --kind {kind} --seed {settings.seed} --out models/{out.name}",
         text=card,
-        settings=effective,
     )
     zoo.save_model(prior, out, known)
 

@@ -1,29 +1,95 @@
-"""What every recipe does at a shell: flags to settings, training with its progress shown, what was measured printed."""
+"""What every recipe does: flags and files to settings, one run at a time, log, what was measured printed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+import torch
 import tyro
 
 from torchface.cli.exit_messages import plain_errors
 from torchface.cli.progress import progress_bars
+from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
-from torchface.progress import Progress
+from torchface.files.whole_files import made_folder, make_folder
+from torchface.progress import Progress, silent
+
+from .recipe_settings import RecipeSettings, recipe_name
+from .run_log import RunLog
+from .settings_files import read_settings, write_settings
+
+Settings = TypeVar("Settings", bound=RecipeSettings)
+Taken = TypeVar("Taken", bound=RecipeSettings, contravariant=True)
+Trained = TypeVar("Trained")
+Made = TypeVar("Made", covariant=True)
+_CONFIG = (
+    "\n\n``--config settings.toml`` fills settings, such as an earlier run's OUT/settings.toml; flags win over it."
+)
 
 
-class HasOut(Protocol):
-    """Settings of a recipe: they say at least where its results go."""
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a recipe is given beside its settings.
+
+    Args:
+        progress: called with each step and how far it is.
+        log: called with what is measured on the way; see :class:`~torchface.progress.ValueLog`.
+        work: folder for what a run that goes on takes up; gone when the run has come to its end.
+        device: where to compute.
+    """
+
+    progress: Progress
+    log: RunLog
+    work: Path
+    device: torch.device
 
     @property
-    def out(self) -> Path: ...
+    def checkpoint(self) -> Path:
+        """File for the state of a descent."""
+        return self.work / "checkpoint.safetensors"
 
 
-Settings = TypeVar("Settings", bound=HasOut)
-Trained = TypeVar("Trained")
+class Train(Protocol[Taken, Made]):
+    """Learns, evaluates and saves."""
+
+    def __call__(self, settings: Taken, progress: Progress | None = None) -> Made: ...
+
+
+def recipe(body: Callable[[Settings, Run], Trained]) -> Train[Settings, Trained]:
+    """Makes a recipe's function one of settings and progress: the run's device, folders and log are prepared for it.
+
+    When it has come to its end, ``settings.toml``, ``log.csv`` and ``curves.png`` lie beside the model.
+    """
+
+    @wraps(body)
+    def train(settings: Settings, progress: Progress | None = None) -> Trained:
+        with _running(settings, progress or silent) as run:
+            return body(settings, run)
+
+    return train  # type: ignore[return-value]
+
+
+@contextmanager
+def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
+    device = settings.chosen_device()
+    if not settings.resume:
+        settings.forget()
+    log = RunLog(settings.out, goes_on=settings.work.is_dir())
+    with made_folder(settings.work) as work:
+        try:
+            yield Run(progress, log, work, device)
+        except BaseException:
+            log.write()
+            raise
+    log.close()
+    write_settings(make_folder(settings.out) / "settings.toml", settings)
+    settings.forget()
 
 
 @dataclass(frozen=True)
@@ -38,7 +104,7 @@ class Recipe(Generic[Settings, Trained]):
     """
 
     settings: type[Settings]
-    train: Callable[[Settings, Progress], Trained]
+    train: Train[Settings, Trained]
     description: str | None
     lines: Callable[[Settings, Trained], Iterable[str]]
 
@@ -49,11 +115,34 @@ class Recipe(Generic[Settings, Trained]):
             arguments: words of the command line; those of this process if absent.
         """
         with plain_errors():
-            chosen = tyro.cli(self.settings, description=self.description, args=arguments)
+            chosen = self.chosen(list(sys.argv[1:] if arguments is None else arguments))
             with job_lock(chosen.out), progress_bars() as progress:
                 trained = self.train(chosen, progress)
             for line in self.lines(chosen, trained):
                 print(line)
+
+    def chosen(self, words: Sequence[str]) -> Settings:
+        """The settings of flags and, behind ``--config``, of a file; flags win.
+
+        Raises:
+            FileFormatError: the file cannot be read, names what is no setting, or a value is of another kind.
+            ValueRangeError: ``--config`` without a file.
+        """
+        flags = list(words)
+        default: Settings | None = None
+        for place, word in enumerate(flags):
+            if word == "--config" or word.startswith("--config="):
+                given = word.partition("=")[2] or "".join(flags[place + 1 : place + 2])
+                if not given or given.startswith("--"):
+                    raise ValueRangeError("config: found no file, expected --config FILE")
+                default = read_settings(Path(given), self.settings)
+                del flags[place : place + (1 if "=" in word else 2)]
+                break
+        told = (self.description or "") + _CONFIG
+        name = f"torchface train {recipe_name(self.settings)}"
+        if default is None:
+            return tyro.cli(self.settings, prog=name, description=told, args=flags)
+        return tyro.cli(self.settings, prog=name, description=told, args=flags, default=default)
 
 
 def metric_lines(metrics: Mapping[str, float], number: str = "8.3f") -> list[str]:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -32,27 +32,26 @@ from torchface.rendering.compositing import save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
 
-from .runner import Recipe, metric_lines
+from .model_cards import model_card
+from .recipe_settings import RecipeSettings
+from .runner import Recipe, Run, metric_lines, recipe
 
 _TESTED_PERFORMERS = 20
 _VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
     """What the recipe does.
 
     Args:
         scans: Folder of scans (.obj, .ply, .stl, .glb), in any pose, in millimetres.
         annotations: JSON with the landmarks of each scan by file name.
         performers: Learn from scans of so many embedded performers instead of a folder's.
-        out: Folder for the model, its card and its images.
         appearance: What the detector looks at: the scans' colours, or their form.
         held_out: How many scans, the last by name, are kept for the test; or how many more performers are drawn for it.
             None if absent, and 20 performers.
-        seed: Draws performers, and what their scanner does to them.
         size: Pixels a side of the unwrapped images.
-        licence: Under which the model may be used; MIT for performers, else that of the scans, if absent.
         detector: How landmarks are matched.
     """
 
@@ -64,7 +63,6 @@ class Settings:
     held_out: int | None = None
     seed: int = 7
     size: int = 1024
-    licence: str = ""
     detector: DetectorSettings = field(default_factory=DetectorSettings)
 
 
@@ -85,13 +83,14 @@ class Trained:
     errors: list[ScanErrors]
 
 
-def train(settings: Settings, progress: Progress | None = None) -> Trained:
+@recipe
+def train(settings: Settings, run: Run) -> Trained:
     """Loads, aligns, splits, fits, evaluates and saves.
 
     Raises:
         TorchfaceError: neither scans nor performers are asked for, no scan is annotated, or one cannot be used.
     """
-    progress = progress or silent
+    progress = run.progress
     learn, test = _split(settings, progress)
     progress(f"{len(learn)} scans to learn from, {len(test)} to test on")
     detector = fit(learn, settings.appearance, settings.size, settings.detector, progress)
@@ -156,29 +155,22 @@ def scanned_performers(
 
 def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErrors], count: int) -> None:
     """Writes the model with its effective settings, measured errors and card."""
-    folder, notes = settings.scans, settings.annotations
-    effective = {key: value for key, value in asdict(settings).items() if value is not None}
-    effective |= {key: value.name for key, value in effective.items() if isinstance(value, Path)}
     if settings.performers:
         data = f"{count} scans of the embedded performer; no person's face."
-        flags = f"--performers {settings.performers} --seed {settings.seed}"
     else:
-        data = f"{count} annotated scans of {'a folder' if folder is None else folder.name}."
-        flags = f"--scans {folder and folder.name} --annotations {notes and notes.name}"
-    flags += f" --appearance {settings.appearance}" + (f" --held-out {len(errors)}" if errors else "")
+        data = f"{count} annotated scans of {settings.scans and settings.scans.name}."
     seen = "colours" if settings.appearance == "texture" else "form"
     pitch = CylinderLayout().resized(settings.size).pitch
-    card = zoo.ModelCard(
-        licence=settings.licence or ("MIT" if settings.performers else "that of the scans"),
+    card = model_card(
+        settings,
+        licence="MIT" if settings.performers else "that of the scans",
         data=data,
         metrics=error_table(errors),
-        recipe=f"python -m train.uv_landmarks {flags} --out models/{settings.out.name}",
         text=(
             f"Twelve face landmarks, lip and lid lines of raw scans, found by their {seen}. Tested on {len(errors)} "
             f"other scans; pixels are those of the unwrapped head, {settings.size} a side, {pitch:g} mm each. Lids are "
             "traced where they meet in scans with closed eyes."
         ),
-        settings=effective,
     )
     zoo.save_model(detector, settings.out, card)
 

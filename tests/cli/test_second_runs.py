@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from torchface.cli import main
 from torchface.files.job_lock import file_lock, job_lock
+from train.recipe_settings import RecipeSettings
 from train.runner import Recipe
 
 Lock = Callable[[Path], AbstractContextManager[Path]]
@@ -45,34 +44,27 @@ def test_a_second_run_of_a_command_is_refused(
     assert f"found another run writing into {out} (process" in " ".join(capsys.readouterr().err.split())
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Of a recipe that only writes."""
-
-    out: Path
-
-
 def test_a_second_run_of_a_recipe_is_refused_and_the_lock_goes_with_the_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "model"
-    monkeypatch.setattr(sys, "argv", ["recipe", "--out", str(out)])
+    words = ["--out", str(out)]
     calls: list[str] = []
 
-    def first(settings: Settings, _: object) -> str:
+    def first(settings: RecipeSettings, _: object = None) -> str:
         calls.append("first")
         (settings.out / "model.toml").write_text("first")
         with pytest.raises(SystemExit):
-            Recipe(Settings, second, None, lambda *_: []).main()
+            Recipe(RecipeSettings, second, None, lambda *_: []).main(words)
         assert f"another run writing into {out} (process" in " ".join(capsys.readouterr().err.split())
         return "trained"
 
-    def second(settings: Settings, _: object) -> str:
+    def second(settings: RecipeSettings, _: object = None) -> str:
         calls.append("second")
         (settings.out / "model.toml").write_text("second")
         return "trained"
 
-    Recipe(Settings, first, None, lambda *_: []).main()
+    Recipe(RecipeSettings, first, None, lambda *_: []).main(words)
     assert (calls, (out / "model.toml").read_text()) == (["first"], "first")
-    Recipe(Settings, second, None, lambda *_: []).main()
+    Recipe(RecipeSettings, second, None, lambda *_: []).main(words)
     assert [path.name for path in out.iterdir()] == ["model.toml"]

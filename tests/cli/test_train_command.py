@@ -10,14 +10,11 @@ from torchface.cli import main
 from train import marker_solver
 
 OWN = '''"""``torchface train own``: nothing."""
-from dataclasses import dataclass
-from pathlib import Path
-
+from .recipe_settings import RecipeSettings
 from .runner import Recipe
 
-@dataclass(frozen=True)
-class Settings:
-    out: Path
+class Settings(RecipeSettings):
+    pass
 
 RECIPE = Recipe(Settings, lambda settings, _: settings.out.name, __doc__, lambda _, made: [f"{made} done"])
 '''

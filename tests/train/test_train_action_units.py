@@ -28,8 +28,16 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
 def test_a_video_and_its_labels_become_a_model(session: RecordedSession, tmp_path: Path) -> None:
     video, labels = (session.video.path,), (session.labels_path,)
     out = tmp_path / "units"
-    trained = train(Settings(video, labels, video, labels, out, size=32, folds=2))
-    assert {path.name for path in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "levels.png"}
+    trained = train(
+        Settings(video=video, labels=labels, test_video=video, test_labels=labels, out=out, size=32, folds=2)
+    )
+    assert {path.name for path in out.iterdir()} == {
+        "model.toml",
+        "state.safetensors",
+        "CARD.md",
+        "levels.png",
+        "settings.toml",
+    }
     again = zoo.get_model(out)
     assert isinstance(again, ActionUnitClassifier)
     assert set(again.units) == set(ACTION_UNITS)
@@ -49,11 +57,11 @@ def test_what_is_not_performed_is_left_out_what_is_unknown_is_named(session: Rec
     with pytest.raises(TorchfaceError, match="found the units 99"):
         performed_groups([odd])
     with pytest.raises(TorchfaceError, match="found 1 videos and 0 files of labels"):
-        train(Settings((session.video.path,), (), out=tmp_path / "x"))
+        train(Settings(video=(session.video.path,), labels=(), out=tmp_path / "x"))
     together = replace(session.labels, performed=(Performed(("4", "9"), 5, 20), Performed(("9",), 25, 40)))
     save_action_labels(together, tmp_path / "together.toml")
     with pytest.raises(NameMismatchError, match="4 is never performed alone"):
-        train(Settings((session.video.path,), (tmp_path / "together.toml",), out=tmp_path / "x", size=32))
+        train(Settings(video=(session.video.path,), labels=(tmp_path / "together.toml",), out=tmp_path / "x", size=32))
 
 
 def test_the_command_says_what_it_wants(capsys: pytest.CaptureFixture[str]) -> None:

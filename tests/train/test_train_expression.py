@@ -50,7 +50,7 @@ def pairs(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> 
 def trained(pairs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Path]:
     out = tmp_path_factory.mktemp("models") / "domes"
     asked = ("jawOpen", "mouthSmileLeft+mouthSmileRight")
-    return train(Settings(pairs, expressions=asked, out=out, pictured=1)), out
+    return train(Settings(pairs=pairs, expressions=asked, out=out, pictured=1)), out
 
 
 def test_the_law_is_found(trained: tuple[Trained, Path]) -> None:
@@ -83,10 +83,10 @@ def test_expressions_are_laid_onto_neutrals(dome_rig: BlendshapeRig) -> None:
 
 
 def test_more_components_than_people_are_cut(pairs: Path, tmp_path: Path) -> None:
-    people = gather(Settings(pairs), tmp_path, silent)
-    model = fit(people, Settings(pairs, neutral_components=50))
+    people = gather(Settings(pairs=pairs), tmp_path, silent)
+    model = fit(people, Settings(pairs=pairs, neutral_components=50))
     assert len(model.neutral_components) <= 7
-    chosen = fit(people, Settings(pairs, neutral_components=None, offset_components=None, ridge=None))
+    chosen = fit(people, Settings(pairs=pairs, neutral_components=None, offset_components=None, ridge=None))
     assert len(chosen.neutral_components) <= 6
 
 
@@ -94,35 +94,35 @@ def test_people_who_do_not_fit_are_named(pairs: Path, dome_rig: BlendshapeRig, t
     with pytest.raises(TorchfaceError, match="either --pairs DIR or --performers"):
         train(Settings())
     with pytest.raises(TorchfaceError, match="found 0 people, expected at least three"):
-        train(Settings(tmp_path, out=tmp_path.parent / "own"))
+        train(Settings(pairs=tmp_path, out=tmp_path.parent / "own"))
     with pytest.raises(NameMismatchError, match="tongueOut"):
-        train(Settings(pairs, expressions=("tongueOut",), out=tmp_path / "own"))
+        train(Settings(pairs=pairs, expressions=("tongueOut",), out=tmp_path / "own"))
     for i in range(3):
         neutral = dome_rig.neutral
         if i == 2:
             neutral = replace(neutral, faces=neutral.faces[:-2], polygons=None)
         save_rig(BlendshapeRig(neutral, dome_rig.deltas, dome_rig.names), tmp_path / f"{i}.glb")
     with pytest.raises(TorchfaceError, match=r"found 2\.glb of topology"):
-        train(Settings(tmp_path, out=tmp_path.parent / "own"))
+        train(Settings(pairs=tmp_path, out=tmp_path.parent / "own"))
 
 
 def test_people_on_disk_give_what_people_in_memory_give(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = gather(Settings(pairs), tmp_path, silent)
+    held = gather(Settings(pairs=pairs), tmp_path, silent)
     monkeypatch.setattr(people_samples, "_HELD_BYTES", 0)
     read_again: list[str] = []
     monkeypatch.setattr(recipe, "load_rig", lambda path: read_again.append(path.name) or load_rig(path))
     (tmp_path / "person_000005.safetensors").write_bytes(b"cut")
     with pytest.warns(UserWarning, match="damaged checkpoint"):
-        kept = gather(Settings(pairs), tmp_path, silent)
+        kept = gather(Settings(pairs=pairs), tmp_path, silent)
     assert read_again == ["person0", "person5"]  # the first is every run's template
     assert not isinstance(kept.offsets, type(held.offsets))
     for i in range(8):
         assert torch.equal(kept.offsets_of(i), held.offsets_of(i))
         assert torch.equal(kept.without(i).offsets.read(0, 7), held.without(i).offsets.read(0, 7))
         assert torch.equal(kept.without(i).neutrals.read(2, 6), held.without(i).neutrals.read(2, 6))
-    asked = Settings(pairs, neutral_components=None, offset_components=None, ridge=None)
+    asked = Settings(pairs=pairs, neutral_components=None, offset_components=None, ridge=None)
     faces = held.expressions.read(0, 8).unflatten(1, (len(held.names), -1))
     whole = ExpressionRegression.fit(
         held.neutrals.read(0, 8), faces, ExpressionSettings(neutral_components=None, offset_components=None, ridge=None)
@@ -137,13 +137,13 @@ def test_of_many_people_the_last_are_left_out_together(
 ) -> None:
     monkeypatch.setattr(expression_table, "_MANY", 7)
     monkeypatch.setattr(expression_table, "_TESTED", 2)
-    found = train(Settings(pairs, out=tmp_path / "own", pictured=0)).comparison
+    found = train(Settings(pairs=pairs, out=tmp_path / "own", pictured=0)).comparison
     assert found is not None
     assert (len(found.squared), found.learned) == (2, 6)
-    rest = gather(Settings(pairs), tmp_path / "work", silent).first(6)
+    rest = gather(Settings(pairs=pairs), tmp_path / "work", silent).first(6)
     assert rest.who[-1] == "person5"
     mean = found.squared[:, :, METHODS.index("mean offset")]
-    people = gather(Settings(pairs), tmp_path / "work", silent)
+    people = gather(Settings(pairs=pairs), tmp_path / "work", silent)
     truth = (people.offsets_of(7) - rest.mean_rig().deltas).double().square().sum((-1, -2))
     torch.testing.assert_close(mean[1], truth)
     assert "leaving out the last 2 people together" in (tmp_path / "own" / "CARD.md").read_text()

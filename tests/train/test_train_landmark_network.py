@@ -16,6 +16,7 @@ from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from train import landmark_network as recipe
 from train.face_pictures import StoredPictures
+from train.run_log import read_log
 
 SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}
 QUICK = NetworkSettings(steps=3, batch=4)
@@ -50,14 +51,15 @@ def test_files_give_what_memory_gives(files: list[Path], workers: int) -> None:
 
 def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipe, "PART", 3)
+    monkeypatch.setattr(recipe, "EACH", 2)
     monkeypatch.setattr(recipe, "picture_files", lambda *_: files)
-    settings = recipe.Settings(tmp_path / "own", 6, 2, network=QUICK)
+    settings = recipe.Settings(out=tmp_path / "own", pictures=6, held_out=2, network=QUICK)
     model = recipe.train(settings)
     again = zoo.get_model(tmp_path / "own")
     assert isinstance(again, LandmarkNetwork)
     assert again.config == model.config
-    assert len((tmp_path / "own" / "curve.csv").read_text().splitlines()) > 0
-    assert not (tmp_path / "own" / "checkpoint.safetensors").exists()
+    assert {row.name for row in read_log(tmp_path / "own" / "log.csv")} == {"pixels off", "learning rate"}
+    assert not settings.work.exists()
 
 
 def test_files_of_something_else_are_refused(files: list[Path], tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
     assert "performer" not in record.data
     assert record.licence == "that of the data"  # other people's photographs are not ours to license
     assert "14 faces to learn from, 4 to test on" in lines
-    assert not (tmp_path / "faces" / "checkpoint.safetensors").exists()
+    assert not settings.work.exists()
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
@@ -104,7 +104,7 @@ def test_the_recipe_learns_from_a_folder_and_goes_on_where_it_was_killed(
     monkeypatch.setattr(recipe, "_save", killed)
     with pytest.raises(KeyboardInterrupt):
         train(other)
-    assert (tmp_path / "again" / "checkpoint.safetensors").exists()
+    assert (other.work / "checkpoint.safetensors").exists()
     monkeypatch.undo()
     lines.clear()
     again, _ = train(other, lambda step, *_: lines.append(step))

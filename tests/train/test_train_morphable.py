@@ -93,7 +93,13 @@ def test_the_model_stands_upright_and_knows_its_landmarks(trained: tuple[Trained
 
 def test_the_folder_holds_model_card_and_pictures(trained: tuple[Trained, Path]) -> None:
     result, out = trained
-    assert {p.name for p in out.iterdir()} == {"model.toml", "state.safetensors", "CARD.md", "pictures"}
+    assert {p.name for p in out.iterdir()} == {
+        "model.toml",
+        "state.safetensors",
+        "CARD.md",
+        "pictures",
+        "settings.toml",
+    }
     assert not [p for p in out.parent.iterdir() if p != out]
     names = {"modes", "color_modes", "random", "morph", "far", "components", "quality"}
     assert {p.stem for p in (out / "pictures").iterdir()} == names
@@ -104,7 +110,7 @@ def test_the_folder_holds_model_card_and_pictures(trained: tuple[Trained, Path])
     assert zoo.describe(out).metrics == pytest.approx(result.metrics)
     assert result.metrics["held out, of the mean head's error"] < 1
     card = (out / "CARD.md").read_text()
-    assert "python -m train.morphable --scans" in card
+    assert "torchface train morphable --scans" in card
     assert "Tested on 2 heads" in card
 
 

@@ -65,7 +65,7 @@ def test_both_priors_of_weight_takes(folder: Path, tmp_path: Path) -> None:
     solved = measured["own_shape"]
     assert solved["held out, error of a weight"] < solved["held out, error of a weight without a prior"]
     record = zoo.describe(tmp_path / "own_dynamics")
-    assert record.recipe.startswith("python -m train.priors --takes")
+    assert record.recipe.startswith("torchface train priors --takes")
     assert "--window 3" in record.recipe
     assert record.licence == "that of the takes"
     for picture in ("calibration", "curves"):

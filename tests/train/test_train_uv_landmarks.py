@@ -50,7 +50,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(folder: Path, out: Path) -> Settings:
-    return Settings(folder, folder / "annotations.json", 0, out, "texture", held_out=1, size=SIZE, detector=QUICK)
+    return Settings(
+        scans=folder, annotations=folder / "annotations.json", out=out, held_out=1, size=SIZE, detector=QUICK
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,7 @@ def test_the_model_on_disk_finds_the_same(trained: tuple[Trained, Path], folder:
     described = zoo.describe(out)
     assert described.size < 2 * 2**20
     assert described.metrics["mean error, pixels"] == pytest.approx(result.errors[0].mean_pixels)
-    assert described.recipe.startswith("python -m train.uv_landmarks --scans")
+    assert described.recipe.startswith("torchface train uv_landmarks --scans")
     scan = load_mesh(folder / "scan_003.obj")
     found = scan_landmarks(again, scan)
     truth = load_annotations(folder / "annotations.json")["scan_003.obj"]

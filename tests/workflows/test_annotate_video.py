@@ -193,7 +193,7 @@ def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
     exact = Tracker(film)
     exact.landmarks = film.landmarks
     write_proposals(prepare_annotation(video, tmp_path / "frames", exact, 10))
-    trained = train(Settings(tmp_path / "frames", tmp_path / "actor", folds=3))
+    trained = train(Settings(data=tmp_path / "frames", out=tmp_path / "actor", folds=3))
     assert trained.errors.shape == (10,)
     assert trained.errors.mean() < 0.5 * trained.start_errors.mean()
     described = zoo.describe(tmp_path / "actor")
@@ -206,7 +206,7 @@ def test_the_recipe_learns_from_the_folder_and_tells_left_out_errors(
     found = model(film.frames[rows, None].float() / 255, film.landmarks[rows] + 2.0)
     assert (found - film.landmarks[rows]).norm(dim=2).mean() < 1.0
     with pytest.raises(TorchfaceError, match="folds: found 1"):
-        train(Settings(tmp_path / "frames", tmp_path / "actor", folds=1))
+        train(Settings(data=tmp_path / "frames", out=tmp_path / "actor", folds=1))
 
 
 def test_the_command_writes_proposals_of_the_zoos_tracker(

@@ -1,6 +1,16 @@
-"""Solvers that know nothing of faces."""
+"""Solvers, and a descent of networks, that know nothing of faces."""
 
 from torchface.optim.box_qp import BoxQP, box_qp
+from torchface.optim.gradient_descent import DescentRun, DescentSettings, DescentTask, descend
 from torchface.optim.simplex_qp import SimplexQP, simplex_qp
 
-__all__ = ["BoxQP", "SimplexQP", "box_qp", "simplex_qp"]
+__all__ = [
+    "BoxQP",
+    "DescentRun",
+    "DescentSettings",
+    "DescentTask",
+    "SimplexQP",
+    "box_qp",
+    "descend",
+    "simplex_qp",
+]

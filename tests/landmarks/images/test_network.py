@@ -12,7 +12,6 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.images.image_files import load_image
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
-from torchface.landmarks.images import network_descent
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.finders.crop_finder import BothSides
 from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
@@ -62,11 +61,8 @@ def test_training_finds_what_is_there_to_be_seen(pictures: tuple[torch.Tensor, .
     assert error(fit_network(*pictures, untrained, settings)) < 0.6 * before
 
 
-def test_a_run_that_was_stopped_ends_as_one_that_was_not(
-    pictures: tuple[torch.Tensor, ...], tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = NetworkSettings(steps=6, batch=8, workers=0)
-    monkeypatch.setattr(network_descent, "_CHECK", 3)
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(pictures: tuple[torch.Tensor, ...], tmp_path) -> None:
+    settings = NetworkSettings(steps=6, batch=8, workers=0, checkpoint_every=0)
 
     def trained(stop_at: int | None) -> dict[str, torch.Tensor]:
         def stop(_: str, done: int = 0, total: int = 0) -> None:

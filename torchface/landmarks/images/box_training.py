@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import l1_loss, logsigmoid
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torch.utils.data import DataLoader, Dataset
 
-from torchface.errors import FileFormatError, ValueRangeError
-from torchface.files.checkpoints import checkpoint_key, read_checkpoint, write_checkpoint
+from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.box_network import STRIDE, BoxNetwork, FaceMaps, face_geometry
-from torchface.progress import Progress, silent
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress, ValueLog, silent
 
 _SPREAD, _LEAST_SPREAD = 0.09, 0.6  # of the heat round a centre: of the face's side, and in cells
 _DESCRIBED = 0.3  # cells of so much heat describe the face
@@ -63,7 +61,9 @@ class BoxTrainingSettings:
         decay: of the weights.
         averaged: steps over which the weights that are kept are averaged.
         channels, blocks: see :class:`BoxNetwork`.
-        checkpoint: steps from one to the next.
+        seed: of the first weights.
+        workers: processes that make pictures; they do not change the result.
+        checkpoint_every: seconds from one checkpoint to the next.
 
     Example:
         >>> BoxTrainingSettings(pictures=1600, batch=16).steps
@@ -77,19 +77,35 @@ class BoxTrainingSettings:
     averaged: int = 200
     channels: tuple[int, ...] = (24, 32, 64, 96)
     blocks: tuple[int, ...] = (1, 3, 4, 4)
-    checkpoint: int = 100
+    seed: int = 0
+    workers: int = 0
+    checkpoint_every: float = 120.0
 
     def __post_init__(self) -> None:
-        if min(self.pictures, self.batch, self.averaged, self.checkpoint) < 1 or not self.rate > 0:
+        if min(self.pictures, self.batch, self.averaged) < 1 or not self.rate > 0:
             raise ValueRangeError(
                 f"training of boxes: found {self.pictures} pictures, {self.batch} a step, rate {self.rate}, averaged "
-                f"over {self.averaged}, a checkpoint every {self.checkpoint}; expected positive numbers"
+                f"over {self.averaged}; expected positive numbers"
             )
 
     @property
     def steps(self) -> int:
         """How many."""
         return -(-self.pictures // self.batch)
+
+    @property
+    def descent(self) -> DescentSettings:
+        """The same, as every network's training has it."""
+        return DescentSettings(
+            self.steps,
+            self.batch,
+            self.rate,
+            self.decay,
+            1 - 1 / self.averaged,
+            self.workers,
+            self.seed,
+            self.checkpoint_every,
+        )
 
 
 class _Batch(NamedTuple):
@@ -100,25 +116,14 @@ class _Batch(NamedTuple):
     doubtful: Tensor
 
 
-class _Numbered(Dataset[LabelledPicture]):
-    def __init__(self, pictures: Pictures, begin: int, end: int) -> None:
-        self.pictures, self.begin, self.end = pictures, begin, end
-
-    def __len__(self) -> int:
-        return self.end - self.begin
-
-    def __getitem__(self, number: int) -> LabelledPicture:
-        return self.pictures(self.begin + number)
-
-
 def fit_boxes(
     pictures: Pictures,
     settings: BoxTrainingSettings | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
-    seed: int = 0,
-    workers: int = 0,
     source: Mapping[str, object] | None = None,
+    device: str | torch.device = "cpu",
+    log: ValueLog | None = None,
 ) -> BoxNetwork:
     """Learns from pictures.
 
@@ -126,50 +131,32 @@ def fit_boxes(
         pictures: by number.
         settings: how it learns.
         progress: called with each step and how far it is.
-        checkpoint: a file that is written now and then; where it is there, from the same settings, seed and source,
-            learning goes on from it.
-        seed: of the first weights.
-        workers: processes that make pictures; this one if 0.
+        checkpoint: a file that is written now and then; where it is there, from the same settings and source, learning
+            goes on from it.
         source: what the pictures are made of, for the checkpoint.
+        device: where the network computes.
+        log: called with what was measured, every fifty steps.
 
     Raises:
         FileFormatError: the checkpoint is of other settings or another source.
     """
     settings, progress = settings or BoxTrainingSettings(), progress or silent
     with torch.random.fork_rng([]):
-        torch.manual_seed(seed)
+        torch.manual_seed(settings.seed)
         model = BoxNetwork(settings.channels, settings.blocks)
-    model.train().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / settings.averaged), use_buffers=True)
-    optimiser = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=settings.decay)
-    key = content_key("box_training/1", settings=settings, seed=seed, source=source or {})
-    step = 0 if checkpoint is None else _resume(checkpoint, key, model, average, optimiser)
-    loader = DataLoader(
-        _Numbered(pictures, step * settings.batch, settings.steps * settings.batch),
-        settings.batch,
-        collate_fn=_collate,
-        num_workers=workers,
-    )
-    recent = math.nan
-    for batch in loader:  # a step of gradient descent each
-        for group in optimiser.param_groups:
-            group["lr"] = settings.rate * _share_of_rate(step, settings.steps)
-        images = (batch.images.float() / 255).to(memory_format=torch.channels_last)
-        loss = box_loss(model.maps(images), batch.faces, batch.doubtful)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 5.0)
-        optimiser.step()
-        average.update_parameters(model)
-        step += 1
-        now = float(loss.detach())
-        recent = now if math.isnan(recent) else 0.98 * recent + 0.02 * now
-        progress(f"learning, loss {recent:.3f}", step, settings.steps)
-        if checkpoint is not None and step % settings.checkpoint == 0 and step < settings.steps:
-            write_checkpoint(checkpoint, _state(step, model, average, optimiser), key)
-    found = average.module
-    assert isinstance(found, BoxNetwork)
-    return found.to(memory_format=torch.contiguous_format).eval()  # type: ignore[call-overload]
+
+    def loss(batch: _Batch, _: float) -> tuple[Tensor, float]:
+        images = (batch.images.to(device).float() / 255).to(memory_format=torch.channels_last)
+        found = box_loss(model.maps(images), batch.faces.to(device), batch.doubtful.to(device))
+        return found, float(found.detach())
+
+    key = content_key("box_training/2", config=model.config, source=source or {})
+    task = DescentTask(partial(_drawn, pictures, settings.batch), loss, key)
+    return descend(model, task, settings.descent, DescentRun(progress, log, checkpoint, device))
+
+
+def _drawn(pictures: Pictures, size: int, step: int) -> _Batch:
+    return _collate([pictures(number) for number in range(step * size, (step + 1) * size)])
 
 
 def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
@@ -218,14 +205,6 @@ def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
     return centre + 2.0 * l1_loss(said * unit, wanted * unit, reduction="sum") / weight
 
 
-def _share_of_rate(step: int, steps: int) -> float:
-    """Of the highest learning rate: up over the first twentieth, down along a cosine."""
-    rising = max(1.0, steps / 20)
-    if step < rising:
-        return (step + 1) / (rising + 1)
-    return 0.5 * (1 + math.cos(math.pi * (step - rising) / max(1.0, steps - rising)))
-
-
 def _collate(pictures: Sequence[LabelledPicture]) -> _Batch:
     most = max(1, *(len(one.faces) for one in pictures))
     faces = torch.full((len(pictures), most, 4), torch.nan)
@@ -234,34 +213,3 @@ def _collate(pictures: Sequence[LabelledPicture]) -> _Batch:
         faces[row, : len(one.faces)] = one.faces
         doubtful[row, : len(one.faces)] = one.doubtful
     return _Batch(torch.stack([one.image for one in pictures]), faces, doubtful)
-
-
-def _state(step: int, model: nn.Module, average: AveragedModel, optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """All that goes on changing, by name."""
-    state = {"step": torch.tensor(step)}
-    state |= {f"model.{name}": value.clone() for name, value in model.state_dict().items()}
-    state |= {f"average.{name}": value.clone() for name, value in average.state_dict().items()}
-    for number, moments in optimiser.state_dict()["state"].items():
-        state |= {f"optimiser.{number}.{name}": value.clone() for name, value in moments.items()}
-    return state
-
-
-def _resume(path: Path, key: str, model: nn.Module, average: AveragedModel, optimiser: torch.optim.Optimizer) -> int:
-    """The step that a checkpoint was written after, 0 for none; model, average and optimiser as they were then."""
-    if checkpoint_key(path) not in (None, key):
-        raise FileFormatError(
-            f"{path}: found a checkpoint of other pictures or settings, or of another version; expected one of these; "
-            "remove it to start anew"
-        )
-    state = read_checkpoint(path, key)
-    if state is None:
-        return 0
-    model.load_state_dict({name[6:]: value for name, value in state.items() if name.startswith("model.")})
-    average.load_state_dict({name[8:]: value for name, value in state.items() if name.startswith("average.")})
-    moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in state.items():
-        if name.startswith("optimiser."):
-            _, number, moment = name.split(".")
-            moments.setdefault(int(number), {})[moment] = value
-    optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})
-    return int(state["step"])

@@ -13,11 +13,11 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
-from torchface.landmarks.images.network_descent import DescentSettings, KeptDescent, descend
 from torchface.landmarks.images.picture_augmentation import AugmentationSettings, Crops, augmented
-from torchface.progress import Progress, silent
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress, ValueLog, silent
 
-_METHOD = "landmark network/1"
+_METHOD = "landmark network/2"
 # Pairs of landmarks whose distance is what is read off a face: how far lids and lips are open, how high brows are.
 _PAIRS = torch.tensor([[37, 41], [38, 40], [43, 47], [44, 46], [61, 67], [62, 66], [63, 65], [51, 57], [48, 54],
                        [19, 37], [24, 44]])  # fmt: skip
@@ -124,33 +124,39 @@ def fit_network_rows(
     progress: Progress | None = None,
     checkpoint: Path | None = None,
     device: str | torch.device = "cpu",
+    log: ValueLog | None = None,
 ) -> LandmarkNetwork:
     """What :func:`fit_network` learns, from pictures that a ``DataLoader``'s workers read a batch at a time.
 
     Args:
         pictures: at least one; those of a batch are asked for by their numbers.
+        log: called with what was measured, every fifty steps.
 
     All others: as :func:`fit_network`.
     """
     settings, progress = settings or NetworkSettings(), progress or silent
     if network is None:
-        torch.manual_seed(settings.seed)
-        network = LandmarkNetwork()
+        with torch.random.fork_rng([]):
+            torch.manual_seed(settings.seed)
+            network = LandmarkNetwork()
     chosen = network
 
     def loss(crops: Crops, share: float) -> tuple[Tensor, float]:
         return _loss(chosen, crops, settings, share, device)
 
-    key = content_key(_METHOD, settings=settings, config=network.config)
-    draw = partial(_crops, pictures, network.size, network.margin, settings)
-    return descend(
-        network, draw, loss, settings, "training the network", progress, KeptDescent(key, checkpoint), device
+    own = {"pair": settings.pair, "heat": settings.heat, "augmentation": settings.augmentation}
+    task = DescentTask(
+        partial(_crops, pictures, network.size, network.margin, settings),
+        loss,
+        content_key(_METHOD, settings=own, config=network.config),
+        "training the network",
+        "pixels off",
     )
+    return descend(network, task, settings, DescentRun(progress, log, checkpoint, device))
 
 
-def _crops(
-    pictures: LabelledPictures, size: int, margin: float, settings: NetworkSettings, generator: torch.Generator
-) -> Crops:
+def _crops(pictures: LabelledPictures, size: int, margin: float, settings: NetworkSettings, step: int) -> Crops:
+    generator = torch.Generator().manual_seed(1_000_003 * settings.seed + step)
     numbers = torch.randint(len(pictures), (settings.batch,), generator=generator)
     return augmented(*pictures.rows(numbers), size, margin, generator, settings.augmentation)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -22,6 +23,28 @@ _FOUND, _DOUBTFUL = (
 )  # shares of a face that are seen: from the first on it is one, under the second it is none
 _SCENES, _VIEWS = 16, 8  # what is drawn once is shown so often: drawing takes longer than learning
 _WHOLE = 0.75  # of a face's box that must lie in the picture for it to count as one
+
+
+class ScenePeople(Protocol):
+    """People without a background, in memory or in files."""
+
+    @property
+    def landmarks(self) -> Tensor:
+        """iBUG's 68 of each, (N,68,2) pixels."""
+        ...
+
+    @property
+    def faces(self) -> np.ndarray:
+        """Centre, side and roll angle of each face, (N,4)."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __hash__(self) -> int: ...
+
+    def person(self, number: int) -> np.ndarray:
+        """One picture, (S,S,4), black where nobody is."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +83,24 @@ class CutOuts:
     @cached_property
     def faces(self) -> np.ndarray:
         """Centre, side and roll angle of each face, (N,4)."""
-        boxes, tilts = turned_box(self.landmarks)
-        return torch.cat([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:3], tilts[:, None]], 1).numpy()
+        return upright_faces(self.landmarks)
 
     def person(self, number: int) -> np.ndarray:
         """One picture, (S,S,4), black where nobody is."""
-        picture = self.pictures[number].permute(1, 2, 0).contiguous().numpy()
-        picture[picture[..., 3] == 0] = 0
-        return picture
+        return cut_out(self.pictures[number])
+
+
+def upright_faces(landmarks: Tensor) -> np.ndarray:
+    """Centre, side and roll angle of the faces of landmarks (N,68,2), (N,4)."""
+    boxes, tilts = turned_box(landmarks)
+    return torch.cat([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:3], tilts[:, None]], 1).numpy()
+
+
+def cut_out(rgba: Tensor) -> np.ndarray:
+    """A picture (4,S,S) as (S,S,4), black where nobody is."""
+    picture = rgba.permute(1, 2, 0).contiguous().numpy()
+    picture[picture[..., 3] == 0] = 0
+    return picture
 
 
 @dataclass(frozen=True)
@@ -97,7 +130,9 @@ class SceneSettings:
             )
 
 
-def face_scene(people: CutOuts, number: int, settings: SceneSettings | None = None, seed: int = 0) -> LabelledPicture:
+def face_scene(
+    people: ScenePeople, number: int, settings: SceneSettings | None = None, seed: int = 0
+) -> LabelledPicture:
     """Draws a scene; of 128 numbers in a row each eight show one, mirrored or not, in another light.
 
     People stand before each other, the larger in front; they are mirrored, turned, cut by the border, hidden by hands,
@@ -120,7 +155,7 @@ def face_scene(people: CutOuts, number: int, settings: SceneSettings | None = No
 
 
 @lru_cache(maxsize=2 * _SCENES)  # each is shown again soon
-def _staged(people: CutOuts, number: int, settings: SceneSettings, seed: int) -> tuple[np.ndarray, Tensor, Tensor]:
+def _staged(people: ScenePeople, number: int, settings: SceneSettings, seed: int) -> tuple[np.ndarray, Tensor, Tensor]:
     """A scene before it is taken (S,S,3), its faces (F,4), and which are doubtful (F,)."""
     rng = np.random.default_rng((seed, number, 0))
     size = settings.size
@@ -156,7 +191,7 @@ def _crowd(people: int) -> np.ndarray:
 def _stand(
     image: np.ndarray,
     owner: np.ndarray,
-    people: CutOuts,
+    people: ScenePeople,
     side: float,
     number: int,
     settings: SceneSettings,

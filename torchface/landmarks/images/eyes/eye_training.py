@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,10 +15,10 @@ from torchface.errors import ShapeError
 from torchface.files.content_keys import content_key
 from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, EyeCrops, EyeLabels, augmented_eyes
 from torchface.landmarks.images.eyes.eye_network import STRIDE, EyeFindings, EyeNetwork
-from torchface.landmarks.images.network_descent import DescentSettings, KeptDescent, descend
-from torchface.progress import Progress, silent
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress, ValueLog, silent
 
-_METHOD = "eye network/1"
+_METHOD = "eye network/2"
 _UPPER, _LOWER = (1, 2), (5, 4)  # of the lids' landmarks, opposite each other
 _HEAT = 1.2  # standard deviation of the heat map asked for, cells
 _NARROW = 0.03  # of the lids' opening: errors below count with their square
@@ -39,6 +40,30 @@ class EyeSettings(DescentSettings):
     gap: float = 1.5
     heat: float = 0.5
     augmentation: EyeAugmentation = field(default_factory=EyeAugmentation)
+
+
+class LabelledEyes(Protocol):
+    """Cut-out pictures of both eyes and what is known of them, read some at a time: of tensors or of files."""
+
+    def __len__(self) -> int: ...
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, EyeLabels]:
+        """Pictures uint8 (B,4,H,W) and what is known of them, of numbers (B,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _InMemory:
+    """Pictures (M,4,H,W) and their labels."""
+
+    rgba: Tensor
+    labels: EyeLabels
+
+    def __len__(self) -> int:
+        return len(self.rgba)
+
+    def rows(self, numbers: Tensor) -> tuple[Tensor, EyeLabels]:
+        return self.rgba[numbers], self.labels.rows(numbers)
 
 
 def fit_eyes(
@@ -73,7 +98,6 @@ def fit_eyes(
     Raises:
         ShapeError: other shapes.
     """
-    settings, progress = settings or EyeSettings(), progress or silent
     if rgba.ndim != 4 or rgba.shape[1] != 4 or rgba.dtype != torch.uint8 or not len(rgba):
         raise ShapeError(f"rgba: found {rgba.dtype} {tuple(rgba.shape)}, expected uint8 (M,4,H,W) with a picture")
     if labels.landmarks.shape != (len(rgba), 68, 2) or labels.iris.shape != (len(rgba), 2, 2):
@@ -81,25 +105,53 @@ def fit_eyes(
             f"labels: found landmarks {tuple(labels.landmarks.shape)} and irises {tuple(labels.iris.shape)}, expected "
             f"({len(rgba)},68,2) and ({len(rgba)},2,2)"
         )
+    return fit_eye_rows(_InMemory(rgba, labels), network, settings, progress, checkpoint, device)
+
+
+def fit_eye_rows(
+    pictures: LabelledEyes,
+    network: EyeNetwork | None = None,
+    settings: EyeSettings | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+    device: str | torch.device = "cpu",
+    log: ValueLog | None = None,
+) -> EyeNetwork:
+    """What :func:`fit_eyes` learns, from pictures that a ``DataLoader``'s workers read a batch at a time.
+
+    Args:
+        pictures: at least one; those of a batch are asked for by their numbers.
+        log: called with what was measured, every fifty steps.
+
+    All others: as :func:`fit_eyes`.
+    """
+    settings, progress = settings or EyeSettings(), progress or silent
     if network is None:
-        torch.manual_seed(settings.seed)
-        network = EyeNetwork()
+        with torch.random.fork_rng([]):
+            torch.manual_seed(settings.seed)
+            network = EyeNetwork()
     chosen = network
 
     def loss(crops: EyeCrops, share: float) -> tuple[Tensor, float]:
         return _loss(chosen, crops, settings, share, device)
 
-    key = content_key(_METHOD, settings=settings, config=network.config)
-    draw = partial(_crops, rgba, labels, (network.width, network.height), settings)
-    return descend(network, draw, loss, settings, "training on eyes", progress, KeptDescent(key, checkpoint), device)
+    own = {"gap": settings.gap, "heat": settings.heat, "augmentation": settings.augmentation}
+    task = DescentTask(
+        partial(_crops, pictures, (network.width, network.height), settings),
+        loss,
+        content_key(_METHOD, settings=own, config=network.config),
+        "training on eyes",
+        "pixels off",
+    )
+    return descend(network, task, settings, DescentRun(progress, log, checkpoint, device))
 
 
-def _crops(
-    rgba: Tensor, labels: EyeLabels, size: tuple[int, int], settings: EyeSettings, generator: torch.Generator
-) -> EyeCrops:
-    rows = torch.randint(len(rgba), (settings.batch,), generator=generator)
+def _crops(pictures: LabelledEyes, size: tuple[int, int], settings: EyeSettings, step: int) -> EyeCrops:
+    generator = torch.Generator().manual_seed(1_000_003 * settings.seed + step)
+    rows = torch.randint(len(pictures), (settings.batch,), generator=generator)
     eyes = torch.randint(2, (settings.batch,), generator=generator)
-    return augmented_eyes(rgba[rows], labels.rows(rows), eyes, *size, generator, settings.augmentation)
+    rgba, labels = pictures.rows(rows)
+    return augmented_eyes(rgba, labels, eyes, *size, generator, settings.augmentation)
 
 
 def _loss(

@@ -1,0 +1,227 @@
+"""What every recipe has of the runner: settings files, logs, devices, runs that go on where they were killed."""
+
+from __future__ import annotations
+
+import sys
+import types
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchface import TorchfaceError
+from torchface.files.documents import write_toml
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress
+from train.model_cards import command
+from train.recipe_settings import ANY_DEVICE, RecipeSettings
+from train.run_log import RunLog, read_log
+from train.runner import Recipe, Run, recipe
+from train.settings_files import read_settings, write_settings
+
+RECIPES = (
+    "action_units", "appearance", "enhancement", "expression", "eye_network", "face_boxes", "landmark_network",
+    "landmarks", "marker_solver", "morphable", "priors", "uv_landmarks",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(RecipeSettings):
+    """A line is learned.
+
+    Args:
+        data: What there is no default for.
+        kind: One of two.
+        slope: Of the line.
+        parts: Several.
+        limit: A number, or none.
+        network: How it descends.
+    """
+
+    data: Path
+    kind: Literal["one", "two"] = "one"
+    slope: float = 3.0
+    parts: tuple[int, ...] = (1, 2)
+    limit: int | None = 14
+    network: DescentSettings = field(default_factory=lambda: DescentSettings(120, 8, 0.1, checkpoint_every=0))
+
+    devices: ClassVar[tuple[str, ...]] = ANY_DEVICE
+
+
+class Noisy(nn.Module):
+    """A line whose inputs are dropped at random while it learns."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.line, self.dropped = nn.Linear(2, 1), nn.Dropout(0.2)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        return self.line(self.dropped(inputs))
+
+
+@recipe
+def train(settings: Settings, run: Run) -> Noisy:
+    torch.manual_seed(settings.seed)
+    line = Noisy()
+
+    def draw(step: int) -> Tensor:
+        return torch.randn(settings.network.batch, 2, generator=torch.Generator().manual_seed(step))
+
+    def loss(inputs: Tensor, _: float) -> tuple[Tensor, float]:
+        total = (line(inputs) - settings.slope * inputs[:, :1]).square().mean()
+        return total, float(total.detach())
+
+    how = DescentRun(run.progress, run.log, run.checkpoint, run.device)
+    return descend(line, DescentTask(draw, loss), settings.network, how)
+
+
+RECIPE = Recipe(Settings, train, "A line.", lambda settings, _: [f"slope {settings.slope}"])
+
+
+def killed_after(step: int) -> Progress:
+    def progress(_: str, done: int = 0, total: int = 0) -> None:
+        if done == step:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_settings_of_every_recipe_are_read_as_they_were_written(name: str, tmp_path: Path) -> None:
+    kind = import_module(f"train.{name}").Settings
+    assert issubclass(kind, RecipeSettings)
+    needed = {"action_units": {"video": (Path("a"),), "labels": (Path("b"),)}, "appearance": {"data": Path("c")}}
+    settings = kind(**needed.get(name, {}), seed=5, out=tmp_path / "model", licence="MIT", resume=False)
+    write_settings(tmp_path / "settings.toml", settings)
+    assert read_settings(tmp_path / "settings.toml", kind) == settings
+
+
+def test_flags_go_before_the_file_and_the_file_before_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    write_toml(file, {"slope": 5, "limit": "none", "network": {"rate": 0.5}, "data": "there", "parts": [7]})
+    found = RECIPE.chosen(["--config", str(file), "--network.rate", "0.25", "--seed", "4"])
+    assert (found.data, found.slope, found.parts, found.limit, found.seed) == (Path("there"), 5.0, (7,), None, 4)
+    assert found.network.rate == 0.25
+    again = tmp_path / "again.toml"
+    write_settings(again, found)
+    assert RECIPE.chosen([f"--config={again}"]) == found
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"slop": 5}, "found slop = 5, expected only out, seed, device, resume, licence, data"),
+        ({"slope": "steep"}, "found slope = 'steep', expected a number"),
+        ({"resume": 1}, "found resume = 1, expected true or false"),
+        ({"kind": "three"}, "found kind = 'three', expected one of 'one', 'two'"),
+        ({"network": {"steps": 1.5}}, "found network.steps = 1.5, expected a whole number"),
+        ({"parts": [1, "two"]}, "found parts[1] = 'two', expected a whole number"),
+        ({"network": 3}, "found network = 3, expected a table"),
+    ],
+)
+def test_what_a_file_cannot_say_is_named(
+    document: dict[str, object], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toml(tmp_path / "odd.toml", document)
+    with pytest.raises(SystemExit) as ended:
+        RECIPE.main(["--config", str(tmp_path / "odd.toml")])
+    assert ended.value.code == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"odd.toml: {message}" in told
+
+
+def test_what_has_no_default_and_is_not_in_the_file_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_toml(tmp_path / "own.toml", {"slope": 5})
+    with pytest.raises(SystemExit):
+        RECIPE.main(["--config", str(tmp_path / "own.toml")])
+    assert "--data" in capsys.readouterr().err
+
+
+def test_a_killed_run_goes_on_to_the_same_model_and_log(tmp_path: Path) -> None:
+    whole = train(Settings(data=tmp_path, out=tmp_path / "whole"))
+    settings = Settings(data=tmp_path, out=tmp_path / "killed")
+    with pytest.raises(KeyboardInterrupt):
+        train(settings, killed_after(70))
+    steps: list[int] = []
+    again = train(settings, lambda _, done=0, total=0: steps.append(done))
+    assert steps[0] == 70  # the checkpoint is of the step before
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=0, msg=name)
+    logs = [read_log(tmp_path / own / "log.csv") for own in ("whole", "killed")]
+    rows = [[(row.step, row.name, row.value) for row in log] for log in logs]
+    assert rows[0] == rows[1]
+    assert [row[0] for row in rows[0]] == [50, 50, 100, 100, 120, 120]
+    names = {path.name for path in settings.out.iterdir()} - {"tensorboard"}
+    assert names == {"settings.toml", "log.csv", "curves.png"}
+    assert not settings.work.exists()
+
+
+def test_a_run_may_start_anew(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, out=tmp_path / "line")
+    with pytest.raises(KeyboardInterrupt):
+        train(settings, killed_after(70))
+    other = Settings(data=tmp_path, out=tmp_path / "line", network=DescentSettings(60, 8, 0.1))
+    with pytest.raises(TorchfaceError, match="found a checkpoint of other data or settings"):
+        train(other)
+    steps: list[int] = []
+    fresh = Settings(data=tmp_path, out=tmp_path / "line", network=other.network, resume=False)
+    train(fresh, lambda _, done=0, total=0: steps.append(done))
+    assert steps == list(range(1, 61))
+    assert [row.step for row in read_log(tmp_path / "line" / "log.csv")] == [50, 50, 60, 60]
+
+
+def test_a_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, out=tmp_path / "line")
+    with pytest.raises(KeyboardInterrupt):
+        train(settings, killed_after(3))
+    (found,) = settings.work.iterdir()
+    assert found.read_bytes()[8:10] == b'{"'  # safetensors: a length, then JSON
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("cuda:99", "found 'cuda:99', but PyTorch sees"),
+        ("gpu", "found 'gpu', expected cpu or cuda or mps"),
+        ("meta", "found 'meta', expected cpu or cuda or mps"),
+    ],
+)
+def test_devices_that_are_not_there_are_told_before_anything_begins(device: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TorchfaceError, match=message):
+        train(Settings(data=tmp_path, out=tmp_path / "line", device=device))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(TorchfaceError, match="expected cpu: this recipe knows no other"):
+        RecipeSettings(device="cuda").chosen_device()
+
+
+def test_tensorboard_is_told_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: str, purge_step: int | None) -> None:
+            told.append((Path(folder).name, 0.0, purge_step or 0))
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            told.append((name, value, step))
+
+        def close(self) -> None: ...
+
+    module = types.ModuleType("torch.utils.tensorboard")
+    module.SummaryWriter = Writer  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
+    log = RunLog(tmp_path)
+    log(50, "loss", 0.5)
+    log.close()
+    assert told == [("tensorboard", 0.0, 0), ("loss", 0.5, 50)]
+
+
+def test_a_card_tells_the_command_that_makes_the_model_again(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path / "my scans", limit=None, parts=(3, 4), out=Path("a/line"), device="cpu")
+    told = command(settings)
+    assert told == ("torchface train test_runner --data 'my scans' --parts 3 4 --limit None --seed 0 --out models/line")

@@ -1,0 +1,79 @@
+"""What every recipe's settings have in common: the same words mean the same everywhere."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+
+from torchface.errors import ValueRangeError
+
+CPU_ALONE = ("cpu",)
+ANY_DEVICE = ("cpu", "cuda", "mps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeSettings:
+    """What the recipe does; fields are flags, and keys of a settings file.
+
+    Args:
+        out: Folder for the model, its card and pictures, the settings and the log.
+        seed: Decides all that is drawn.
+        device: Where the recipe computes, such as cpu, cuda, cuda:1 or mps; if absent on a GPU where it can use one
+            and there is one.
+        resume: Go on where a run that was killed has stopped; --no-resume starts anew.
+        licence: Under which the model may be used; what that which it has learned from allows, if absent.
+    """
+
+    out: Path = Path("models/mine")
+    seed: int = 0
+    device: str | None = None
+    resume: bool = True
+    licence: str | None = None
+
+    devices: ClassVar[tuple[str, ...]] = CPU_ALONE
+    """Kinds of devices that the recipe can compute on."""
+
+    @property
+    def work(self) -> Path:
+        """Folder of what is not finished, beside ``out``; it goes when the run has come to its end."""
+        return self.out.parent / f".{self.out.name}.training"
+
+    def forget(self) -> None:
+        """Deletes what a run that was killed has left."""
+        shutil.rmtree(self.work, ignore_errors=True)
+
+    def chosen_device(self) -> torch.device:
+        """The device to compute on.
+
+        Raises:
+            ValueRangeError: there is no such device, or the recipe cannot use it.
+        """
+        if self.device is None:
+            found = "cuda" in self.devices and torch.cuda.is_available()
+            return torch.device("cuda" if found else "cpu")
+        able = " or ".join(self.devices)
+        try:
+            device = torch.device(self.device)
+        except RuntimeError:
+            raise ValueRangeError(f"device: found {self.device!r}, expected {able}, such as cuda:0") from None
+        if device.type not in self.devices:
+            raise ValueRangeError(f"device: found {self.device!r}, expected {able}: this recipe knows no other")
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise ValueRangeError(
+                f"device: found {self.device!r}, but PyTorch sees {torch.cuda.device_count()} CUDA devices here; "
+                "expected one of them, or cpu"
+            )
+        if device.type == "mps" and not torch.backends.mps.is_available():
+            raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees no such device here; expected cpu")
+        return device
+
+
+def recipe_name(kind: type) -> str:
+    """The name of the recipe that these settings are of, as ``torchface train`` knows it."""
+    module = kind.__module__.rpartition(".")[2]
+    return Path(sys.modules["__main__"].__file__ or "").stem if module == "__main__" else module
