@@ -14,17 +14,25 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
 from torchface.capture.action_units.regions import RegionGroup
-from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ReciprocalPrior, ShapePrior
+from torchface.capture.priors import (
+    AdaptedDynamicsPrior,
+    DynamicsPrior,
+    DynamicsSettings,
+    ReciprocalPrior,
+    ShapePrior,
+)
 from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.capture.webcam import ExampleSolver, WebcamSolver
 from torchface.capture.webcam.examples.example_shapes import ExampleShapes
 from torchface.capture.webcam.examples.landmark_model import LandmarkModel
 from torchface.capture.webcam.webcam_state import WebcamControls
 from torchface.enhancement import CapturedPerformance, EnhancementModel
+from torchface.enhancement.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.box_network import BoxNetwork
 from torchface.landmarks.images.eyes import EyeNetwork
+from torchface.landmarks.images.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.network import LandmarkNetwork
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
@@ -207,6 +215,26 @@ def enhancement_model(number: int) -> EnhancementModel:
     )
 
 
+@cache
+def wrinkle_weights(number: int) -> WrinkleWeights:
+    whole, weights = rig(number), random(20, len(NAMES), seed=number).float()
+    maps = (weights[:, None, :2] * weights[:, None, 2:4]).repeat(1, 2, 1)
+    halves = (whole.vertices[:, 1] > 0).float()
+    shares = torch.stack([halves, 1 - halves])
+    return WrinkleWeights.fit(whole.vertices, whole(weights), maps, shares, ["upper", "lower"])
+
+
+def landmark_trees(number: int) -> LandmarkTrees:
+    trees = LandmarkTrees(landmarks=5, cascades=2, trees=3, depth=2, features=6, components=4)
+    drawn = torch.Generator().manual_seed(number)
+    for name, limit in (("anchors", 5), ("first", 6), ("second", 6), ("leaves", 100)):
+        buffer = getattr(trees, name)
+        buffer.copy_(torch.randint(limit, buffer.shape, generator=drawn))
+    for name in ("mean", "offsets", "thresholds", "scales", "bases"):
+        getattr(trees, name).uniform_(generator=drawn)
+    return trees
+
+
 def action_unit_classifier(number: int) -> ActionUnitClassifier:
     groups = [RegionGroup("brows", ("left brow", "right brow"), ("1", "4"), ())]
     model = ActionUnitClassifier(groups, [GroupSize(3, 3)], 16)
@@ -293,17 +321,29 @@ EXAMPLES: dict[str, Example] = {
         lambda n: HybridGraph(marker_solver(n), 3, 3),
         lambda: (*graph_inputs(), *(x.float() for x in pulled_markers()[1:])), cells={"vmap": "no"},
     ),
+    "BlendshapeRig": Example(corrected_rig, lambda: (random(3, len(NAMES)).float(),)),
     "ShapePrior": Example(shape_prior, lambda: (random(3, len(NAMES)),), prior_energy),
     "ReciprocalPrior": Example(reciprocal_prior, lambda: (random(3, len(NAMES)),), prior_energy),
     "DynamicsPrior": Example(dynamics_prior, lambda: (random(3, 3, len(NAMES)).float(),)),
+    "AdaptedDynamicsPrior": Example(
+        lambda n: AdaptedDynamicsPrior(dynamics_prior(n), NAMES[::-1], 45.0),
+        lambda: (random(3, 4, len(NAMES)).float(),),
+    ),
     "MorphableModel": Example(morphable_model, lambda: (random(3, 4).float(),)),
     "HeadModel": Example(head_model, lambda: (random(3, 3).float(), random(3, 3).float())),
     "ExpressionRegression": Example(expression_regression, lambda: (rig().vertices[None],), cells={"vmap": "no"}),
     "EnhancementModel": Example(
         enhancement_model, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),), cells={**SOLVER, "torch.export": "no"}
     ),
+    "WrinkleWeights": Example(
+        wrinkle_weights, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),)
+    ),
     "ActionUnitClassifier": Example(
         action_unit_classifier, lambda: (random(3, 2, 16, 16).float(), random(2, 16, 16, seed=1).float()),
+        cells={"gradients": "no", "jacrev": "no"},
+    ),
+    "LandmarkTrees": Example(
+        landmark_trees, lambda: (random(2, 1, 40, 40).float(), torch.tensor([[5.0, 5, 30, 30], [8, 6, 25, 28]])),
         cells={"gradients": "no", "jacrev": "no"},
     ),
     "LandmarkNetwork": Example(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,15 +72,24 @@ def numbers(example: Example, module: Any, first: Tensor, *rest: Tensor) -> Tens
     return torch.stack([(part * weight).sum() for part, weight in zip(found, weights, strict=True)])
 
 
+@contextlib.contextmanager
+def real() -> Iterator[str]:
+    yield "cuda"
+
+
+DEVICES = {"pretended": pretended, **({"cuda": real} if torch.cuda.is_available() else {})}
+
+
 @every_class
-def test_it_moves_to_another_device(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After use; no tensor is made elsewhere than where the inputs are."""
+@pytest.mark.parametrize("kind", DEVICES)
+def test_it_moves_to_another_device(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After use; no tensor is made elsewhere than where the inputs are. On a GPU too where there is one."""
     example = EXAMPLES[name]
     inputs, wanted = example.inputs(), outputs(example, example.make(0), *example.inputs())
     # Tensors of a class of one's own cannot be looked at in inference mode.
     monkeypatch.setattr(torch, "inference_mode", torch.no_grad)
     module = fresh(example)
-    with pretended() as device, torch.no_grad():
+    with DEVICES[kind]() as device, torch.no_grad():
         module.to(device)
         held = [*module.buffers(), *module.parameters()]
         assert {tensor.device.type for tensor in held} == {device}
@@ -190,7 +200,7 @@ def test_jacobians(name: str) -> None:
         found = torch.func.jacrev(computed)(first)
         torch.testing.assert_close(found, torch.autograd.functional.jacobian(computed, first), equal_nan=True)
         return
-    if name == "ActionUnitClassifier":  # classes are steps
+    if name in ("ActionUnitClassifier", "LandmarkTrees"):  # steps
         assert not torch.func.jacrev(computed)(first).any()
         return
     with pytest.raises((TraceError, RuntimeError), match=r"in place of jacrev|autograd|WholeTakeSolver: found"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,6 +50,24 @@ def film(actor: BlendshapeRig) -> PortraitVideo:
 @pytest.fixture(scope="module")
 def model(film: PortraitVideo) -> AppearanceModel:
     return AppearanceModel.fit(list(film.frames[:TRAINED]), film.landmarks[:TRAINED])
+
+
+def test_a_state_that_changes_takes_effect(film: PortraitVideo, model: AppearanceModel) -> None:
+    """What is prepared of it follows, whichever way it was changed; a copy is on its own."""
+    shown, start = images(film)[:2], half_neutral(film)[:2]
+    before = model(shown, start)
+    changed = copy.deepcopy(model)
+    assert torch.equal(changed(shown, start), before)
+    changed.levels[0].slope.data.mul_(0.5)  # no version counter moves
+    changed.mean_shape.data.copy_(changed.mean_shape.flip(1).roll(1, 1) * torch.tensor([1.02, 0.98]))
+    after = changed(shown, start)
+    assert float((after - before).abs().max()) > 0.05
+    fresh = AppearanceModel.from_config(model.config)
+    fresh.load_state_dict(changed.state_dict())
+    torch.testing.assert_close(fresh(shown, start), after)
+    changed.load_state_dict(model.state_dict())
+    torch.testing.assert_close(changed(shown, start), before)
+    assert torch.equal(model(shown, start), before)
 
 
 def eyes_apart(landmarks: Tensor) -> Tensor:
@@ -198,14 +217,14 @@ def test_a_step_is_the_plain_simultaneous_algorithms_step(film: PortraitVideo, m
         state = torch.cat([torch.zeros(1, 4), 0.01 * torch.randn(1, len(model.deviations), generator=generator)], 1)
         precision = torch.cat([torch.zeros(4), model.deviations.pow(-2)]).double()
         residual = level.residual(sampled)
-        fast = level.step(residual, state.double(), precision)[0]
+        fast = level.step(residual, state.double(), precision, level.curvature_terms())[0]
         plain = joint_step(level, residual, residual.coefficients, state.double(), precision)
         torch.testing.assert_close(fast, plain, rtol=2e-3, atol=2e-3 * float(plain.abs().max()))
         # The projected curvature, quadratic in the coefficients, is the one of the Jacobian itself.
         flat = level.jacobian(residual.coefficients)[0].flatten(0, 1)
         modes = level.modes.flatten(1)
         projected = flat - modes.T @ (modes @ flat)
-        found = level.projected_curvature(residual.coefficients)[0]
+        found = level.projected_curvature(residual.coefficients, level.curvature_terms())[0]
         torch.testing.assert_close(found, projected.T @ projected, rtol=1e-6, atol=1e-6 * float(found.abs().max()))
     finally:
         level.float()

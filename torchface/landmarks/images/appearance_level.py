@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
+from torchface.optim.prepared_tensors import Prepared
+
 
 class TextureResidual(NamedTuple):
     """What texture modes cannot explain of sampled features: ``left`` (B,C,N), and their coefficients (B,K)."""
@@ -58,10 +60,8 @@ class AppearanceLevel(nn.Module):
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("noise", torch.ones(()))
         self.register_buffer("typical", torch.ones(()))
-        self._curvature: Tensor | None = None
-        self._curvature_of: tuple[int, int, torch.device] | None = None
-        self._placing: Tensor | None = None
-        self._placing_of: tuple[int, int, int] | None = None
+        self._curvature: Prepared[Tensor] = Prepared()
+        self._placing: Prepared[Tensor] = Prepared()
 
     def sample(self, features: Tensor, points: Tensor) -> Tensor:
         """Features (B,C,h,w) at the level's places on faces with these points (B,P,2), pixels: (B,C,N)."""
@@ -79,19 +79,20 @@ class AppearanceLevel(nn.Module):
         """Mean squared residual (B,) over what training images that were left out had: about 1 on a good fit."""
         return residual.left.square().mean((1, 2)) / self.typical
 
-    def step(self, residual: TextureResidual, state: Tensor, precision: Tensor) -> Tensor:
+    def step(self, residual: TextureResidual, state: Tensor, precision: Tensor, terms: Tensor) -> Tensor:
         """By how much the template should move, (B,Q).
 
         Args:
             residual: at the current alignment.
             state: the current shape along the motions (B,Q), 0 for the similarity's.
             precision: of the shape along each, (Q,), 0 for the similarity's.
+            terms: of :meth:`curvature_terms`.
         """
         mixed = _with_one(residual.coefficients)
         slope = (mixed @ self.slope.flatten(1)).unflatten(1, self.slope.shape[1:])
         pull = (residual.left[..., None] * slope).sum(1)
         downhill = pull.flatten(1) @ self.motion.flatten(0, 1) / self.noise
-        curvature = self.projected_curvature(residual.coefficients) / self.noise
+        curvature = self.projected_curvature(residual.coefficients, terms) / self.noise
         damping = 1e-4 * curvature.diagonal(dim1=1, dim2=2).mean(1)[:, None] + 1e-9
         system = curvature + torch.diag_embed(precision + damping)
         return torch.linalg.solve(system, downhill + precision * state)
@@ -100,11 +101,11 @@ class AppearanceLevel(nn.Module):
         """J (B,C,N,Q) of the texture with these coefficients (B,K)."""
         return torch.einsum("bk,kcnd,ndq->bcnq", _with_one(coefficients), self.slope, self.motion)
 
-    def projected_curvature(self, coefficients: Tensor) -> Tensor:
+    def projected_curvature(self, coefficients: Tensor, terms: Tensor) -> Tensor:
         """The projected curvature of the texture with these coefficients (B,K), (B,Q,Q)."""
         mixed = _with_one(coefficients)
         first, second = _pairs(mixed.shape[1], mixed.device)
-        flat = (mixed[:, first] * mixed[:, second]) @ self._curvature_terms()
+        flat = (mixed[:, first] * mixed[:, second]) @ terms
         count = self.motion.shape[2]
         rows, columns = _pairs(count, mixed.device)
         whole = flat.new_empty(len(flat), count, count)
@@ -114,14 +115,13 @@ class AppearanceLevel(nn.Module):
 
     def _placing_matrix(self, points: int) -> Tensor:
         """What each of P points adds to each place, (P,N): a product with it takes an eighth of gathering corners."""
-        known = (self.weight.data_ptr(), self.weight._version, self.corner._version)
-        if self._placing is None or self._placing_of != known:
-            matrix = self.weight.new_zeros(points, len(self.weight))
-            self._placing = matrix.scatter_add(0, self.corner.T, self.weight.T)
-            self._placing_of = known
-        return self._placing
 
-    def _curvature_terms(self) -> Tensor:
+        def made() -> Tensor:
+            return self.weight.new_zeros(points, len(self.weight)).scatter_add(0, self.corner.T, self.weight.T)
+
+        return self._placing.get((self.weight, self.corner, points), made)
+
+    def curvature_terms(self) -> Tensor:
         r"""What each product of two coefficients adds to each entry of the curvature, (J,R): upper triangles of both.
 
         A place's gradients meet in a 2 x 2 tensor, summed over the channels before the motions come in:
@@ -130,32 +130,31 @@ class AppearanceLevel(nn.Module):
 
         which takes a tenth of the work of the Jacobians' own products. Kept until the state changes.
         """
-        known = (self.slope.data_ptr(), self.slope._version, self.slope.device)
-        if self._curvature is None or self._curvature_of != known:
-            first, second = _pairs(len(self.slope), self.slope.device)
-            rows, columns = _pairs(self.motion.shape[2], self.slope.device)
-            x, y = self.slope.unbind(-1)
-            crossed = torch.einsum("icn,jcn->ijn", x, y)
-            tensors = torch.stack([
-                torch.einsum("icn,jcn->ijn", x, x), (crossed + crossed.transpose(0, 1)) / 2,
-                torch.einsum("icn,jcn->ijn", y, y),
-            ], dim=-1)[first, second]  # fmt: skip
-            across, down = self.motion.unbind(1)
-            moved = torch.stack([
-                across[:, rows] * across[:, columns],
-                across[:, rows] * down[:, columns] + down[:, rows] * across[:, columns],
-                down[:, rows] * down[:, columns],
-            ], dim=1)  # fmt: skip
-            whole = tensors.flatten(1) @ moved.flatten(0, 1)
-            # What the projection takes away: the Jacobians' shares along the modes.
-            pulls = torch.einsum("kcn,icnd->iknd", self.modes, self.slope)
-            shares = pulls.flatten(2) @ self.motion.flatten(0, 1)
-            along = torch.einsum("ikp,jkq->ijpq", shares, shares)
-            taken = (along[first, second] + along[second, first])[:, rows, columns] / 2
-            twice = torch.where(first == second, 1.0, 2.0).to(whole)
-            self._curvature = (whole - taken) * twice[:, None]
-            self._curvature_of = known
-        return self._curvature
+        return self._curvature.get((self.slope, self.motion, self.modes), self._new_curvature_terms)
+
+    def _new_curvature_terms(self) -> Tensor:
+        first, second = _pairs(len(self.slope), self.slope.device)
+        rows, columns = _pairs(self.motion.shape[2], self.slope.device)
+        x, y = self.slope.unbind(-1)
+        crossed = torch.einsum("icn,jcn->ijn", x, y)
+        tensors = torch.stack([
+            torch.einsum("icn,jcn->ijn", x, x), (crossed + crossed.transpose(0, 1)) / 2,
+            torch.einsum("icn,jcn->ijn", y, y),
+        ], dim=-1)[first, second]  # fmt: skip
+        across, down = self.motion.unbind(1)
+        moved = torch.stack([
+            across[:, rows] * across[:, columns],
+            across[:, rows] * down[:, columns] + down[:, rows] * across[:, columns],
+            down[:, rows] * down[:, columns],
+        ], dim=1)  # fmt: skip
+        whole = tensors.flatten(1) @ moved.flatten(0, 1)
+        # What the projection takes away: the Jacobians' shares along the modes.
+        pulls = torch.einsum("kcn,icnd->iknd", self.modes, self.slope)
+        shares = pulls.flatten(2) @ self.motion.flatten(0, 1)
+        along = torch.einsum("ikp,jkq->ijpq", shares, shares)
+        taken = (along[first, second] + along[second, first])[:, rows, columns] / 2
+        twice = torch.where(first == second, 1.0, 2.0).to(whole)
+        return (whole - taken) * twice[:, None]
 
 
 def _pairs(count: int, device: torch.device) -> tuple[Tensor, Tensor]:

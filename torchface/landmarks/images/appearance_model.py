@@ -16,6 +16,7 @@ from torchface.landmarks.images.appearance_level import AppearanceLevel, sample_
 from torchface.landmarks.images.dense_features import CHANNELS, Features, dense_features
 from torchface.landmarks.images.face_warp import with_forehead
 from torchface.landmarks.images.shape_modes import PlanarPose, planar_pose
+from torchface.optim.prepared_tensors import Prepared
 
 COUNT = 68
 _MARGIN = 0.15
@@ -157,8 +158,7 @@ class AppearanceModel(nn.Module):
                 f"expected {len(self.settings.resolutions)}"
             )
         channels = CHANNELS[self.settings.features]
-        self._maps: _LinearMaps | None = None
-        self._maps_of: tuple[int, int, int, torch.dtype] | None = None
+        self._maps: Prepared[_LinearMaps] = Prepared()
         self.register_buffer("mean_shape", torch.zeros(COUNT, 2))
         self.register_buffer("motions", torch.zeros(4 + shape_modes, COUNT, 2))
         self.register_buffer("deviations", torch.ones(shape_modes))
@@ -276,6 +276,7 @@ class AppearanceModel(nn.Module):
         state = self._shape(found)[1]
         lowest = found.new_full((len(found),), torch.inf)
         precision = torch.cat([self.deviations.new_zeros(4), self.deviations.pow(-2)])
+        terms = level.curvature_terms()
         still = torch.zeros_like(lowest, dtype=torch.bool)
         for iteration in range(self.settings.iterations + 1):
             residual = level.residual(level.sample(crop.features, self._points(found)))
@@ -286,7 +287,7 @@ class AppearanceModel(nn.Module):
             still = still | ~(energy < _ASTRAY * lowest)
             if iteration == self.settings.iterations or still.all():
                 break
-            moved = (level.step(residual, state, precision) @ self.motions.flatten(1)).view_as(found)
+            moved = (level.step(residual, state, precision, terms) @ self.motions.flatten(1)).view_as(found)
             warp = self._linear_parts(found)
             pose, shape = self._shape(found - (warp * moved[:, :, None]).sum(3))
             ahead = self._landmarks(pose, shape)
@@ -335,14 +336,14 @@ class AppearanceModel(nn.Module):
 
     def _linear_maps(self) -> _LinearMaps:
         """Kept until the state changes."""
-        known = (self.mean_shape.data_ptr(), self.mean_shape._version, self.triangles._version, self.mean_shape.dtype)
-        if self._maps is None or self._maps_of != known:
+
+        def made() -> _LinearMaps:
             units = torch.zeros(COUNT, COUNT, 2).to(self.mean_shape)
             units[..., 0] = torch.eye(COUNT)
             points = with_forehead(units, self.settings.jaw_margin)[..., 0].T.contiguous()
-            self._maps = _LinearMaps(points, self._warp_steps(units)[:, :, 0].permute(2, 1, 0).contiguous())
-            self._maps_of = known
-        return self._maps
+            return _LinearMaps(points, self._warp_steps(units)[:, :, 0].permute(2, 1, 0).contiguous())
+
+        return self._maps.get((self.mean_shape, self.triangles), made)
 
     def _warp_steps(self, landmarks: Tensor) -> Tensor:
         """See :meth:`_linear_parts`: linear in the landmarks."""
