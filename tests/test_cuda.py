@@ -129,6 +129,12 @@ def test_head_poses_and_filters(rig: BlendshapeRig) -> None:
             torch.testing.assert_close(other.cpu(), one, rtol=1e-3, atol=1e-3)
 
 
+def test_models_lie_where_they_were_asked_for() -> None:
+    for name in zoo.list_models():
+        model = zoo.get_model(name, device="cuda")
+        assert {tensor.device.type for tensor in model.state_dict().values()} == {"cuda"}, name
+
+
 @pytest.mark.parametrize("name", ["expressions", "face_landmarks", "head", "uv_landmarks"])
 def test_models_of_the_zoo(rig: BlendshapeRig, name: str) -> None:
     model = zoo.get_model(name)

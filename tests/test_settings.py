@@ -14,9 +14,11 @@ from torchface.capture import HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.energy import ridge_term, sparsity_term
 from torchface.capture.priors.shape_prior import ShapePrior
 from torchface.capture.video.video_settings import VideoSettings
+from torchface.enhancement import EnhancementSettings
 from torchface.errors import ValueRangeError
-from torchface.modeling import FitSettings
+from torchface.modeling import BakeSettings, ExpressionSettings, FitSettings
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
+from torchface.onnx import GraphSteps
 from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Level, Stage
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.marker_stage import place_markers
@@ -46,7 +48,11 @@ SETTINGS: dict[str, Setting] = {
         *("tolerance", "steps"),
     ),
     **fields(FitSettings, "inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"),
-    **fields(FitSettings, "contour_slide", "max_iterations"),
+    **fields(FitSettings, "contour_slide", "max_iterations", "transfers", "texture_size"),
+    **fields(EnhancementSettings, "fps", "wavelength", "temporal"),
+    **fields(GraphSteps, "seen", "with_gaps"),
+    **fields(BakeSettings, "maximum_distance", "maximum_angle", "padding"),
+    **fields(ExpressionSettings, "neutral_components", "offset_components", "ridge"),
     **fields(RiggingSchedule, "iterations", "unnamed", "kappa", "theta"),
     "RiggingSchedule.beta": lambda value: RiggingSchedule(beta=(0.5, value)),
     **changed(STAGE, "stiffness", "landmark_weight", "contact_weight", "tolerance", "iterations", "samples"),

@@ -7,7 +7,7 @@ from typing import Literal
 
 from torchface.enhancement.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
-from torchface.number_checks import MAX_FPS, MIN_FPS, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, MAX_FPS, MIN_FPS, checked_number
 
 DetailKind = Literal["displacements", "gradients"]
 Matching = Literal["projection", "learned"]
@@ -48,7 +48,7 @@ class EnhancementSettings:
             raise ValueRangeError(f"matching: found {self.matching!r:.40}, expected one of {', '.join(_MATCHINGS)}")
         checked_number("fps", self.fps, MIN_FPS, MAX_FPS)
         checked_number("wavelength", self.wavelength, above=True, most=1e6)
-        checked_number("temporal", self.temporal)
+        checked_number("temporal", self.temporal, most=LARGEST_WEIGHT)
 
 
 DEFAULT_SETTINGS = EnhancementSettings()

@@ -17,6 +17,7 @@ from torchface.geometry.meshes.uv_raster import TexelMap, interpolate, rasterise
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.detail.scan_alignment import Correspondences, ScanAlignment, align_scan
+from torchface.number_checks import checked_count, checked_number
 from torchface.rendering.raycast import RayCaster
 
 MAX_SIDE = 8192
@@ -30,7 +31,7 @@ class BakeSettings:
 
     Args:
         maximum_distance: along the normal, millimetres.
-        maximum_angle: between the normals of mesh and scan, degrees, less than 90.
+        maximum_angle: between the normals of mesh and scan, degrees, 90 at most.
         padding: texels by which charts are dilated, so that seams do not show when the map is filtered.
 
     Raises:
@@ -46,12 +47,9 @@ class BakeSettings:
     padding: int = 16
 
     def __post_init__(self) -> None:
-        if not 0 < self.maximum_distance < float("inf"):
-            raise ValueRangeError(f"maximum_distance: found {self.maximum_distance}, expected positive millimetres")
-        if not 0 < self.maximum_angle < 90:
-            raise ValueRangeError(f"maximum_angle: found {self.maximum_angle}, expected degrees between 0 and 90")
-        if self.padding < 0:
-            raise ValueRangeError(f"padding: found {self.padding}, expected texels, at least 0")
+        checked_number("maximum_distance", self.maximum_distance, above=True, most=1e6)
+        checked_number("maximum_angle", self.maximum_angle, 0.0, 90.0, above=True)
+        checked_count("padding", self.padding, 0, MAX_SIDE)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from torchface.modeling.morphable.streamed_training import sequence_components
 from torchface.modeling.rigging.component_choice import choose_components
 from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, Form
 from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, laid_together
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
 from torchface.progress import Progress, silent
 
 NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
@@ -49,11 +50,10 @@ class ExpressionSettings:
 
     def __post_init__(self) -> None:
         for what in ("neutral_components", "offset_components"):
-            found = getattr(self, what)
-            if found is not None and found < 1:
-                raise ValueRangeError(f"{what}: found {found}, expected 1 at least")
-        if self.ridge is not None and not 0 <= self.ridge < float("inf"):
-            raise ValueRangeError(f"ridge: found {self.ridge}, expected a finite number of at least 0")
+            if getattr(self, what) is not None:
+                checked_count(what, getattr(self, what), 1)
+        if self.ridge is not None:
+            checked_number("ridge", self.ridge, most=LARGEST_WEIGHT)
 
 
 def fit_expressions(
