@@ -70,7 +70,7 @@ def test_parts(size: int) -> None:
     began = time.perf_counter()
     model.enhance(coarse)
     first = time.perf_counter() - began
-    encoder, matching = model._prepared(), model._matching()
+    encoder, matching = model._prepared(), model.matching_projection()
     points = torch.linspace(0, len(model.neutral) - 1, 250).long()
     shell = ThinShell(model.neutral, model.faces, points)
     with torch.no_grad():

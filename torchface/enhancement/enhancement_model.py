@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from torchface.enhancement.actor_timing import ActorTiming
-from torchface.enhancement.aligned_frames import FrameAlignment
-from torchface.enhancement.captured_performance import CapturedPerformance
-from torchface.enhancement.detail_basis import StreamingBasis, blended, region_products
-from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.detail_basis import blended
 from torchface.enhancement.enhancement_settings import (
     DEFAULT_SETTINGS,
     DetailKind,
@@ -23,30 +19,23 @@ from torchface.enhancement.enhancement_settings import (
     EnhancementSizes,
     Matching,
 )
-from torchface.enhancement.gradient_detail import GradientDetail
-from torchface.enhancement.learned_map import LearnedMap, map_shares
-from torchface.enhancement.low_pass import LowPass, vertex_areas
+from torchface.enhancement.learned_map import LearnedMap
+from torchface.enhancement.low_pass import vertex_areas
 from torchface.enhancement.model_training import (
     Encoder,
-    learn_frames,
-    warn_without_neutral,
+    make_encoder,
 )
 from torchface.enhancement.own_lids import OwnLids
-from torchface.enhancement.patches import grow_patches
 from torchface.enhancement.projection import RegionProjection
-from torchface.enhancement.regions import Regions, regions_of_motion
-from torchface.enhancement.surface_frames import SurfaceFrames
+from torchface.enhancement.regions import Regions
 from torchface.errors import TopologyError, ValueRangeError
-from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.operators import triangle_areas
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
-from torchface.progress import Progress, silent
 
 _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
-_COLOR_RANK = 32
 # Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
 # motion that the smooth part lacks far, for that goes on linearly; with wrinkles alone not so, for they saturate.
 _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
@@ -120,6 +109,8 @@ class EnhancementModel(nn.Module):
     color_coefficients: Tensor
     limits: Tensor
     map_shares: Tensor
+    fit: ClassVar[Callable[..., EnhancementModel]]
+    """:func:`torchface.enhancement.enhancement_training.fit_enhancement`, bound where this package begins."""
 
     def __init__(
         self,
@@ -204,103 +195,6 @@ class EnhancementModel(nn.Module):
         sizes = EnhancementSizes(**{one.name: given.pop(one.name) for one in fields(EnhancementSizes)})
         settings = EnhancementSettings(**{one.name: given.pop(one.name) for one in fields(EnhancementSettings)})
         return cls(sizes, settings=settings, **given)
-
-    @classmethod
-    def fit(
-        cls,
-        performance: CapturedPerformance,
-        settings: EnhancementSettings = DEFAULT_SETTINGS,
-        *,
-        patch_size: int = 100,
-        region_count: int = 13,
-        rank: int = 64,
-        seed: int = 0,
-        folder: str | Path | None = None,
-        progress: Progress | None = None,
-    ) -> EnhancementModel:
-        """Learns from a captured performance.
-
-        Args:
-            performance: K frames of the actor.
-            settings: how frames are split and detail is found.
-            patch_size: vertices a patch.
-            region_count: how many regions are looked for.
-            rank: components of the detail.
-            seed: of patches and regions.
-            folder: where a run that is killed finds what it has learned; of this run alone.
-            progress: told of frames.
-
-        Returns:
-            The model. ``lost_share`` says what part of the details' energy its components do not hold.
-
-        Raises:
-            TopologyError: vertices of frames are in another order.
-            ValueRangeError: NaN.
-            AlignmentError: frames of another unit.
-            FileFormatError: the disk is full.
-        """
-        progress = silent if progress is None else progress
-        checked_count("rank", rank, 1)
-        frames, faces, sequences, colors = (
-            performance.frames,
-            performance.faces,
-            performance.sequences,
-            performance.colors,
-        )
-        neutral = performance.neutral.detach().float()
-        progress("preparing the mesh")
-        patches = grow_patches(faces, len(neutral), patch_size, seed)
-        encoder = _encoder(neutral, faces, patches, settings.wavelength, settings.detail)
-        key = content_key(
-            "enhancement/2",
-            neutral=neutral,
-            faces=faces,
-            patches=patches,
-            wavelength=settings.wavelength,
-            detail=settings.detail,
-        )
-        folder = None if folder is None else Path(folder)
-        size = 3 * len(neutral) if settings.detail == "displacements" else 9 * len(faces)
-        learned = learn_frames(frames, performance.coarse, encoder, rank, size, key, folder, progress)
-        warn_without_neutral(learned.motion)
-        marks = performance.landmarks
-        regions = regions_of_motion(learned.motion, patches, neutral, faces, region_count, marks, seed=seed)
-        hue = None if colors is None else StreamingBasis(3 * len(neutral), min(_COLOR_RANK, len(frames)))
-        sizes = EnhancementSizes(
-            len(neutral),
-            len(faces),
-            learned.features.shape[1],
-            len(frames),
-            len(learned.basis.components),
-            0 if hue is None else hue.rank,
-        )
-        model = cls(
-            sizes,
-            regions.names,
-            regions.voluntary.tolist(),
-            settings,
-            learned.basis.lost_share,
-            performance.coarse is not None,
-        )
-        model.neutral, model.faces, model.patches = neutral.clone(), faces.clone(), patches
-        model.region_weights, model.sequences = regions.weights.float(), sequences.clone()
-        model.database_features = learned.features
-        model.components, model.coefficients = learned.basis.components, learned.basis.coefficients
-        progress("comparing the sequences")
-        projection = model._matching()
-        model.limits = projection.limits(sequences).to(model.limits)
-        if model.keeps_input:  # what the smooth part lacks is mostly motion, of which the map always counts whole
-            products = region_products(model.components, encoder.detail.site_weights(model.vertex_weights))
-            shares = map_shares(projection, model.coefficients, model._reach(), products, sequences)
-            model.map_shares = shares.to(model.map_shares)
-        if hue is not None and colors is not None:
-            model.mean_color = colors.float().mean(0)
-            for some in colors.split(32):
-                hue.add((some.float() - model.mean_color).transpose(1, 2).flatten(1).contiguous())
-            found = hue.finished()
-            model.color_components[: len(found.components)] = found.components
-            model.color_coefficients[:, : found.coefficients.shape[1]] = found.coefficients
-        return model.eval()
 
     @property
     def regions(self) -> Regions:
@@ -453,11 +347,11 @@ class EnhancementModel(nn.Module):
         encoder = self._prepared()
         turned = encoder.frames.turned(smooth)
         features = encoder.gradients.features(smooth, turned)
-        projection = self._matching()
+        projection = self.matching_projection()
         matched = projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
         if self.matching == "learned":
-            reach, shares = self._reach(), self.map_shares
+            reach, shares = self.map_reach(), self.map_shares
             learned = self._learned.get(
                 (*self._matched_with(), self.coefficients, reach, shares),
                 lambda: LearnedMap(projection, self.coefficients, reach, shares),
@@ -484,10 +378,12 @@ class EnhancementModel(nn.Module):
     def _prepared(self) -> Encoder:
         return self._encoder.get(
             (self.neutral, self.faces, self.patches, self.wavelength),
-            lambda: _encoder(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
+            lambda: make_encoder(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
         )
 
-    def _matching(self) -> RegionProjection:
+    def matching_projection(self) -> RegionProjection:
+        """What finds each region's blend of the database for a coarse frame."""
+
         def made() -> RegionProjection:
             return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
 
@@ -496,7 +392,7 @@ class EnhancementModel(nn.Module):
     def _matched_with(self) -> tuple[Tensor, ...]:
         return self.database_features, self.region_weights, self.neutral, self.faces, self.patches
 
-    def _reach(self) -> Tensor:
+    def map_reach(self) -> Tensor:
         """Of each region, up to what distance the learned map is trusted, (R,)."""
         return self.limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
 
@@ -516,12 +412,3 @@ class EnhancementModel(nn.Module):
         bad = (~torch.isfinite(coarse.detach())).any(-1).any(-1).nonzero()[:, 0]
         if len(bad):
             raise ValueRangeError(f"coarse: frame {int(bad[0])} holds NaN or infinite vertices, expected none")
-
-
-def _encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> Encoder:
-    frames = SurfaceFrames(neutral, faces)
-    gradients = frames.patch_gradients(patches, faces, neutral)
-    alignment = FrameAlignment(neutral, gradients.means)
-    low_pass = LowPass(neutral, faces, wavelength)
-    kept = DisplacementDetail(neutral, faces, frames) if detail == "displacements" else GradientDetail(neutral, faces)
-    return Encoder(alignment, low_pass, frames, gradients, kept)

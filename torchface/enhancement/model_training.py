@@ -13,6 +13,7 @@ from torch import Tensor
 from torchface.enhancement.aligned_frames import FrameAlignment
 from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
 from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.enhancement_settings import DetailKind
 from torchface.enhancement.gradient_detail import GradientDetail
 from torchface.enhancement.low_pass import LowPass
 from torchface.enhancement.surface_frames import PatchGradients, SurfaceFrames
@@ -154,3 +155,13 @@ def _identity(frames: Tensor | MeshSequence | None) -> object:
     # A thousand dense meshes take a minute to read: their file is known by name, size and time.
     told = frames.path.stat()
     return [str(frames.path.resolve()), frames.key, list(frames.shape), told.st_size, told.st_mtime_ns]
+
+
+def make_encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> Encoder:
+    """Of a neutral (V,3) and its faces (F,3), in patches (F,); ``wavelength`` in millimetres."""
+    frames = SurfaceFrames(neutral, faces)
+    gradients = frames.patch_gradients(patches, faces, neutral)
+    alignment = FrameAlignment(neutral, gradients.means)
+    low_pass = LowPass(neutral, faces, wavelength)
+    kept = DisplacementDetail(neutral, faces, frames) if detail == "displacements" else GradientDetail(neutral, faces)
+    return Encoder(alignment, low_pass, frames, gradients, kept)
