@@ -83,6 +83,7 @@ class EnhancementModel(nn.Module):
     works on displacements, alignment and averages by patches; detail is of low rank.
 
     Example:
+        >>> from torchface.enhancement import CapturedPerformance
         >>> from torchface.synthetic import performer
         >>> rig = performer(texture=False)
         >>> smiles = rig.index(["mouthSmileLeft", "mouthSmileRight"])
