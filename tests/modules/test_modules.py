@@ -38,6 +38,8 @@ COLUMNS = (
 )  # fmt: skip
 ROUNDING = 1e-9
 
+IN_ONE_GRAPH = [name for name, example in EXAMPLES.items() if "torch.compile" not in example.cells]
+
 every_class = pytest.mark.parametrize("name", EXAMPLES)
 
 
@@ -213,16 +215,24 @@ def test_jacobians(name: str) -> None:
 
 @every_class
 def test_compiled_it_computes_the_same(name: str) -> None:
-    """In one graph, or with one gap in which it runs as ever."""
-    example = EXAMPLES[name]
+    """In one graph, or with one gap in which it runs as ever; as far as the code that a backend makes of the graph."""
+    check_compiled(EXAMPLES[name], name in IN_ONE_GRAPH, "aot_eager")
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("name", IN_ONE_GRAPH)
+def test_compiled_to_machine_code_it_computes_the_same(name: str) -> None:
+    check_compiled(EXAMPLES[name], True, "inductor")
+
+
+def check_compiled(example: Example, whole: bool, backend: str) -> None:
     module, inputs = example.make(0), example.inputs()
-    whole = example.cells.get("torch.compile", "yes") == "yes"
     torch.compiler.reset()
-    compiled = torch.compile(Called(example, module), backend="eager", fullgraph=whole)
+    compiled = torch.compile(Called(example, module), backend=backend, fullgraph=whole)
     with torch.no_grad():
         wanted = outputs(example, module, *inputs)
         for _ in range(2):
-            assert_same(list(compiled(*inputs)), wanted, 1e-5)
+            assert_same(list(compiled(*inputs)), wanted, 1e-4 if backend == "inductor" else 1e-5)
 
 
 @every_class

@@ -157,7 +157,8 @@ class SolverGraph(nn.Module):
 
     def _constant(self, offset: Tensor, w: Tensor) -> Tensor:
         """:math:`c` from the gradient at w."""
-        distance = torch.addmm(offset, w, self.rows.T, alpha=self.gram_scale)
+        # ``.T`` would be taken out of a compiled branch, which then has one tensor twice.
+        distance = torch.addmm(offset, w, self.rows.t(), alpha=self.gram_scale)
         gradient = torch.addmm(self.l1_penalty, distance, self.rows) + self.double_ridge * w
         return torch.addmm(torch.addmm((RELAXATION - 1) * w, w, -self.step), gradient, self.offset)
 
@@ -189,7 +190,7 @@ class SolverGraph(nn.Module):
         z = v = z[:, None]
         for steps in stretches(self.steps_with_gaps):
             w = z
-            distance = (seen_offset + self.gram_scale * (w @ self.rows.T)) * seen
+            distance = (seen_offset + self.gram_scale * (w @ self.rows.t())) * seen
             gradient = distance @ self.rows + visible * (penalty + ridge * w)
             constant = gradient @ offset + w @ minus_step + (RELAXATION - 1) * w
             for _ in range(steps):
