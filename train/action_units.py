@@ -16,7 +16,12 @@ from torchface import TorchfaceError, zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.capture.action_units import GROUPS, RegionGroup, RegionVideo, TrainingSettings, classify, read_regions
 from torchface.capture.action_units.classifier import group_regions
-from torchface.capture.action_units.classifier_evaluation import cross_validation, labelled_intensities, level_agreement
+from torchface.capture.action_units.classifier_evaluation import (
+    Split,
+    cross_validation,
+    labelled_intensities,
+    level_agreement,
+)
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.rendering.compositing import headed, save_rendered_image, sheet
@@ -36,7 +41,8 @@ class Settings(RecipeSettings):
         test_video: Videos of performers to test on.
         test_labels: What is in each of those.
         size: Pixels a side that every region is brought to.
-        folds: Into how many parts the frames are split for the cross-validation; 0 leaves it out.
+        folds: In how many turns the cross-validation leaves performers out, of a single one whole repetitions; 0 leaves
+            it out.
         training: How it is trained.
     """
 
@@ -78,7 +84,10 @@ def train(settings: Settings, run: Run) -> Trained:
     classifier = ActionUnitClassifier.fit(videos, labels, groups, settings.training, progress)
     metrics: dict[str, float] = {}
     if settings.folds:
-        accuracy = cross_validation(videos, labels, groups, settings.training, settings.folds, "repetitions")
+        alone = len(videos) == 1
+        split: Split = "repetitions" if alone else "performers"
+        folds = settings.folds if alone else min(settings.folds, len(videos))
+        accuracy = cross_validation(videos, labels, groups, settings.training, folds, split)
         metrics = {f"cross-validated accuracy, {name}": value for name, value in accuracy.items()}
         metrics["cross-validated accuracy"] = sum(accuracy.values()) / len(accuracy)
     for path, own in zip(settings.test_video, test_labels, strict=True):
@@ -141,8 +150,9 @@ def save(
         text=(
             f"Action units {', '.join(classifier.units)} told from strokes of reflective paint in a head-camera video, "
             "frame by frame, each at one of a few levels of intensity. It knows no other units, and combinations only "
-            "as far as they were performed. Accuracy is of unit and level together, whole repetitions left out; other "
-            "performers' is the share of frames in which every unit is within a level of their own labels."
+            "as far as they were performed. Accuracy is of unit and level together, of performers left out, or of "
+            "repetitions left out where there is one performer; other performers' is the share of frames in which "
+            "every unit is within a level of their own labels."
         ),
     )
     zoo.save_model(classifier, settings.out, card)

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
-from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_expression_samples
 from torchface.progress import Progress
 from torchface.rendering.compositing import save_rendered_image
@@ -26,10 +24,9 @@ from .people_samples import People
 from .people_samples import gather as gather_people
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, recipe
+from .settled_expressions import settle
 
 _METHOD = "a person's expressions/1"
-# Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
-_HALF, _NOTHING = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,17 +152,6 @@ def selected(rig: BlendshapeRig, expressions: tuple[str, ...]) -> BlendshapeRig:
         return rig
     deltas = [rig.deltas[rig.index(expression.split("+"))].sum(0) for expression in expressions]
     return BlendshapeRig(rig.neutral, torch.stack(deltas), expressions)
-
-
-def settle(neutral: Tensor, expression: Tensor) -> Tensor:
-    """An expression (V,3) moved onto its neutral by what stays: far-off vertices lose their say, round by round."""
-    moved = expression
-    for half in _HALF:
-        distance = (moved - neutral).norm(dim=-1)
-        weights = 1 / (1 + (distance / half) ** 2) ** 2
-        pose = similarity_transform(expression[None], neutral[None], weights[None], scale=False)
-        moved = pose.apply(expression[None])[0]
-    return expression if float((moved - expression).norm(dim=-1).max()) < _NOTHING else moved
 
 
 def save(model: ExpressionRegression, people: People, comparison: Comparison | None, settings: Settings) -> None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
@@ -18,7 +17,6 @@ from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
-from torchface.modeling import color_casts, texture_areas, without_cast
 from torchface.progress import Progress
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
@@ -27,8 +25,6 @@ from torchface.workflows.batch.batch_items import find_items
 from torchface.workflows.register.register_scans import SCANS
 
 _METHOD = "gathered heads/2"
-_CAST_VERTICES = 4000
-_CAST_SAMPLES = 6_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,37 +157,6 @@ def laid(gathered: Gathered, scale: bool) -> tuple[Samples, Samples]:
         for part in (rest.read(*block) for block in blocks(rest))
     ]
     return aligned(learn, found), MovedSamples(rest, _joined(poses)) if poses else rest
-
-
-@dataclass(frozen=True, eq=False)
-class Balanced:
-    """Colours with each scan's cast taken off as they are read."""
-
-    colors: Samples
-    casts: Tensor
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """M, V, 3."""
-        return self.colors.shape
-
-    def read(self, begin: int, end: int) -> Tensor:
-        """See ``Samples``."""
-        return without_cast(self.colors.read(begin, end), self.casts[begin:end])
-
-
-def balanced_colors(colors: Samples, template: Mesh, white_balance: bool, progress: Progress) -> Samples:
-    """The colours, freed from casts that are told from some thousands of vertices, weighted by their texels."""
-    if not white_balance:
-        return colors
-    weights = texture_areas(template) if template.uvs is not None else torch.ones(len(template.vertices))
-    most = max(200, min(_CAST_VERTICES, _CAST_SAMPLES // colors.shape[0]))
-    chosen = torch.arange(0, len(weights), max(1, -(-len(weights) // most)))
-    some = torch.cat([colors.read(*block)[:, chosen] for block in blocks(colors)])
-    casts = color_casts(some, weights[chosen])
-    brightest = float(casts.mean(1).abs().max().exp())
-    progress(f"casts taken off; the strongest exposure is {brightest:.2f} times the mean")
-    return Balanced(colors, casts)
 
 
 def vertex_colored(mesh: Mesh) -> Mesh:

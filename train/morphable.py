@@ -10,18 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from torchface import TorchfaceError, zoo
-from torchface.errors import ValueRangeError
-from torchface.geometry.sample_batches import SampleRange, Samples, blocks
-from torchface.modeling import HeadModel, MorphableModel
-from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
+from torchface.modeling import HeadModel
+from torchface.modeling.morphable.model_quality import ModelQuality
 from torchface.modeling.morphable.streamed_training import fit_sequence
 from torchface.progress import Progress
 
+from .head_colors import fitted_colors
 from .head_figures import draw
-from .head_samples import Source, balanced_colors, gather, laid, performers, registered
+from .head_measures import card_text, cross_validated, head_quality, measured
+from .head_samples import Source, gather, laid, performers, registered
 from .head_templates import ict_head_model, load_template
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
@@ -29,7 +27,6 @@ from .runner import Recipe, Run, metric_lines, recipe
 
 _TESTED_PERFORMERS = 20
 _MANY, _FOLDS, _MIN_FOLDS = 100, 10, 3  # meshes; of fewer than the first, a tenth tells too little
-_MEASURED = 500  # heads; leaving one out takes an eigensystem of so many for each
 _MEASURES = (
     "; generalisation leaves one head out at a time; specificity is how far its random heads lie from the nearest it "
     "has learned from (root mean squares over the vertices)."
@@ -111,27 +108,11 @@ def train(settings: Settings, run: Run) -> Trained:
     shape = fit_sequence(learn, settings.components, work / "shape", progress)
     if settings.variance is not None:
         shape = shape.truncate(variance=settings.variance)
-    color, test_colors = None, None
-    if gathered.colors is not None:
-        progress("fitting the colours")
-        balanced = balanced_colors(
-            gathered.colors, gathered.template, settings.white_balance and not settings.performers, progress
-        )
-        learned = SampleRange(balanced, 0, count)
-        test_colors = SampleRange(balanced, count, len(gathered.shapes))
-        try:
-            color = fit_sequence(learned, settings.color_components, work / "color", progress)
-        except ValueRangeError as error:
-            progress(f"no model of colours: {error}")
-            test_colors = None
+    balance = settings.white_balance and not settings.performers
+    color, test_colors = fitted_colors(gathered, balance, settings.color_components, work / "color", progress)
     model = HeadModel.on(gathered.template, shape, color, rig)
     progress("measuring")
-    quality = None
-    if count >= 3:
-        some = min(count, _MEASURED)
-        generator = torch.Generator().manual_seed(settings.seed)
-        numbers = _spread(range(1, min(some - 2, shape.count) + 1))
-        quality = model_quality(SampleRange(learn, 0, some), numbers, generator=generator)
+    quality = head_quality(learn, count, shape.count, settings.seed)
     metrics = measured(model, quality, test, test_colors)
     folds = 0
     if not gathered.held_out and count >= _MIN_FOLDS:
@@ -157,55 +138,6 @@ def _ict(settings: Settings, folder: Path, progress: Progress) -> Trained:
     return Trained(model, metrics, None)
 
 
-def cross_validated(heads: Samples, folds: int, components: int | None) -> dict[str, float]:
-    """How far heads lie from models of the others: each is left out once, in so many turns.
-
-    All heads were laid on each other together.
-    """
-    samples = torch.cat([heads.read(*block) for block in blocks(heads)])
-    fold_of = torch.arange(len(samples)) % folds
-    far, mean = [], []
-    for fold in range(folds):  # a model a turn
-        others, left = samples[fold_of != fold], samples[fold_of == fold]
-        model = MorphableModel.fit(others, None if components is None else min(components, len(others) - 1))
-        far.append((model(model.project(left)) - left).norm(dim=-1).mean(1))
-        mean.append((left - model.mean).norm(dim=-1).mean(1))
-    each, base = torch.cat(far), torch.cat(mean)
-    return {
-        "left out in turn, heads": float(len(each)),
-        "left out in turn, mean error mm": float(each.mean()),
-        "left out in turn, worst head mm": float(each.max()),
-        "left out in turn, of the mean head's error": float(each.mean() / base.mean()),
-    }
-
-
-def measured(
-    model: HeadModel, quality: ModelQuality | None, test: Samples, test_colors: Samples | None
-) -> dict[str, float]:
-    """What goes into the card: millimetres and shares."""
-    metrics = {"shape components": float(model.shape.count), "shape variance held": float(model.shape.explained[-1])}
-    if test.shape[0]:
-        far = [
-            (model.shape(model.shape.project(part)) - part).norm(dim=-1)
-            for part in (test.read(*block) for block in blocks(test))
-        ]
-        mean = [(part - model.shape.mean).norm(dim=-1) for part in (test.read(*block) for block in blocks(test))]
-        metrics["held out, mean error mm"] = float(torch.cat(far).mean())
-        metrics["held out, of the mean head's error"] = float(torch.cat(far).mean() / torch.cat(mean).mean())
-    if quality is not None:
-        metrics["generalisation mm"] = float(quality.generalisation[-1])
-        metrics["specificity mm"] = float(quality.specificity[-1])
-        metrics["nearest samples mm"] = quality.nearest
-    if model.color is not None:
-        metrics["color components"] = float(model.color.count)
-        metrics["color variance held"] = float(model.color.explained[-1])
-        if test_colors is not None and test_colors.shape[0]:
-            parts = [test_colors.read(*block) for block in blocks(test_colors)]
-            errors = [(model.color(model.color.project(part)) - part).abs() for part in parts]
-            metrics["held out, mean color error"] = float(torch.cat(errors).mean())
-    return metrics
-
-
 def save(
     model: HeadModel, settings: Settings, metrics: dict[str, float], count: int, held_out: int, folds: int
 ) -> None:
@@ -216,30 +148,19 @@ def save(
         data = f"{model.shape.count} identity modes of ICT-FaceKit's FaceXModel, made of light-stage scans of people."
     else:
         data = f"{count} registered meshes of {settings.scans and settings.scans.name}."
-    colors = (
-        "Colours are one a vertex, sRGB; a cast that the whole set shares remains, and so does light from the side."
-        if model.color is not None
-        else "The meshes brought no colours, so the model has none."
-    )
     if folds:
         tested = f"Tested on all {count} heads, each left out of the model once, in {folds} turns{_MEASURES}"
     elif settings.ict is not None:
         tested = "Nothing was held out: the modes are as their authors give them."
     else:
         tested = f"Tested on {held_out} heads that it has not learned from{_MEASURES}"
-    carried = f"A rig of {len(model.rig_names)} shapes travels with it. " if model.rig_names else ""
     free = "MIT" if settings.performers else "MIT, as ICT-FaceKit" if settings.ict is not None else "that of the scans"
     card = model_card(
         settings,
         licence=free,
         data=data,
         metrics=metrics,
-        text=(
-            f"Neutral heads as a linear model: a mean and {model.shape.count} components, coefficients in standard "
-            "deviations, millimetres. Good for drawing heads, for holding a registration or a fit to photographs to "
-            f"what heads look like, for filling in what a scan does not show. {colors} {carried}{tested} It "
-            "knows no heads unlike those it has learned from: beyond 3 standard deviations it only guesses."
-        ),
+        text=card_text(model, tested),
     )
     zoo.save_model(
         model, settings.out, card, half=[name for name in _HALF if settings.half and name in model.state_dict()]
@@ -274,13 +195,6 @@ def _source(settings: Settings) -> tuple[Source, int]:
         if asked is not None and not 1 <= asked < count:
             raise TorchfaceError(f"{name}: found {asked}, expected 1 to {count - 1} with {count} heads to learn from")
     return source, held_out
-
-
-def _spread(numbers: range, most: int = 60) -> list[int]:
-    """At most so many of the numbers, first and last among them."""
-    if len(numbers) <= most:
-        return list(numbers)
-    return sorted({numbers[round(i)] for i in torch.linspace(0, len(numbers) - 1, most).tolist()})
 
 
 RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(trained.metrics))

@@ -18,6 +18,7 @@ from torchface.shape_names import mapping
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.solve.solve_take import SolveSettings, solve_markers
 
+from .held_out import held_out_people
 from .kept_takes import KeptTake, TakesRead, TakeStore
 
 _METHOD = "takes of priors/1"
@@ -35,6 +36,7 @@ class PriorTakes:
         weights: of each take, (T,N), clipped to [0,1]; read from disk as they are asked for.
         labels: what each take is called.
         frames: T of each take.
+        people: whom each take shows, by any name.
         solved: how many of them were solved from markers.
     """
 
@@ -43,6 +45,7 @@ class PriorTakes:
     weights: Sequence[Tensor]
     labels: Sequence[str]
     frames: Sequence[int]
+    people: Sequence[str]
     solved: int = 0
 
     def some(self, rows: Sequence[int]) -> PriorTakes:
@@ -52,6 +55,7 @@ class PriorTakes:
             weights=TakesRead(self.weights, tuple(rows)),
             labels=[self.labels[row] for row in rows],
             frames=[self.frames[row] for row in rows],
+            people=[self.people[row] for row in rows],
         )
 
     def spread(self, most: int) -> PriorTakes:
@@ -71,7 +75,7 @@ def read_takes(
     """All takes of a folder, by name; one is in memory at a time.
 
     Args:
-        folder: with .csv, .c3d and .trc files.
+        folder: with .csv, .c3d and .trc files, or with a folder of such files for each person.
         work: folder that keeps their weights, a file a take; those of an earlier run are taken up.
         fps: frame rate to bring all takes to; that of the first if absent.
         rig: of the performer of marker takes.
@@ -86,7 +90,8 @@ def read_takes(
     progress = progress or silent
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with takes")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    inside = (*folder.glob("*"), *folder.glob("*/*"))
+    paths = sorted(path for path in inside if path.suffix.lower() in _SUFFIXES and path.is_file())
     if not paths:
         raise FileFormatError(f"{folder}: found no take, expected files ending in {', '.join(_SUFFIXES)}")
     solver = content_key(_METHOD, rig=_content(rig), attachment=attachment)
@@ -100,7 +105,8 @@ def read_takes(
             first, fps = take, take.fps
         _check_names(first.names, take.names, paths[0], path)
     assert first is not None
-    return _stored(store, first, [path.stem for path in paths])
+    people = [str(path) if path.parent == folder else path.parent.name for path in paths]
+    return _stored(store, first, [path.stem for path in paths], people)
 
 
 def _read(
@@ -149,12 +155,13 @@ def synthetic_takes(
         first = take if first is None else first
         progress("making takes up", number + 1, count)
     assert first is not None
-    return _stored(store, first, [f"made up {i}" for i in range(count)])
+    labels = [f"made up {i}" for i in range(count)]
+    return _stored(store, first, labels, labels)
 
 
-def _stored(store: TakeStore, first: KeptTake, labels: Sequence[str]) -> PriorTakes:
+def _stored(store: TakeStore, first: KeptTake, labels: Sequence[str], people: Sequence[str]) -> PriorTakes:
     found = store.takes()
-    return PriorTakes(first.names, first.fps, found, labels, found.frames, store.solved)
+    return PriorTakes(first.names, first.fps, found, labels, found.frames, people, store.solved)
 
 
 def _content(rig: BlendshapeRig | None) -> object:
@@ -183,19 +190,19 @@ def renamed(takes: PriorTakes, names: Sequence[str]) -> tuple[PriorTakes, tuple[
 
 
 def split(takes: PriorTakes, held_out: int | None) -> tuple[PriorTakes, PriorTakes]:
-    """Takes to learn from, and the last ones to test on: a third of them if not said.
+    """Takes to learn from, and the last ones to test on, with all others of the same people: a third if not said.
 
     Raises:
         ShapeError: there are too few.
     """
     count = len(takes.weights)
-    last = max(count // 3, 1) if held_out is None else held_out
-    if not 1 <= last < count:
+    learn, test = held_out_people(takes.people, max(count // 3, 1) if held_out is None else held_out)
+    if not learn or not test:
         raise ShapeError(
-            f"takes: found {count} of which {last} are to be held out, expected at least one to learn from and one to "
-            "test on"
+            f"takes: found {count} of which {len(test)} are to be held out, expected at least one to learn from and "
+            "one to test on"
         )
-    return takes.some(range(count - last)), takes.some(range(count - last, count))
+    return takes.some(learn), takes.some(test)
 
 
 def _check_names(names: tuple[str, ...], others: tuple[str, ...], first: Path, path: Path) -> None:

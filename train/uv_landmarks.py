@@ -11,33 +11,30 @@ from typing import Literal
 
 import torch
 
-from torchface import Mesh, TorchfaceError, load_mesh, zoo
+from torchface import TorchfaceError, zoo
 from torchface.landmarks import (
     UV_LANDMARK_NAMES,
     CylinderLayout,
     DetectorSettings,
     FaceFrame,
     LineExamples,
-    ScanAnnotation,
     UVLandmarkDetector,
     appearance_image,
     line_image,
-    load_annotations,
     scan_landmarks,
     unwrap,
 )
 from torchface.landmarks.scans.detector_evaluation import ScanErrors, draw_result, error_table, landmark_errors
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image, sheet
-from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
 
+from .annotated_scans import AnnotatedScan, annotated_scans, scanned_performers, shown_people
+from .held_out import held_out_people
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
 _TESTED_PERFORMERS = 20
-_VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +46,8 @@ class Settings(RecipeSettings):
         annotations: JSON with the landmarks of each scan by file name.
         performers: Learn from scans of so many embedded performers instead of a folder's.
         appearance: What the detector looks at: the scans' colours, or their form.
-        held_out: How many scans, the last by name, are kept for the test; or how many more performers are drawn for it.
-            None if absent, and 20 performers.
+        held_out: How many scans, the last by name, are kept for the test, with all others in the same folder, which
+            show the same person; or how many more performers are drawn for it. None if absent, and 20 performers.
         size: Pixels a side of the unwrapped images.
         detector: How landmarks are matched.
     """
@@ -64,15 +61,6 @@ class Settings(RecipeSettings):
     seed: int = 7
     size: int = 1024
     detector: DetectorSettings = field(default_factory=DetectorSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class AnnotatedScan:
-    """A scan, what is known of it, and what to call it."""
-
-    name: str
-    mesh: Mesh
-    truth: ScanAnnotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +128,6 @@ def fit(
     )
 
 
-def scanned_performers(
-    count: int, seed: int, progress: Progress | None = None, voxel: float = _VOXEL
-) -> list[AnnotatedScan]:
-    """Raw textured scans of embedded performers with closed eyes, and the truth about them."""
-    progress = progress or silent
-    settings, scans = ScannerSettings(voxel=voxel), []
-    for i, identity in enumerate(draw_identities(count, torch.Generator().manual_seed(seed))):
-        scan = scan_head(eyes_closed(performer(identity)), 1000 * seed + i, settings)
-        scans.append(AnnotatedScan(f"performer {i:03d}", scan.mesh, scan.annotation))
-        progress("scanning performers", i + 1, count)
-    return scans
-
-
 def save(detector: UVLandmarkDetector, settings: Settings, errors: list[ScanErrors], count: int) -> None:
     """Writes the model with its effective settings, measured errors and card."""
     if settings.performers:
@@ -187,16 +162,15 @@ def _split(settings: Settings, progress: Progress) -> tuple[list[AnnotatedScan],
         more = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out
         scans = scanned_performers(settings.performers + more, settings.seed, progress)
         return scans[: settings.performers], scans[settings.performers :]
-    annotations = load_annotations(settings.annotations)
-    names, held_out = sorted(annotations), settings.held_out or 0
-    split = len(names) - held_out
-    if split < 2:
+    known = annotated_scans(settings.scans, settings.annotations)
+    people = shown_people([scan.name for scan in known])
+    learn, test = held_out_people(people, settings.held_out or 0)
+    if len(learn) < 2:
         raise TorchfaceError(
-            f"{settings.annotations}: found {len(names)} annotated scans, expected at least two besides the "
-            f"{held_out} held out"
+            f"{settings.annotations}: found {len(known)} annotated scans, expected at least two besides the "
+            f"{len(test)} held out"
         )
-    scans = [AnnotatedScan(name, load_mesh(settings.scans / name), annotations[name]) for name in names]
-    return scans[:split], scans[split:]
+    return [known[number] for number in learn], [known[number] for number in test]
 
 
 RECIPE = Recipe(Settings, train, __doc__, lambda _, trained: metric_lines(error_table(trained.errors), "8.2f"))

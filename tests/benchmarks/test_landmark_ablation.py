@@ -31,7 +31,8 @@ from torchface.synthetic import draw_identities, neutral_head, performer
 from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, eyes_closed, scan_head
 from torchface.synthetic.stages.subdivision import finely_coloured
 from torchface.viz.figures.face_views import heat_map
-from train.uv_landmarks import fit, scanned_performers
+from train.annotated_scans import scanned_performers
+from train.uv_landmarks import fit
 
 SCANS = int(os.environ.get("TORCHFACE_BENCH_HEADS", "6"))
 PICTURE = Path("out/landmarks/ablation.png")

@@ -20,7 +20,8 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import MIRROR_68, relative_errors
 from torchface.onnx import export_model
-from train.landmarks import Faces, evaluate, load_faces, rendered_faces
+from train.annotated_faces import Faces, load_faces, rendered_faces
+from train.landmarks import evaluate
 
 LEARN, TEST = 300, 150
 SETTINGS = TreeSettings(cascades=8, trees=60, depth=5, oversampling=10, rotation=0, gamma=0, noise=0)
@@ -38,7 +39,7 @@ def enlarged(faces: Faces) -> Faces:
         torch.from_numpy(cv2.resize(image.numpy(), None, fx=LARGER, fy=LARGER, interpolation=cv2.INTER_CUBIC))
         for image in faces.images
     ]
-    return Faces(images, (LARGER * faces.boxes).round(), (LARGER * (faces.landmarks + 0.5) - 0.5).round())
+    return Faces(images, (LARGER * faces.boxes).round(), (LARGER * (faces.landmarks + 0.5) - 0.5).round(), faces.people)
 
 
 def jittered(faces: Faces, seed: int) -> Faces:
@@ -54,7 +55,7 @@ def mirrored(faces: Faces) -> Faces:
     landmarks, boxes = faces.landmarks[:, list(MIRROR_68)].clone(), faces.boxes.clone()
     landmarks[..., 0] = wide[:, None] - landmarks[..., 0]
     boxes[:, 0] = wide - boxes[:, 0] - boxes[:, 2]
-    return Faces([image.flip(1).contiguous() for image in faces.images], boxes, landmarks)
+    return Faces([image.flip(1).contiguous() for image in faces.images], boxes, landmarks, faces.people)
 
 
 def cpu_milliseconds(run: Callable[[int], object], count: int) -> float:
@@ -148,7 +149,7 @@ def test_photographs(data: Path) -> None:
     errors = []
     for picture in sorted(set(pictures)):
         learn, test = (
-            Faces([faces.images[row] for row in rows], faces.boxes[rows], faces.landmarks[rows])
+            faces.some(rows)
             for rows in (
                 [row for row, name in enumerate(pictures) if name != picture],
                 [row for row, name in enumerate(pictures) if name == picture],

@@ -22,7 +22,8 @@ from torchface.landmarks import (
 )
 from torchface.landmarks.scans.detector_evaluation import draw_result, error_table, landmark_errors
 from torchface.rendering.compositing import save_rendered_image, sheet
-from train.uv_landmarks import AnnotatedScan, fit, scanned_performers
+from train.annotated_scans import AnnotatedScan, scanned_performers
+from train.uv_landmarks import fit
 
 LEARN, TEST = 30, 20
 PICTURES = Path("out/landmarks")

@@ -172,6 +172,16 @@ def test_takes_on_disk_give_the_priors_that_takes_in_memory_give(folder: Path, t
             torch.testing.assert_close(learn(kept.weights).state_dict()[name], value, rtol=0, atol=0, msg=name)
 
 
+def test_nobody_is_learned_from_and_tested_on(tmp_path: Path) -> None:
+    for name in ("anna", "ben"):
+        (tmp_path / "takes" / name).mkdir(parents=True)
+        for take in range(2):
+            saved(tmp_path / "takes" / name, f"take_{take}", 30)
+    saved(tmp_path / "takes", "carl", 30)
+    learn, test = split(read_takes(tmp_path / "takes", tmp_path / "work"), 2)  # the last two: ben's second, and carl
+    assert (learn.people, test.labels) == (["anna", "anna"], ["take_0", "take_1", "carl"])
+
+
 def test_bad_input(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueRangeError, match="a folder of takes, or a number of performances"):
         train(Settings())

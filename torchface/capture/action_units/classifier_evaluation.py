@@ -24,7 +24,7 @@ from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.errors import ShapeError
 from torchface.io.action_labels import ActionLabels
 
-Split = Literal["frames", "repetitions"]
+Split = Literal["frames", "repetitions", "performers"]
 
 
 def cross_validation(
@@ -44,7 +44,7 @@ def cross_validation(
         settings: of the training; frames are not warped.
         folds: into how many parts the frames are split; each is left out once.
         split: ``frames`` draws frames at random, as is usual; ``repetitions`` leaves whole repetitions out, so that no
-            frame is tested with its neighbours.
+            frame is tested with its neighbours; ``performers`` whole videos, so that none is tested with their own.
 
     Returns:
         Accuracy by name of the group.
@@ -83,6 +83,8 @@ def _folds(labels: Sequence[ActionLabels], folds: int, split: Split, seed: int) 
     generator = torch.Generator().manual_seed(seed)
     if split == "frames":
         return torch.randperm(total, generator=generator) % folds
+    if split == "performers":
+        return torch.cat([torch.full((own.frames,), number % folds) for number, own in enumerate(labels)])
     fold = torch.zeros(total, dtype=torch.int64)
     start = 0
     for own in labels:

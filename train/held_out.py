@@ -1,0 +1,17 @@
+"""Who is held out for the test: people, never single pictures, scans or takes of someone who is learned from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def held_out_people(people: Sequence[str], count: int) -> tuple[list[int], list[int]]:
+    """Which examples to learn from, and which to test on: all of the people whom the last so many examples show.
+
+    Args:
+        people: whom each example shows, by any name.
+        count: how many examples are to be held out at least, none if it is not positive.
+    """
+    tested = set(people[max(len(people) - count, 0) :]) if count > 0 else set()
+    learn = [number for number, who in enumerate(people) if who not in tested]
+    return learn, [number for number, who in enumerate(people) if who in tested]
