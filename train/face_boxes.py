@@ -6,7 +6,7 @@ Its scenes are put together from rendered people, which are rendered once and ke
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -39,7 +39,7 @@ class Settings(RecipeSettings):
         ict: ICT-FaceKit's FaceXModel, whose heads are four people in five; embedded performers alone without.
         held_out: Of them, the last, of people whom no scene that it learns from shows, kept for the test.
         tested: Scenes of those that are held out.
-        workers: Processes that render, and that put scenes together; 0 for this one alone.
+        workers: Processes that render.
         scenes: What is in them.
         training: How it learns.
     """
@@ -51,7 +51,7 @@ class Settings(RecipeSettings):
     held_out: int = 1056
     tested: int = 200
     seed: int = 1
-    workers: int = 0
+    workers: int = 2
     scenes: SceneSettings = field(default_factory=SceneSettings)
     training: BoxTrainingSettings = field(default_factory=BoxTrainingSettings)
 
@@ -71,15 +71,13 @@ def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
             f"found held_out {settings.held_out} of {settings.people} people, tested {settings.tested}; expected some "
             "people, not all, and 1 at least"
         )
-    files = picture_files(
-        settings.folder, settings.people, settings.seed, settings.ict, max(1, settings.workers), progress
-    )
+    files = picture_files(settings.folder, settings.people, settings.seed, settings.ict, settings.workers, progress)
     split = EACH * ((len(StoredPictures(files)) - settings.held_out) // EACH)  # whole people
     people, others = StoredCutOuts(files, 0, split), StoredCutOuts(files, split)
     progress(f"{len(people)} pictures of people to learn from, {len(others)} to test on")
     model = BoxNetwork.fit(
         partial(_scene, people, settings.scenes, settings.seed),
-        replace(settings.training, seed=settings.seed, workers=settings.workers),
+        settings.training,
         progress,
         run.checkpoint,
         {"scenes": settings.scenes, "people": len(people), "ict": settings.ict is not None, "seed": settings.seed},

@@ -22,7 +22,7 @@ class RecipeSettings:
 
     Args:
         out: Folder for the model, its card and pictures, the settings and the log.
-        seed: Decides all that is drawn.
+        seed: Decides all that is drawn, but what settings with a seed of their own draw.
         device: Where the recipe computes, such as cpu, cuda, cuda:1 or mps; if absent on a GPU where it can use one
             and there is one.
         resume: Go on where a run that was killed has stopped; --no-resume starts anew.

@@ -13,6 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import torch
 import tyro
 
+from torchface import zoo
 from torchface.cli.exit_messages import plain_errors
 from torchface.cli.progress import progress_bars
 from torchface.errors import ValueRangeError
@@ -64,7 +65,8 @@ class Train(Protocol[Taken, Made]):
 def recipe(body: Callable[[Settings, Run], Trained]) -> Train[Settings, Trained]:
     """Makes a recipe's function one of settings and progress: the run's device, folders and log are prepared for it.
 
-    When it has come to its end, ``settings.toml``, ``log.csv`` and ``curves.png`` lie beside the model.
+    When it has come to its end, ``settings.toml``, ``log.csv`` (what was measured on the way, and of the model) and
+    ``curves.png`` lie beside the model.
     """
 
     @wraps(body)
@@ -87,6 +89,10 @@ def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
         except BaseException:
             log.write()
             raise
+    if (settings.out / "model.toml").is_file():
+        step = log.rows[-1].step if log.rows else 0
+        for name, value in zoo.describe(settings.out.resolve()).metrics.items():
+            log(step, name, value)
     log.close()
     write_settings(make_folder(settings.out) / "settings.toml", settings)
     settings.forget()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import types
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchface import TorchfaceError
+from torchface import TorchfaceError, zoo
 from torchface.files.documents import write_toml
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
 from torchface.progress import Progress
@@ -225,3 +226,13 @@ def test_a_card_tells_the_command_that_makes_the_model_again(tmp_path: Path) -> 
     settings = Settings(data=tmp_path / "my scans", limit=None, parts=(3, 4), out=Path("a/line"), device="cpu")
     told = command(settings)
     assert told == ("torchface train test_runner --data 'my scans' --parts 3 4 --limit None --seed 0 --out models/line")
+
+
+@pytest.mark.parametrize("name", zoo.list_models())
+def test_commands_of_the_shipped_models_are_still_taken(name: str) -> None:
+    """``python -m train.NAME FLAGS``, as ``torchface train NAME FLAGS`` takes them."""
+    words = shlex.split(zoo.describe(name).recipe)
+    module = words[2].removeprefix("train.")
+    assert module in RECIPES
+    settings = import_module(f"train.{module}").RECIPE.chosen(words[3:])
+    assert settings.out.name == name

@@ -37,6 +37,7 @@ def test_a_video_and_its_labels_become_a_model(session: RecordedSession, tmp_pat
         "CARD.md",
         "levels.png",
         "settings.toml",
+        "log.csv",
     }
     again = zoo.get_model(out)
     assert isinstance(again, ActionUnitClassifier)

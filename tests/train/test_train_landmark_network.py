@@ -58,7 +58,10 @@ def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.Monke
     again = zoo.get_model(tmp_path / "own")
     assert isinstance(again, LandmarkNetwork)
     assert again.config == model.config
-    assert {row.name for row in read_log(tmp_path / "own" / "log.csv")} == {"pixels off", "learning rate"}
+    told = {row.name: row.value for row in read_log(tmp_path / "own" / "log.csv")}
+    measured = zoo.describe(tmp_path / "own").metrics
+    assert set(told) == {"pixels off", "learning rate", *measured}
+    assert {name: told[name] for name in measured} == pytest.approx(measured, nan_ok=True)
     assert not settings.work.exists()
 
 

@@ -99,6 +99,7 @@ def test_the_folder_holds_model_card_and_pictures(trained: tuple[Trained, Path])
         "CARD.md",
         "pictures",
         "settings.toml",
+        "log.csv",
     }
     assert not [p for p in out.parent.iterdir() if p != out]
     names = {"modes", "color_modes", "random", "morph", "far", "components", "quality"}
