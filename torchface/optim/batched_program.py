@@ -22,7 +22,7 @@ from torchface.optim.primal_dual_active_set import primal_dual_active_set
 # Cycles of splitting before the active set is tried, times the root of N; then steps of splitting and Newton steps for
 # what it does not settle, an H that is singular or close to it: splitting brings such problems near enough for Newton
 # steps to end them, and the last ones make sure.
-_FIRST_CYCLES = 0.235
+_FIRST_CYCLES = 0.21
 # Few variables and a coarse tolerance: so many steps of splitting alone end nearly always, sooner than a factorisation.
 _COARSE_ROUNDS = ((None, 88), (None, 40))
 _COARSE, _FEW_VARIABLES = 1e-7, 64
