@@ -29,13 +29,19 @@ from torchface.capture.webcam.guided_gains import gain_factors, gain_groups, hig
 from torchface.capture.webcam.person_filter import frame_information, lasting_precision
 from torchface.capture.webcam.person_prior import PersonPrior
 from torchface.capture.webcam.rig_tables import CONTOUR_TRUST, arkit_names, closing, owners, tells
+from torchface.capture.webcam.shown_state import (
+    LOST_FIT,
+    ShownOutputs,
+    chosen_state,
+    double_state,
+    lost_state,
+    shown_state,
+)
 from torchface.capture.webcam.webcam_settings import WebcamSettings
-from torchface.capture.webcam.webcam_state import PARTS, StateLayout, WebcamControls, WebcamState
-from torchface.capture.webcam.weight_filter import one_euro_step
+from torchface.capture.webcam.webcam_state import StateLayout, WebcamControls, WebcamState
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
-from torchface.geometry.rotations import rotation_matrix
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.landmark_finder import trust_of
 from torchface.optim.exported_operators import split_box_program_quickly, symmetric_inverse
@@ -54,15 +60,12 @@ _LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
 _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
 _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
-_HOLD, _RELAX = 0.3, 0.5
-"""For how long a lost face is held, and how long it then takes to rest, seconds."""
 _SETTLED = 0.15  # seconds after which a found face's pose has come to rest
 _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is known of, and for how long, seconds
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person tell, and for how long, seconds
 _LIDS = ("eyeBlink", "eyeWide", "eyeSquint")
 _LID_MOTION = 3.0
 _LID_RIDGE = {"eyeWide": 16.0, "eyeSquint": 8.0}  # lids that stand a little otherwise are noise, more likely than not
-_MISFIT, _LOST_FIT = 0.06, 0.14  # of the eyes' distance
 _CONSTANTS = ("landmark_weights", "identity", "camera", "look_eyes", "upright", "damping", "filter_units")
 
 
@@ -279,7 +282,7 @@ class WebcamSolver(nn.Module):
     ) -> Tensor:
         """The next state's vector (S,), of a ``FaceReading``, ``step``'s other arguments and the state's vector."""
         pose, gain, smoothing, reset, freeze = controls.double()
-        before = _double(self.layout.unpack(torch.where(reset > 0, 0.0, _known(state, 0.0))))
+        before = double_state(self.layout.unpack(torch.where(reset > 0, 0.0, _known(state, 0.0))))
         interval = _known(interval.double(), _SHORTEST).clamp(_SHORTEST, _LONGEST)
         focal = size.double().max() / (2 * math.tan(math.radians(ASSUMED_FIELD_OF_VIEW) / 2))
         centre = 0.5 * (size.double() - 1)
@@ -296,9 +299,10 @@ class WebcamSolver(nn.Module):
         spread = _known(deviation.double(), 0.0).clamp(0, 1e3) / focal
         eyes = EyesRead(openness.double(), closed.double(), eye_visibility.double())
         solved = self._solved(_Seen(rays, trust, spread, iris_rays, eyes), before, interval, pose, freeze)
-        lost = self._lost(before, interval)
-        after = _chosen(found, solved, lost)
-        return self._shown(after, before, found, present, interval, gain, smoothing).pack()
+        lost = lost_state(before, interval)
+        after = chosen_state(found, solved, lost)
+        outputs = ShownOutputs(self.gain_shapes, self.to_arkit, self.filter_units)
+        return shown_state(outputs, after, before, found, present, interval, gain, smoothing).pack()
 
     def _solved(self, seen: _Seen, before: WebcamState, interval: Tensor, pose: Tensor, freeze: Tensor) -> WebcamState:
         """The state of a frame with a face, its outputs not yet calmed."""
@@ -379,7 +383,7 @@ class WebcamSolver(nn.Module):
 
         at = self._linearised(points, head, rays, precision)
         error = self._error(at, precision, eyes, trust)
-        good = learns * (shown > _SETTLED) * (error < _LOST_FIT)
+        good = learns * (shown > _SETTLED) * (error < LOST_FIT)
         person, information, evidence = self._learned_person(at, head, before, interval, pose, good)
         gains_after, gains_seen = learned_gains(
             weights, self.gain_shapes, before, interval, pose, (freeze <= 0).double()
@@ -487,67 +491,6 @@ class WebcamSolver(nn.Module):
         person, information, evidence, _ = given[-4:]
         return person.clone(), information.clone(), evidence.clone()
 
-    def _lost(self, before: WebcamState, interval: Tensor) -> WebcamState:
-        """The state of a frame without a face: as it was, then on its way to rest."""
-        lost = before.lost + interval
-        left = (_HOLD + _RELAX - before.lost).clamp(max=_RELAX)
-        left_now = (_HOLD + _RELAX - lost).clamp(min=0, max=_RELAX)
-        share = torch.where(left > 0, left_now / left.clamp(min=1e-6), 0.0)
-        return replace(
-            before,
-            weights=before.weights * share,
-            shapes=before.shapes * share,
-            gaze=before.gaze * share,
-            speeds=torch.zeros_like(before.speeds),
-            shown=torch.zeros_like(before.shown),
-            tracked=torch.zeros_like(before.tracked),
-            lost=torch.where((before.pose.abs().sum() > 0), lost, 0.0),
-        )
-
-    def _shown(
-        self,
-        after: WebcamState,
-        before: WebcamState,
-        found: Tensor,
-        present: Tensor,
-        interval: Tensor,
-        gain: Tensor,
-        smoothing: Tensor,
-    ) -> WebcamState:
-        """The state with its outputs: weights by ARKit's names with gains, calmed."""
-        gains = gain_factors(after.gains, self.gain_shapes)
-        weights = (gain * (self.to_arkit @ (after.shapes / gains))).clamp(0, 1)
-        pose = after.pose
-        first = (before.pose.abs().sum() < 1e-9) | (after.shown < 1.5 * interval)
-        turned = pose[:9].reshape(3, 3)
-        # The sine of the turn for the turn: between two frames it is small.
-        apart = 0.5 * (turned @ before.rotation.T - before.rotation @ turned.T)
-        turn = torch.stack([apart[2, 1], apart[0, 2], apart[1, 0]])
-        motion = torch.cat([turn, pose[9:] - before.translation])
-        speeds = torch.where(first, 0.0, before.speeds)
-        old = torch.cat([before.weights, torch.zeros_like(motion)])
-        unit = self.filter_units
-        calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
-        rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
-        translation = torch.where(first, pose[9:], before.translation + calm[-3:])
-        fit = ((_LOST_FIT - after.error) / (_LOST_FIT - _MISFIT)).clamp(0, 1)
-        return replace(
-            after,
-            weights=torch.where(found, calm[:-6].clamp(0, 1), after.weights),
-            rotation=torch.where(found, rotation, before.rotation),
-            translation=torch.where(found, translation, before.translation),
-            speeds=torch.where(found, speeds, after.speeds),
-            tracked=torch.where(found, present * fit, 0.0),
-        )
-
 
 def _known(values: Tensor, otherwise: float) -> Tensor:
     return torch.where(torch.isnan(values), otherwise, values)
-
-
-def _double(state: WebcamState) -> WebcamState:
-    return WebcamState(*(getattr(state, name).double() for name in PARTS))
-
-
-def _chosen(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
-    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in PARTS))
