@@ -6,6 +6,7 @@ import csv
 import io
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,7 @@ from matplotlib.figure import Figure
 
 from torchface.files.whole_files import make_folder, write_file
 
-_HEAD = ["seconds", "step", "name", "value"]
-_INTERVAL = 5.0  # seconds between two writings of the table
+_HEAD = "seconds,step,name,value\n"
 
 
 @dataclass(frozen=True)
@@ -44,39 +44,27 @@ class RunLog:
         self._folder = folder
         self.rows: list[Row] = read_log(folder / "log.csv") if goes_on else []
         """All that was measured so far."""
-        self._resumed, self._begun = bool(self.rows), not self.rows
+        self._resumed, self._begun = bool(self.rows), False
         self._start = time.monotonic() - (self.rows[-1].seconds if self.rows else 0.0)
-        self._written = time.monotonic()
         self._board: Any = None
 
     def __call__(self, step: int, name: str, value: float) -> None:
         """See :class:`~torchface.progress.ValueLog`."""
-        if not self._begun:
-            self.rows = [row for row in self.rows if row.step < step]
+        row = Row(time.monotonic() - self._start, step, name, float(value))
+        if self._begun:
+            self.rows.append(row)
+            with (self._folder / "log.csv").open("a") as file:
+                file.write(_lines([row]))
+        else:
             self._begun = True
-        if self._board is None:
+            self.rows = [*(old for old in self.rows if old.step < step), row]
+            write_file(make_folder(self._folder) / "log.csv", (_HEAD + _lines(self.rows)).encode())
             self._board = _board(self._folder / "tensorboard", step if self._resumed else 0)
-        self.rows.append(Row(time.monotonic() - self._start, step, name, float(value)))
         if self._board:
             self._board.add_scalar(name, value, step)
-        if time.monotonic() - self._written > _INTERVAL:
-            self.write()
-
-    def write(self) -> None:
-        """Writes the table, if there is anything in it."""
-        self._written = time.monotonic()
-        if not self.rows:
-            return
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerow(_HEAD)
-        table.writerows((f"{row.seconds:.1f}", row.step, row.name, f"{row.value:.8g}") for row in self.rows)
-        make_folder(self._folder)
-        write_file(self._folder / "log.csv", text.getvalue().encode())
 
     def close(self) -> None:
-        """Writes all, and the curves."""
-        self.write()
+        """Writes the curves."""
         if self._board:
             self._board.close()
         curves = {
@@ -88,14 +76,21 @@ class RunLog:
 
 
 def read_log(path: Path) -> list[Row]:
-    """The rows of a table; none where it is not there or cannot be read."""
+    """The rows of a table, up to one that a killed run has left half; none where it is not there."""
+    rows: list[Row] = []
     try:
-        lines = list(csv.reader(path.read_text().splitlines()))
-        if lines[:1] != [_HEAD]:
-            return []
-        return [Row(float(seconds), int(step), name, float(value)) for seconds, step, name, value in lines[1:]]
+        for seconds, step, name, value in csv.reader(path.read_text().removeprefix(_HEAD).splitlines()):
+            rows.append(Row(float(seconds), int(step), name, float(value)))
     except (OSError, ValueError):
-        return []
+        pass
+    return rows
+
+
+def _lines(rows: Sequence[Row]) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerows((f"{row.seconds:.1f}", row.step, row.name, f"{row.value:.8g}") for row in rows)
+    return text.getvalue()
 
 
 def _board(folder: Path, step: int) -> Any:

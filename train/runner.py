@@ -84,11 +84,7 @@ def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
         settings.forget()
     log = RunLog(settings.out, goes_on=settings.work.is_dir())
     with made_folder(settings.work) as work:
-        try:
-            yield Run(progress, log, work, device)
-        except BaseException:
-            log.write()
-            raise
+        yield Run(progress, log, work, device)
     if (settings.out / "model.toml").is_file():
         step = log.rows[-1].step if log.rows else 0
         for name, value in zoo.describe(settings.out.resolve()).metrics.items():

@@ -91,6 +91,28 @@ tell(begin, start)
 """
 
 
+EYES = """
+from pathlib import Path
+from torchface.landmarks.images.eyes.eye_training import EyeSettings, fit_eye_rows
+from train.eye_pictures import StoredEyePictures
+pictures = StoredEyePictures(sorted(Path(sys.argv[2]).glob("*.safetensors")), 0, int(sys.argv[1]))
+begin, start = peak(), time.process_time()
+fit_eye_rows(pictures, None, EyeSettings(steps=int(sys.argv[3]), batch=int(sys.argv[4])))
+tell(begin, start)
+"""
+SCENES = """
+from functools import partial
+from pathlib import Path
+from torchface.landmarks import BoxNetwork, BoxTrainingSettings
+from torchface.synthetic.stages.face_scenes import face_scene
+from train.face_pictures import StoredCutOuts
+people = StoredCutOuts(sorted(Path(sys.argv[2]).glob("*.safetensors")), 0, int(sys.argv[1]))
+begin, start = peak(), time.process_time()
+BoxNetwork.fit(partial(face_scene, people), BoxTrainingSettings(int(sys.argv[3]) * int(sys.argv[4]), int(sys.argv[4])))
+tell(begin, start)
+"""
+
+
 def trained(what: str, script: str, counts: Sequence[int], *words: object) -> list[Found]:
     """What training took, count by count; told and drawn."""
     from matplotlib.figure import Figure
@@ -175,15 +197,36 @@ def test_takes(tmp_path: Path) -> None:
     assert second < 1.4 * first
 
 
+def repeated(folder: Path, rows: dict[str, torch.Tensor]) -> Path:
+    """Rows of a file under so many names that there are enough of them."""
+    folder.mkdir()
+    first = folder / "0000.safetensors"
+    save_file(rows, first)
+    for number in range(1, PICTURES[-1] // len(rows["rgba"])):
+        os.link(first, folder / f"{number:04}.safetensors")
+    return folder
+
+
 def test_pictures(tmp_path: Path) -> None:
-    """Files of the size that the recipe renders, one of them under many names."""
+    """Files of the size that the recipes render, one of them under many names."""
     generator = torch.Generator().manual_seed(0)
-    first = tmp_path / "0000.safetensors"
-    rgba = torch.randint(256, (240, 4, 192, 192), generator=generator, dtype=torch.uint8)
     landmarks = 40 + 110 * torch.rand(240, 68, 2, generator=generator)
-    save_file({"rgba": rgba, "landmarks": landmarks, "visible": torch.ones(240, 68, dtype=torch.bool)}, first)
-    for number in range(1, PICTURES[-1] // 240):
-        os.link(first, tmp_path / f"{number:04}.safetensors")
-    told = trained("pictures", NETWORK, PICTURES, tmp_path, STEPS, BATCH)
-    check_memory(told)
-    assert told[-1]["seconds"] < 1.4 * told[0]["seconds"]
+    rgba = torch.randint(256, (240, 4, 192, 192), generator=generator, dtype=torch.uint8)
+    visible = torch.ones(240, 68, dtype=torch.bool)
+    faces = repeated(tmp_path / "faces", {"rgba": rgba, "landmarks": landmarks, "visible": visible})
+    labels = {"openness": 2, "bare": 2}
+    eyes = {name: torch.rand(240, size, generator=generator) for name, size in labels.items()}
+    eyes |= {name: 160 * torch.rand(240, 2, 2, generator=generator) for name in ("iris", "gaze")}
+    eyes |= {
+        "rgba": rgba[:, :, :64, :160].contiguous(),
+        "landmarks": landmarks,
+        "visible": visible[:, :12].contiguous(),
+    }
+    for what, script, folder in (
+        ("pictures", NETWORK, faces),
+        ("eyes", EYES, repeated(tmp_path / "eyes", eyes)),
+        ("people of scenes", SCENES, faces),
+    ):
+        told = trained(what, script, PICTURES, folder, STEPS, BATCH)
+        check_memory(told)
+        assert told[-1]["seconds"] < 1.4 * told[0]["seconds"]

@@ -222,6 +222,20 @@ def test_tensorboard_is_told_where_it_is_installed(tmp_path: Path, monkeypatch: 
     assert told == [("tensorboard", 0.0, 0), ("loss", 0.5, 50)]
 
 
+def test_a_log_goes_on_with_the_step_that_is_done_again(tmp_path: Path) -> None:
+    log = RunLog(tmp_path)
+    for step in (50, 100, 150):
+        log(step, "loss, of all", 1 / step)
+    with (tmp_path / "log.csv").open("a") as file:
+        file.write("9.0,20")  # a line that a killed run has left
+    again = RunLog(tmp_path, goes_on=True)
+    again(100, "loss, of all", 0.5)
+    again(150, "loss, of all", 0.25)
+    again.close()
+    told = [(row.step, row.name, row.value) for row in read_log(tmp_path / "log.csv")]
+    assert told == [(50, "loss, of all", 0.02), (100, "loss, of all", 0.5), (150, "loss, of all", 0.25)]
+
+
 def test_a_card_tells_the_command_that_makes_the_model_again(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path / "my scans", limit=None, parts=(3, 4), out=Path("a/line"), device="cpu")
     told = command(settings)
