@@ -15,6 +15,7 @@ import tyro
 
 from torchface import zoo
 from torchface.cli.exit_messages import plain_errors
+from torchface.cli.plain_options import plain_options
 from torchface.cli.progress import progress_bars
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
@@ -109,6 +110,9 @@ class Recipe(Generic[Settings, Trained]):
     train: Train[Settings, Trained]
     description: str | None
     lines: Callable[[Settings, Trained], Iterable[str]]
+
+    def __post_init__(self) -> None:
+        plain_options(self.settings)
 
     def main(self, arguments: Sequence[str] | None = None) -> None:
         """Parses flags, trains, prints; a mistake of the user ends it with one line and status 2.

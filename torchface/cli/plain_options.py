@@ -6,15 +6,18 @@ from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
 _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
 
 
-def plain_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, whose help says ``PATH`` instead of ``{None}|PATH (default: None)``."""
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def plain_options(command: Command) -> Command:
+    """The command, or the dataclass, whose help says ``PATH`` instead of ``{None}|PATH (default: None)``."""
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in signature(command).parameters.items():
         kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
