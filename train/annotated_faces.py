@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
-from torchface.io.images.image_files import load_image
+from torchface.io import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.images.ibug_68 import box_around

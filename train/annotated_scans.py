@@ -12,7 +12,7 @@ from torchface import Mesh, load_mesh
 from torchface.landmarks import ScanAnnotation, load_annotations
 from torchface.progress import Progress, silent
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.scanner import ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.stages import ScannerSettings, eyes_closed, scan_head
 
 _VOXEL = 1.7  # millimetres; coarse, and so a scan takes seconds
 

@@ -18,8 +18,8 @@ from torch import Tensor
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
+from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.mesh_files import MESH_ENDINGS
-from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.progress import Progress
 from torchface.synthetic.stages.weight_curves import GESTURES
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer

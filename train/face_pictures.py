@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.files.shards import Shards
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind

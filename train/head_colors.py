@@ -11,8 +11,7 @@ from torch import Tensor
 from torchface import Mesh
 from torchface.errors import ValueRangeError
 from torchface.geometry.sample_batches import SampleRange, Samples, blocks
-from torchface.modeling import MorphableModel, color_casts, texture_areas, without_cast
-from torchface.modeling.morphable.streamed_training import fit_sequence
+from torchface.modeling import MorphableModel, color_casts, fit_sequence, texture_areas, without_cast
 from torchface.progress import Progress
 
 from .head_samples import Gathered

@@ -10,17 +10,15 @@ from torch import Tensor
 
 from torchface.files.whole_files import make_folder
 from torchface.geometry.sample_batches import Samples, blocks
-from torchface.modeling import HeadModel
-from torchface.modeling.morphable.model_quality import ModelQuality
+from torchface.modeling import HeadModel, ModelQuality
 from torchface.progress import Progress
 from torchface.rendering.compositing import save_rendered_image
+from torchface.viz import modes_figure, random_figure
 from torchface.viz.figures.model_figures import (
     color_modes_figure,
     extrapolation_figure,
-    modes_figure,
     morph_figure,
     quality_figure,
-    random_figure,
     scatter_figure,
 )
 

@@ -15,7 +15,7 @@ from torchface.files.content_keys import content_key
 from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
 from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
 from torchface.progress import Progress
 from torchface.rendering.clay_shading import sample_texture

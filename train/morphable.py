@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface import TorchfaceError, zoo
-from torchface.modeling import HeadModel
-from torchface.modeling.morphable.model_quality import ModelQuality
-from torchface.modeling.morphable.streamed_training import fit_sequence
+from torchface.modeling import HeadModel, ModelQuality, fit_sequence
 from torchface.progress import Progress
 
 from .head_colors import fitted_colors

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
 from torchface.geometry.similarity import similarity_transform
-from torchface.io.meshes.mesh_sequence import MeshSequence
+from torchface.io import MeshSequence
 from torchface.progress import Progress
 
 _MOST = 40  # frames that are measured of what was learned
