@@ -130,7 +130,7 @@ def trained(what: str, script: str, counts: Sequence[int], *words: object) -> li
     for place, (name, key) in enumerate((("processor seconds", "seconds"), ("peak GiB", "gib")), 1):
         axes = figure.add_subplot(1, 2, place)
         axes.plot(counts, [found[key] for found in told], "o-")
-        axes.set(xlabel=what, ylabel=name, xlim=(0, None), ylim=(0, None))
+        axes.set(xlabel=what, ylabel=name, xlim=(0, None), ylim=(0, 1.1 * max(found[key] for found in told)))
     OUT.mkdir(parents=True, exist_ok=True)
     figure.savefig(OUT / f"{what}.png")
     print(OUT / f"{what}.png")
