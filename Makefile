@@ -34,7 +34,7 @@ $(BLENDER)/.installed: constraints.txt
 test-blender: $(VENV)/.installed-test $(BLENDER)/.installed
 	TORCHFACE_BLENDER=$(BLENDER)/bin/python $(RUN) -m pytest -m blender tests/io/blender
 
-# Ray starts a cluster of two nodes on this machine's loopback; should it hang, the time limit ends it, and all its processes.
+# Ray starts a cluster of two nodes on this machine; should it hang, the time limit ends it, and all its processes.
 test-cluster: $(VENV)/.installed-cluster
 	RAY_USAGE_STATS_ENABLED=0 OMP_NUM_THREADS=1 timeout --kill-after=30 900 $(RUN) -m pytest -m cluster -o faulthandler_timeout=300 \
 		tests/workflows/batch

@@ -27,7 +27,6 @@ NODE = {
     "num_cpus": 1,
     "object_store_memory": 80 * 2**20,
     "include_log_monitor": False,
-    "node_ip_address": "127.0.0.1",
 }
 TEXTS = {f"w{i}": f"word {i}" for i in range(8)}
 DRIVER = """
@@ -45,7 +44,7 @@ run_batch(job, WORDS, find_items([words], WORDS), words.parent / "out", BatchOpt
 
 @pytest.fixture(scope="module")
 def shared_cluster() -> Iterator[Any]:
-    """A Ray cluster on this machine's loopback, of what batches need alone."""
+    """A Ray cluster on this machine, of what batches need alone."""
     ray = pytest.importorskip("ray", reason="ray is not installed: pip install '.[cluster]'")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
