@@ -65,7 +65,7 @@ class RecipeSettings:
             raise ValueRangeError(f"device: found {self.device!r}, expected {able}: this recipe knows no other")
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
             there = ", ".join(f"cuda:{number}" for number in range(torch.cuda.device_count())) or "no CUDA device"
-            raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees {there} here; expected such or cpu")
+            raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees {there} here; expected cpu")
         if device.type == "mps" and not torch.backends.mps.is_available():
             raise ValueRangeError(f"device: found {self.device!r}, but PyTorch sees no such device here; expected cpu")
         return device
