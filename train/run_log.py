@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchface.files.whole_files import make_folder, write_file
+from torchface.files.write_errors import unwritten
 
 _HEAD = "seconds,step,name,value\n"
 
@@ -49,12 +50,15 @@ class RunLog:
         self._board: Any = None
 
     def __call__(self, step: int, name: str, value: float) -> None:
-        """See :class:`~torchface.progress.ValueLog`."""
+        """See :class:`~torchface.progress.ValueLog`.
+
+        Raises:
+            FileFormatError: the table cannot be written.
+        """
         row = Row(time.monotonic() - self._start, step, name, float(value))
         if self._begun:
             self.rows.append(row)
-            with (self._folder / "log.csv").open("a") as file:
-                file.write(_lines([row]))
+            self._append(row)
         else:
             self._begun = True
             self.rows = [*(old for old in self.rows if old.step < step), row]
@@ -62,6 +66,15 @@ class RunLog:
             self._board = _board(self._folder / "tensorboard", step if self._resumed else 0)
         if self._board:
             self._board.add_scalar(name, value, step)
+
+    def _append(self, row: Row) -> None:
+        """Not the whole file again: a long run would spend its time on that. A killed one leaves half a row at most."""
+        path = self._folder / "log.csv"
+        try:
+            with path.open("a") as file:
+                file.write(_lines([row]))
+        except OSError as error:
+            raise unwritten(path, error) from error
 
     def close(self) -> None:
         """Writes the curves."""

@@ -85,6 +85,8 @@ def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
         settings.forget()
     log = RunLog(settings.out, goes_on=settings.work.is_dir())
     with made_folder(settings.work) as work:
+        if not (begun := work / "settings.toml").is_file():  # a run that is refused leaves the killed one's
+            write_settings(begun, settings)
         yield Run(progress, log, work, device)
     if (settings.out / "model.toml").is_file():
         step = log.rows[-1].step if log.rows else 0

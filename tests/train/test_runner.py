@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
 import types
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface import TorchfaceError, zoo
+from torchface.errors import FileFormatError
 from torchface.files.documents import write_toml
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
 from torchface.progress import Progress
@@ -170,6 +172,7 @@ def test_a_run_may_start_anew(tmp_path: Path) -> None:
     other = Settings(data=tmp_path, out=tmp_path / "line", network=DescentSettings(60, 8, 0.1))
     with pytest.raises(TorchfaceError, match="found a checkpoint of other data or settings"):
         train(other)
+    assert read_settings(settings.work / "settings.toml", Settings) == settings
     steps: list[int] = []
     fresh = Settings(data=tmp_path, out=tmp_path / "line", network=other.network, resume=False)
     train(fresh, lambda _, done=0, total=0: steps.append(done))
@@ -181,7 +184,8 @@ def test_a_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
     settings = Settings(data=tmp_path, out=tmp_path / "line")
     with pytest.raises(KeyboardInterrupt):
         train(settings, killed_after(3))
-    (found,) = settings.work.iterdir()
+    (found,) = settings.work.glob("*.safetensors")
+    assert {path.name for path in settings.work.iterdir()} == {found.name, "settings.toml"}
     assert found.read_bytes()[8:10] == b'{"'  # safetensors: a length, then JSON
 
 
@@ -234,6 +238,14 @@ def test_a_log_goes_on_with_the_step_that_is_done_again(tmp_path: Path) -> None:
     again.close()
     told = [(row.step, row.name, row.value) for row in read_log(tmp_path / "log.csv")]
     assert told == [(50, "loss, of all", 0.02), (100, "loss, of all", 0.5), (150, "loss, of all", 0.25)]
+
+
+def test_a_log_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "run")
+    log(50, "loss", 0.5)
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(FileFormatError, match=r"log\.csv: cannot be written: found no folder .*run, expected one"):
+        log(100, "loss", 0.25)
 
 
 def test_a_card_tells_the_command_that_makes_the_model_again(tmp_path: Path) -> None:
