@@ -52,7 +52,7 @@ def test_the_graphs_give_the_weights_of_the_animation(actor: Actor, exported: Ex
         found = session.run(None, {session.get_inputs()[0].name: inputs.numpy()})[0]
         assert found.shape == (FRAMES, regions, 4)
         torch.testing.assert_close(torch.from_numpy(found).flatten(1), values, atol=1e-3, rtol=0)
-    assert float(values[0].abs().max()) == 0
+    assert float(values[0].abs().max()) < 1e-4
     assert float(values[-1].max()) > 0.2
 
 

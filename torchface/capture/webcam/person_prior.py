@@ -15,6 +15,7 @@ from torchface.errors import ShapeError
 _CONTOUR, _BROWS, _INNER = 4.0, 2.5, 1.5
 _BROW_END = 27
 _DEPTH = 0.4  # what a webcam sees of a displacement along its line of sight, beside one across
+_GRADE = 1e-3  # how much more the first coordinate varies than the last, so that no two eigenvalues are the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +51,14 @@ class PersonPrior:
         rows = modes.double().flatten(1)
         deviation = torch.full((LANDMARKS,), _INNER, dtype=torch.float64)
         deviation[:JAW], deviation[JAW:_BROW_END] = _CONTOUR, _BROWS
-        covariance = rows.T @ rows + deviation.square().repeat_interleave(3).diag()
+        variance = deviation.square().repeat_interleave(3)
+        covariance = rows.T @ rows + (variance * torch.linspace(1 + _GRADE, 1, len(variance)).double()).diag()
         seen = torch.tensor([1.0, 1.0, _DEPTH], dtype=torch.float64).repeat(LANDMARKS)
         values, vectors = torch.linalg.eigh(seen[:, None] * covariance * seen)
         values, vectors = values.flip(0)[:count], vectors.flip(1)[:, :count]
+        # LAPACK's builds differ in a vector's sign and in vectors of one eigenvalue; a kept state means the same person
+        # everywhere.
+        vectors = vectors * vectors.gather(0, vectors.abs().argmax(0, keepdim=True)).sign()
         basis = vectors * values.sqrt() / seen[:, None]
         left = (covariance.diagonal() - basis.square().sum(1)).clamp(min=0)
         return PersonPrior(basis.unflatten(0, (LANDMARKS, 3)), left.unflatten(0, (LANDMARKS, 3))[:, :2].mean(1))
