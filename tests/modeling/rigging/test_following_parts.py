@@ -98,7 +98,7 @@ def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
         wanted, radius = eyes(template, parts, true)
         found, found_radius = eyes(template, parts, placed)
         assert float((found - wanted).norm(dim=-1).max()) < 1.5
-        assert float((found_radius / radius - 1).abs().max()) < 0.05
+        assert float((found_radius / radius - 1).abs().max()) < 0.06
         skin = parts.label == parts.body
         assert float((placed.vertices - true.vertices)[skin].norm(dim=-1).max()) < 0.5
         _, template_radius = eyes(template, parts, template.neutral)

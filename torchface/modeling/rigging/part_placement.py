@@ -18,10 +18,12 @@ from torchface.rig import BlendshapeRig
 
 _THIN, _THICKER, _MIN_VERTICES = 0.05, 4.0, 20
 _MAX_ITERATIONS = 8
-_MAX_TOTAL_WEIGHT = 60.0
-_TRANSLATION_DEVIATION, _SCALE_DEVIATION = 2.0, 0.03
+_MAX_TOTAL_WEIGHT = 20.0  # of a registered skin, whose errors are neighbours' too
+# How far people's eyeballs are from where the skin around carries a template's: across, up and to the front.
+_TRANSLATION_DEVIATION = (0.5, 0.8, 1.0)
+_SCALE_DEVIATION = 0.03
 _FACING = 0.6
-_OUTLIER, _MAX_SCALE_CHANGE = 2.0, 0.1
+_OUTLIER = 2.0
 _HOSTS = 8
 _MAX_RISE, _MAX_DROP = 1.0, 0.2
 _NOTHING = 1e-3
@@ -30,12 +32,14 @@ _NOTHING = 1e-3
 def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Mesh:
     r"""A head at rest with the template's parts fitted into it, whatever places they had.
 
-    Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: that of
-    the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that give the skin before each
-    vertex p the thickness :math:`t_p` it has in the template, measured from the group's middle outward,
+    Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: the
+    head's, laid on the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that give the
+    skin before each vertex p the thickness :math:`t_p` it has in the template, measured from the group's middle outward,
 
     .. math:: \min_{\tau,\sigma} \sum_p w_p (t'_p(\tau,\sigma) - t_p)^2
-        + \lambda_\tau |\tau|^2 + \lambda_\sigma \sigma^2.
+        + \tau^T \Lambda \tau + \lambda_\sigma \sigma^2
+
+    with the deviations that people show: lids that a registration has a millimetre off would else turn eyes inward.
 
     Shells and lashes follow the nearest skin; shells keep the height over the eyeball that they have in the template.
     What is left of parts before the skin is cleared as in ``clear_parts``.
@@ -109,13 +113,11 @@ def _fitted(laid: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Si
     around = parts.skin[wanted.triangle[use]].unique()
     if len(around) < _MIN_VERTICES:
         around = parts.skin.unique()
-    # Lids alone hardly determine a head's rotation and an eyeball's size: the rotation is the whole head's.
-    local = similarity_transform(laid[None, around], found[None, around])
-    size = float(local.scale[0].clamp(1 - _MAX_SCALE_CHANGE, 1 + _MAX_SCALE_CHANGE))
-    centre = found[around].mean(0) + size * (middle - laid[around].mean(0))
-    offsets = size * (laid[bones[use]] - middle)
+    # Lids tell little of an eyeball's size and nothing of its rotation: both are the whole head's.
+    centre = middle + (found - laid)[around].mean(0)
+    offsets = laid[bones[use]] - middle
     state = torch.zeros(4, dtype=torch.float64)
-    prior = torch.tensor([1 / _TRANSLATION_DEVIATION**2] * 3 + [1 / _SCALE_DEVIATION**2], dtype=torch.float64)
+    prior = 1 / torch.tensor([*_TRANSLATION_DEVIATION, _SCALE_DEVIATION], dtype=torch.float64).square()
     for _ in range(_MAX_ITERATIONS if bool(use.any()) else 0):
         now = centre + state[:3] + (1 + state[3]) * offsets
         have = _SkinBefore.of(found, parts.skin, centre + state[:3], now)
@@ -125,7 +127,7 @@ def _fitted(laid: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Si
         rows = torch.cat([have.across, offsets.norm(dim=-1)[:, None]], dim=1)
         system = rows.T @ (weight[:, None] * rows) + prior.diag()
         state = state + torch.linalg.solve(system, rows.T @ (weight * error) - prior * state)
-    scale = torch.tensor([size * (1 + float(state[3]))], dtype=torch.float64)
+    scale = 1 + state[3:]
     rotation = torch.eye(3, dtype=torch.float64)[None]
     return Similarity(scale, rotation, (centre + state[:3] - scale * middle)[None])
 
