@@ -34,7 +34,7 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
 
     Hard parts of a group move together by a similarity, so that eyeballs stay round and teeth keep their form: the
     head's, laid on the skin around them, then the translation :math:`\tau` and the growth :math:`\sigma` that give the
-    skin before each vertex p the thickness :math:`t_p` it has in the template, measured from the group's middle outward,
+    skin before each vertex p the thickness :math:`t_p` that it has in the template, from the group's middle outward,
 
     .. math:: \min_{\tau,\sigma} \sum_p w_p (t'_p(\tau,\sigma) - t_p)^2
         + \tau^T \Lambda \tau + \lambda_\sigma \sigma^2
