@@ -13,6 +13,7 @@ from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.content_keys import content_key
 from torchface.geometry.generalised_procrustes import aligned, generalised_procrustes
+from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.sample_batches import MovedSamples, SampleRange, Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import MeshSequence, MeshSequenceWriter
@@ -24,7 +25,9 @@ from torchface.synthetic.head.complexion import complexion_colors, draw_complexi
 from torchface.workflows.batch.batch_items import find_items
 from torchface.workflows.register.register_scans import SCANS
 
-_METHOD = "gathered heads/2"
+_METHOD = "gathered heads/3"
+_LEAST_EXTENT, _MOST_EXTENT = 0.4, 2.5  # of a head beside the template, of one topology
+_FACE, _LEAST_FACE, _MOST_FACE = 250.0, 0.4, 4.0  # millimetres across, and how much less or more a template shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +67,20 @@ def performers(count: int, seed: int) -> Source:
     return Source([f"performer {i}" for i in range(count)], read, content_key(_METHOD, performers=count, seed=seed))
 
 
-def registered(folder: Path) -> Source:
-    """The meshes of a folder, by name."""
+def registered(folder: Path, unit: str | None = None) -> Source:
+    """The meshes of a folder, by name; ``unit`` as ``load_mesh`` takes it."""
     if not folder.is_dir():
-        raise FileFormatError(f"{folder}: found no such folder, expected one of registered meshes")
+        found = "a file" if folder.exists() else "no such folder"
+        raise FileFormatError(f"{folder}: found {found}, expected a folder of registered meshes")
+    if (folder / "vertex_indices.json").is_file():
+        raise FileFormatError(
+            f"{folder}: found ICT-FaceKit's FaceXModel, whose meshes are in centimetres and show expressions too; "
+            f"expected registered heads at rest (take it by --ict {folder})"
+        )
     paths = [item.path for item in find_items([folder], SCANS).items]
     files = {file.name: file for path in paths for file in (path, *named_files(path))}
-    key = content_key(_METHOD, names=[path.name for path in paths], files=files)
-    return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number])), key)
+    key = content_key(_METHOD, names=[path.name for path in paths], files=files, unit=unit)
+    return Source([path.name for path in paths], lambda number: vertex_colored(load_mesh(paths[number], unit)), key)
 
 
 def gather(source: Source, held_out: int, work: Path, template: Mesh | None, progress: Progress) -> Gathered:
@@ -86,9 +95,13 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
 
     Raises:
         TopologyError: a mesh has another topology than the template.
+        ValueRangeError: a mesh is in another unit than the template, or the template than millimetres.
     """
     first = source.read(0)
+    name = source.names[0] if template is None else "template"
     template = upright(first) if template is None else template
+    check_unit(name, template.vertices[template.faces.flatten()], _FACE, "a face", _LEAST_FACE, _MOST_FACE)
+    size_of_template = extent(template.vertices[template.faces.flatten()])
     colored, size = first.colors is not None, len(template.vertices)
     files = (work / "shapes.safetensors", work / "colors.safetensors")
     count = len(source.names)
@@ -104,6 +117,8 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
                     f"{source.names[number]}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, "
                     f"expected the template's topology, {size} vertices and {len(template.faces)} triangles"
                 )
+            used = mesh.vertices[mesh.faces.flatten()]
+            check_unit(source.names[number], used, size_of_template, "a template", _LEAST_EXTENT, _MOST_EXTENT)
             if colored and mesh.colors is None:
                 progress(f"{source.names[number]} has no colours: the model will have none")
                 colored = False
@@ -169,5 +184,4 @@ def vertex_colored(mesh: Mesh) -> Mesh:
 
 
 def _joined(poses: list[Similarity]) -> Similarity:
-
     return Similarity(*(torch.cat([getattr(p, name) for p in poses]) for name in ("scale", "rotation", "translation")))

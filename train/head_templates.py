@@ -30,8 +30,8 @@ def ict_head_model(folder: Path, part: str | None = None, components: int | None
     return model if part is None else model.part(region(rig.neutral, part))
 
 
-def load_template(path: Path, part: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
-    """The neutral of a rig, and the rig; or a mesh alone."""
+def load_template(path: Path, part: str | None = None, unit: str | None = None) -> tuple[Mesh, BlendshapeRig | None]:
+    """The neutral of a rig, and the rig; or a mesh alone, in ``unit``."""
     if path.is_dir() or path.suffix.lower() in SCENE_ENDINGS:
         try:
             rig = load_rig(path, part=part)
@@ -41,5 +41,5 @@ def load_template(path: Path, part: str | None = None) -> tuple[Mesh, Blendshape
         else:
             neutral = vertex_colored(rig.neutral)
             return neutral, BlendshapeRig(neutral, rig.deltas, rig.names)
-    mesh = load_mesh(path)
+    mesh = load_mesh(path, unit)
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None

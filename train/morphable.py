@@ -45,6 +45,7 @@ class Settings(RecipeSettings):
             the model, so that `torchface fit` needs no other. The first mesh where absent, set upright by its landmarks
             if it has any.
         part: The region of template or `FaceXModel` that the heads have, such as face.
+        unit: Of the scans' files (mm, cm, m) where it is not the format's own; of the template's if it is no rig.
         held_out: How many meshes, the last by name, are kept for the test; or how many more performers are drawn for
             it. If absent 20 performers, a tenth of 100 meshes and more; of fewer meshes each is left out once.
         components: How many components of shape; all if absent, at most 200.
@@ -62,6 +63,7 @@ class Settings(RecipeSettings):
     out: Path = Path("models/head")
     template: Path | None = None
     part: str | None = None
+    unit: str | None = None
     held_out: int | None = None
     components: int | None = None
     color_components: int | None = None
@@ -95,7 +97,9 @@ def train(settings: Settings, run: Run) -> Trained:
     if settings.ict is not None:
         return _ict(settings, settings.ict, progress)
     source, held_out = _source(settings)
-    template, rig = (None, None) if settings.template is None else load_template(settings.template, settings.part)
+    template, rig = (
+        (None, None) if settings.template is None else load_template(settings.template, settings.part, settings.unit)
+    )
     work = run.work
     gathered = gather(source, held_out, work, template, progress)
     count = len(gathered.shapes) - gathered.held_out
@@ -179,7 +183,7 @@ def _source(settings: Settings) -> tuple[Source, int]:
         held_out = _TESTED_PERFORMERS if settings.held_out is None else settings.held_out
         source = performers(settings.performers + held_out, settings.seed)
     else:
-        source = registered(settings.scans)
+        source = registered(settings.scans, settings.unit)
         few = len(source.names) < _MANY
         held_out = (0 if few else len(source.names) // 10) if settings.held_out is None else settings.held_out
     count = len(source.names) - held_out

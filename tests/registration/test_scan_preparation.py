@@ -46,9 +46,9 @@ def test_nan_never_gets_into_a_scan(mask: Mesh) -> None:
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
-        (1e-3, r"in metres \(load it with unit='m'; on the command line --unit m\)"),
+        (1e-3, r"in metres \(load with unit='m'; on the command line --unit m\)"),
         (0.1, "in centimetres .*unit='cm'"),
-        (1e3, "in micrometres"),
+        (1e3, "read as metres"),
     ],
 )
 def test_another_unit_is_detected_and_said(mask: Mesh, factor: float, said: str) -> None:

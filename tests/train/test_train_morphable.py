@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from torchface.synthetic.head.complexion import complexion_colors, draw_complexi
 from torchface.viz.figures import model_figures as model_pictures
 from torchface.workflows.fit.fit_model import load_head_model, matching
 from train import morphable as recipe
-from train.head_samples import registered, upright, vertex_colored
+from train.head_samples import Source, registered, upright, vertex_colored
 from train.morphable import Settings, Trained, train
 
 
@@ -133,8 +132,8 @@ def test_a_killed_run_goes_on_where_it_was(
 ) -> None:
     settings, read = Settings(scans=folder, out=tmp_path / "people", held_out=2), []
 
-    def counted(path: Path) -> Callable[[int], Mesh]:
-        source = registered(path)
+    def counted(path: Path, unit: str | None) -> Source:
+        source = registered(path, unit)
 
         def one(number: int) -> Mesh:
             read.append(number)
@@ -244,3 +243,26 @@ def test_a_model_of_registered_faces_carries_the_templates_rig(
     model, rig = matching(load_head_model(tmp_path / "people"))
     assert len(rig.vertices) == len(model.shape.mean) == 9409
     assert len(rig.names) == 53
+
+
+def test_meshes_in_centimetres_are_refused_and_read_with_their_unit(heads: list[Mesh], tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for number, mesh in enumerate(heads[:3]):
+        save_mesh(mesh.with_vertices(mesh.vertices / 10), folder / f"{number}.obj")
+    settings = Settings(scans=folder, out=tmp_path / "people", pictures=tmp_path)
+    with pytest.raises(ValueRangeError, match=r"0\.obj: found an extent of .* in centimetres .*--unit cm"):
+        train(settings)
+    save_mesh(heads[0], tmp_path / "template.glb")
+    with pytest.raises(ValueRangeError, match=r"0\.obj: found .* beside a template .* in centimetres"):
+        train(replace(settings, template=tmp_path / "template.glb"))
+    model = train(replace(settings, unit="cm")).model
+    assert float((model.shape.mean - heads[0].vertices).norm(dim=1).mean()) < 10
+
+
+def test_ict_among_scans_and_a_file_are_told(heads: list[Mesh], tmp_path: Path) -> None:
+    (tmp_path / "vertex_indices.json").write_text("{}")
+    with pytest.raises(TorchfaceError, match=r"found ICT-FaceKit's FaceXModel, .*take it by --ict"):
+        registered(tmp_path)
+    with pytest.raises(TorchfaceError, match="found a file, expected a folder of registered meshes"):
+        registered(tmp_path / "vertex_indices.json")

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components, triangle_areas, triangle_cross
 from torchface.geometry.meshes.proximity import SurfaceIndex
+from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
@@ -19,7 +20,7 @@ _CRUMB = 0.02
 _OFF_SURFACE = 15.0
 _WORST_LANDMARK_FIT = 0.1
 _LINE = 0.02
-_UNITS = {"metres": ("m", 1e-3), "centimetres": ("cm", 0.1), "inches": ("", 1 / 25.4), "micrometres": ("", 1e3)}
+_LEAST_EXTENT, _MOST_EXTENT = 0.17, 9.0  # of a template's: a scan may show less than the face or the whole person
 
 Landmarks = tuple[Tensor, Tensor]
 """Template vertex ids (L,) int64, and where they lie on the scan, (L,3) millimetres; a NaN row is missing."""
@@ -78,7 +79,10 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
         raise ValueRangeError(
             f"scan: found {int(solid.sum())} triangles with any area, expected at least {_LEAST_TRIANGLES}"
         )
-    _check_unit(vertices[faces[solid].flatten()], template)
+    points = vertices[faces[solid].flatten()]
+    check_unit(
+        "scan", points, extent(template.vertices[template.faces.flatten()]), "a template", _LEAST_EXTENT, _MOST_EXTENT
+    )
     label = components(faces, len(vertices))[faces[:, 0]]
     area_of = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, areas)
     large = area_of >= _CRUMB * area_of.max()
@@ -93,26 +97,6 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
     used, faces = faces[face_ids].unique(return_inverse=True)
     prepared = PreparedScan(vertices[used], faces, face_ids, tuple(notes))
     return prepared.turned() if _inside_out(prepared) else prepared
-
-
-def _check_unit(points: Tensor, template: Mesh) -> None:
-    """A scan may show less than the face or the whole person; units differ by more than that."""
-    used = template.vertices[template.faces.flatten()].double()
-    sizes = [float((x.amax(0) - x.amin(0)).norm()) for x in (used, points)]
-    ratio = sizes[1] / sizes[0]
-    if 0.17 <= ratio <= 9:
-        return
-    close = [(name, code) for name, (code, size) in _UNITS.items() if 0.3 < ratio / size < 6]
-    looks = f"; it looks as if the scan were in {close[0][0]}" if close else ""
-    mend = (
-        f" (load it with unit={close[0][1]!r}; on the command line --unit {close[0][1]})"
-        if close and close[0][1]
-        else ""
-    )
-    raise ValueRangeError(
-        f"scan: found an extent of {sizes[1]:.4g} mm beside a template of {sizes[0]:.4g} mm{looks}{mend}; "
-        "expected both in millimetres"
-    )
 
 
 def _inside_out(scan: PreparedScan) -> bool:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices, triangle_areas, vertex_normals
+from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.registration.scan_preparation import check_same_hand
@@ -24,6 +25,7 @@ _REACH = 40.0  # millimetres; no partner is sought beyond
 _NEAR = 3.0  # millimetres; what an expression's scan and its shape differ by at most places
 _MIN_NEAR = 0.6  # share of the samples with a place on the scan that must come to lie near it
 _MIN_OVERLAP = 0.1
+_LEAST_EXTENT, _MOST_EXTENT = 0.12, 12.0  # of a scan beside the mesh: faces differ by a factor of some, units by ten
 _SEED = 0
 
 
@@ -70,7 +72,14 @@ def align_scan(
         >>> laid.similarity.translation.round().tolist()
         [[-30.0, -30.0, -30.0]]
     """
-    _check_extent(mesh, scan)
+    check_unit(
+        "scan",
+        scan.vertices[scan.faces.flatten()],
+        extent(mesh.vertices[mesh.faces.flatten()]),
+        "a mesh",
+        _LEAST_EXTENT,
+        _MOST_EXTENT,
+    )
     target = _Target.of(scan)
     if correspondences is not None:
         picked = _picked(mesh, correspondences)
@@ -78,25 +87,6 @@ def align_scan(
         initial = similarity_transform(picked[0][None], picked[1][None], scale=scale)
         return _result(_iterate(_samples(mesh, _SAMPLES), target, _Pose.of(initial), 40, scale))
     return _automatic(mesh, target, scale)
-
-
-def _check_extent(mesh: Mesh, scan: Mesh) -> None:
-    """Faces differ by a factor of some, units by ten or more."""
-    sizes = [_extent(mesh), _extent(scan)]
-    ratio = sizes[1] / max(sizes[0], 1e-30)
-    if not 0.12 <= ratio <= 12:
-        units = {"metres": 1e-3, "centimetres": 0.1, "inches": 1 / 25.4, "micrometres": 1e3}
-        close = [name for name, size in units.items() if 0.4 < ratio / size < 2.5]
-        hint = f"; it looks as if the scan were in {close[0]}" if close else ""
-        raise ValueRangeError(
-            f"scan: found an extent of {sizes[1]:.4g} mm beside a mesh of {sizes[0]:.4g} mm{hint}; "
-            "expected both in millimetres"
-        )
-
-
-def _extent(mesh: Mesh) -> float:
-    used = mesh.vertices[mesh.faces.flatten().unique()]
-    return float((used.amax(0) - used.amin(0)).double().norm())
 
 
 def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,51 @@
+"""Whether two meshes of people can be in one unit: heads differ by less than units do."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from torchface.errors import ValueRangeError
+
+# What a length in millimetres becomes where a file's unit was not the one that it was read with, and the cure.
+_LOAD = "load with unit={0!r}; on the command line --unit {0}"
+_UNITS = {
+    1e-3: ("in metres", _LOAD.format("m")),
+    0.1: ("in centimetres", _LOAD.format("cm")),
+    1 / 25.4: ("in inches", "scale them by 25.4"),
+    10.0: ("in millimetres and were read as centimetres", "leave the unit out"),
+    1e3: ("in millimetres and were read as metres", "leave the unit out, or say --unit mm"),
+}
+_NEAR = 6.0  # a scan may show less than the other mesh, or more
+
+
+def extent(points: Tensor) -> float:
+    """The diagonal of the box around points (n,3), such as those that a mesh's triangles use; millimetres."""
+    return float((points.amax(0) - points.amin(0)).double().norm())
+
+
+def check_unit(name: str, points: Tensor, beside: float, what: str, least: float, most: float) -> None:
+    """Refuses points whose extent tells another unit than millimetres.
+
+    Args:
+        name: of the points, for the message.
+        points: (n,3), millimetres.
+        beside: the extent to be expected, millimetres; see :func:`extent`.
+        what: has that extent, such as ``"a template"``.
+        least, most: the ratios of the extents that are taken.
+
+    Raises:
+        ValueRangeError: the extent is out of these.
+    """
+    size = extent(points)
+    ratio = size / max(beside, 1e-30)
+    if least <= ratio <= most:
+        return
+    nearest = min(_UNITS, key=lambda unit: abs(math.log(max(ratio, 1e-30) / unit)))
+    near = 1 / _NEAR < ratio / nearest < _NEAR
+    looks = "; it looks as if the lengths were {} ({})".format(*_UNITS[nearest]) if near else ""
+    raise ValueRangeError(
+        f"{name}: found an extent of {size:.4g} mm beside {what} of {beside:.4g} mm{looks}; "
+        "expected both in millimetres"
+    )
