@@ -34,7 +34,8 @@ def live(
     '.[viewer]' in a checkout; --no-page does without.
 
     Args:
-        camera: A camera's number, from 0, or a video file that is played in its own time.
+        camera: A camera's number, from 0, or a video file that is played in its own time, of which --record
+            misses no frame.
         character: A .glb or USD file with shapes by ARKit's names, or a folder of OBJ files; the embedded performer if
             absent.
         mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.

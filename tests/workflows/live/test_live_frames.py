@@ -183,6 +183,17 @@ def test_frames_that_come_while_another_is_solved_are_dropped(tmp_path: Path, cl
     assert times == pytest.approx([100.0, 100.06, 100.12])  # each given at most one frame late
 
 
+def test_a_video_that_is_recorded_loses_no_frame(tmp_path: Path, clock: Clock) -> None:
+    write_video([torch.zeros(10, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 50.0)
+    played = open_source(str(tmp_path / "film.avi"), print, every=True)
+    times = []
+    for came, _ in played.frames():
+        times.append(came)
+        clock.sleep(0.07)
+    assert played.dropped == 0
+    assert times == pytest.approx([100 + number / 50 for number in range(10)])  # the film's own
+
+
 def test_planes_are_the_picture() -> None:
     picture = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
     assert torch.equal(planes(picture), torch.from_numpy(picture).permute(2, 0, 1))

@@ -40,18 +40,20 @@ class FrameSource(Protocol):
 
 
 class PlayedVideo:
-    """A video file whose frames come at its own rate, as a camera's would; those that come too late are dropped.
+    """A video file whose frames come at its own rate, as a camera's would.
 
     Args:
         path: of the file; its frame rate may vary.
+        every: give each frame, however late, as for a recording; else those that come too late are dropped.
 
     Raises:
         FileFormatError: it cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, every: bool = False) -> None:
         self.video = replace(open_video(path), even=False)
         self.dropped = 0
+        self._every = every
         self._times, _ = self.video.uneven_seconds()
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
@@ -63,7 +65,7 @@ class PlayedVideo:
             early = due - time.perf_counter()
             if early > 0:
                 time.sleep(early)
-            elif -early > 1 / self.video.fps:  # a camera would have shown the next one by now
+            elif -early > 1 / self.video.fps and not self._every:  # a camera would have shown the next one by now
                 self.dropped += 1
                 continue
             yield due, cv2.merge(list(frame.numpy()))
@@ -77,20 +79,21 @@ class PlayedVideo:
         """A file needs no closing."""
 
 
-def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE) -> FrameSource:
+def open_source(camera: str, say: Say, size: tuple[int, int] = DEFAULT_SIZE, every: bool = False) -> FrameSource:
     """A camera by its number, or a video file by its path.
 
     Args:
         camera: ``"0"``, ``"1"``, ... or a path.
         say: told what happens to the camera on the way.
         size: width and height to ask a camera for.
+        every: give every frame of a video, however late.
 
     Raises:
         FileFormatError: there is no such camera, it gives no frame, or the file is no video.
     """
     if re.fullmatch("[0-9]{1,3}", camera):
         return Camera(int(camera), say, size)
-    return PlayedVideo(Path(camera))
+    return PlayedVideo(Path(camera), every)
 
 
 def planes(picture: np.ndarray) -> torch.Tensor:

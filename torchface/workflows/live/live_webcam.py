@@ -33,7 +33,8 @@ class LiveSettings:
     """What a live session is made of.
 
     Args:
-        camera: a device's number, or a video file, which is played at its own rate.
+        camera: a device's number, or a video file, which is played at its own rate; every frame of it is solved where
+            ``record`` names a folder.
         character: a rig by ARKit's names; the embedded performer if absent.
         mapping: a table for shapes of other names.
         addresses: see :func:`torchface.io.weights.weight_senders.open_sender`.
@@ -102,7 +103,8 @@ def go_live(
         progress("loading the solver")
         solver = make_solver(progress)
         progress("opening the camera")
-        source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size)))
+        every = settings.record is not None  # a film that is recorded loses no frame
+        source = stack.enter_context(closing(open_source(settings.camera, notes, settings.size, every)))
         streams = stack.enter_context(WeightStreams(settings.addresses, ARKIT, source.video.fps, notes))
         place = settings.record or RECORDINGS
         recordings = Recordings(place, character, source.video.path.name, source.video.fps)
