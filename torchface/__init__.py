@@ -3,8 +3,13 @@
 Names load on first use, so that ``import torchface`` is quick and a command needs only what it touches.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# Threads of small matrix products that spin while they wait cost a busy machine ten times the work itself. Torch reads
+# it once: a program that imports torch first sets it for itself.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-
-# Threads of small matrix products that spin while they wait cost a busy machine ten times the work itself. Set before
-# anything imports torch, which reads it once.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import tyro
 from rich.table import Table
