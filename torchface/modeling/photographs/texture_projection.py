@@ -20,7 +20,7 @@ from torchface.rendering.raycast import RayCaster
 
 _SQUARELY = 0.2
 _MIN_CONFIDENCE = 0.5
-_SHARP = 3.0
+_SHARP, _SLANT, _FADE = 3.0, 0.05, 0.5
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _TYPICAL, _SPARSE = 0.15, 0.05
 _HEAT_LOSS, _HEAT_LOSS_AT_MASK = 0.004, 0.01  # a ring of vertices, relative
@@ -106,18 +106,21 @@ def photo_texture(
     confidences = (
         torch.ones(len(images), len(vertices), dtype=torch.float64) if confidence is None else confidence.cpu().double()
     )
-    weights = torch.stack([
-        _squareness(shown) * _inside((shown.cosine > _SQUARELY) & (one >= _MIN_CONFIDENCE) & ~outside, graph)
+    squareness = torch.stack([_squareness(shown) for shown in at_vertices])
+    inside = torch.stack([
+        _inside((shown.cosine > _SQUARELY) & (one >= _MIN_CONFIDENCE) & ~outside, graph)
         for shown, one in zip(at_vertices, confidences, strict=True)
     ])  # fmt: skip
+    weights = squareness * inside
     soft = torch.stack([_feathered((one >= _MIN_CONFIDENCE).double(), graph) for one in confidences]).amax(0)
-    seen = weights.sum(0)
-    if float(seen.max()) <= 0:
+    if float(weights.max()) <= 0:
         raise AlignmentError("images: found no vertex of the head in any of them, expected cameras that see it")
     gains = _gains(at_vertices, weights)
     toned = [shown.colors.double() * gain for shown, gain in zip(at_vertices, gains, strict=True)]
     blended, offsets = _blended(toned, weights, graph)
-    alpha = (seen / 0.05).clamp(max=1) * soft
+    # A photograph that sees skin at a slant counts in full where it is the only one; where it ends it fades.
+    fade = ((inside / _FADE).clamp(max=1) * (squareness / _SLANT).clamp(max=1)).amax(0) * soft
+    alpha = fade**2 * (3 - 2 * fade)
     filled = _filled(mesh, blended, alpha, base, graph, confidence is not None)
     colors = torch.lerp(filled, blended, alpha[:, None])
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), size, size)
@@ -132,7 +135,7 @@ def photo_texture(
         values += weight * (shown.colors.double() * gains[i] + tone)
         total += weight
     under = texels.interpolate(filled, faces)
-    share = (total / 0.05).clamp(max=1) * texels.interpolate(soft[:, None], faces)
+    share = texels.interpolate(alpha[:, None], faces) * (total > 0)
     values = torch.lerp(under, values / total.clamp(min=1e-9), share).clamp(0, 1)
     return PhotoTexture(laid_out(values, texels), colors.clamp(0, 1).float(), alpha.float())
 
