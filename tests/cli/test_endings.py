@@ -167,7 +167,8 @@ def test_numbers_that_make_no_sense_are_refused(
         "demo": (),
         "pick": (stage / "rig.glb", "--out", tmp_path / "out.json"),
     }.get(words[0], (stage / "rig.glb",))
-    out = () if words[0] in ("view", "pick") else ("--out", tmp_path / ("out" if words[0] == "demo" else "out.png"))
+    file = {"demo": "out", "solve": "out.csv"}.get(words[0], "out.png")
+    out = () if words[0] in ("view", "pick") else ("--out", tmp_path / file)
     with pytest.raises(SystemExit) as ended:
         main([str(word) for word in (words[0], *given, *words[1:], *out)])
     assert ended.value.code == 2

@@ -17,6 +17,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
+from torchface.workflows.weight_files import weight_faults
 
 DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
 OWN = ("ctrl_a", "ctrl_b", "ctrl_c", "ctrl_d")
@@ -138,3 +139,53 @@ def test_a_solved_take_is_saved_as_its_weights(stage: Path, dome_rig: Blendshape
     solved = MarkerSolver(rig, place_markers(dome_rig, 30)).solve_take(load_take(stage / "take.c3d"))
     save_take(solved, stage / "solved.csv")
     assert torch.equal(values(stage / "solved.csv"), solved.weights.values)  # type: ignore[union-attr]
+
+
+def test_what_is_wrong_with_weights_is_told_by_shape_and_frame() -> None:
+    values = torch.full((6, 3, 1), 0.5)
+    track = Track(("jawOpen", "mouthPucker", "eyeBlinkLeft"), values)
+    assert weight_faults(track) == []
+    values[4, 1], values[5, 2], values[2, 0] = torch.nan, torch.nan, 7.5
+    assert weight_faults(track) == [
+        "2 weights are missing, of mouthPucker, eyeBlinkLeft; the first is mouthPucker in frame 4",
+        "1 weights are below 0 or above 1, of jawOpen; the first is jawOpen in frame 2, 7.5",
+    ]
+
+
+def test_missing_weights_are_told_by_every_command(
+    stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said() -> str:
+        found = capsys.readouterr()
+        return " ".join((found.out + found.err).replace("│", "").split())
+
+    values = torch.zeros(5, 2, 1)
+    values[3, 1], values[1, 0] = torch.nan, 1.5
+    file = tmp_path / "gaps.csv"
+    save_weights_csv(Take(30.0, weights=Track(("jawOpen", "tongueOut"), values)), file)
+    assert main(["info", str(file)]) in (0, None)
+    told = "1 weights are missing, of tongueOut; the first is tongueOut in frame 3"
+    assert told in said()
+    words = ["retarget", str(file), "--to", str(stage / "arkit.glb"), "--out", str(tmp_path / "out.csv"), "-q"]
+    assert main(words) in (0, None)
+    shown = said()
+    assert told in shown
+    assert "1 weights are below 0 or above 1, of jawOpen" in shown
+    (tmp_path / "out.csv").unlink()
+    with pytest.raises(SystemExit):
+        main([*words, "--animation", str(tmp_path / "a.glb")])
+    assert told in said()
+    assert not (tmp_path / "out.csv").exists()
+    with pytest.raises(SystemExit):
+        main(["demo", "--take", str(file), "--out", str(tmp_path / "demo")])
+    assert told in said()
+
+
+def test_weights_go_to_a_csv_only(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([
+            "solve", str(stage / "arkit.glb"), str(stage / "take.c3d"), "--attachment", str(stage / "attachment.json"),
+            "--out", str(tmp_path / "weights.xlsx"),
+        ])  # fmt: skip
+    assert "weights.xlsx: found the ending '.xlsx', expected .csv" in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())

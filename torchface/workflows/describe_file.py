@@ -19,6 +19,7 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
+from torchface.workflows.weight_files import weight_faults
 
 Rows = list[tuple[str, str]]
 
@@ -138,6 +139,8 @@ def _take_rows(take: Take) -> Rows:
             (kind, f"{len(track.names)}: {', '.join(track.names)}"),
             (f"{kind} seen", f"{100 * float(seen.mean()):.2f} %, {int((seen.sum(1) == 0).sum())} frames without any"),
         ]
+    if take.weights is not None:
+        rows += [("warning", fault) for fault in weight_faults(take.weights)]
     if take.extras:
         rows.append(("kept besides", ", ".join(map(str, take.extras))))
     return rows

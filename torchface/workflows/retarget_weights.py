@@ -7,6 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from torchface.capture.mouth_close import (
     CLOSE,
     JAW,
@@ -20,9 +22,9 @@ from torchface.files.whole_files import make_folder
 from torchface.io import load_rig, load_take, save_animation
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import arkit_sources
+from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Take, Track
-from torchface.workflows.weight_files import WeightFiles, check_live_link, write_weights
+from torchface.workflows.weight_files import WeightFiles, check_live_link, weight_faults, write_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +64,21 @@ def retarget_weights(
     played = load_take(weights)
     if played.weights is None:
         raise ValueRangeError(f"{weights}: found no weights, expected a CSV of them")
+    faults = [f"{weights}: {fault}" for fault in weight_faults(played.weights)]
+    if files.animation is not None and not bool(torch.isfinite(played.weights.values).all()):
+        raise ValueRangeError(
+            f"{faults[0]}; expected numbers for an animation (leave out --animation, or fill them in)"
+        )
     target = load_rig(to, part=part)
     check_live_link(target.names, files.live_link)
     rig = None
     if source is not None:
         rig = load_rig(source)
+        moving = (played.weights.values[..., 0].nan_to_num() > 0).any(0)
+        known = mapping(played.weights.names, rig.names).any(0)
+        lost = [played.weights.names[row] for row in (moving & ~known).nonzero()[:, 0].tolist()]
+        if lost:
+            faults.append(f"{source} has no shape for {', '.join(lost)}, which move in {weights}")
         # By the rig's own spelling, which is what a table names.
         played = replace(played, weights=Track(rig.names, rig.weights_from(played.weights)[..., None]))
     assert played.weights is not None
@@ -77,7 +89,7 @@ def retarget_weights(
         raise NameMismatchError(f"{table or weights}: {error}") from error
     moved, told = _mouth_closed(retarget_take(played, shapes), rig, target, rules or {})
     progress("writing")
-    written = [*told, *write_weights(moved, files.out, files.live_link)]
+    written = [*faults, *told, *write_weights(moved, files.out, files.live_link)]
     if files.animation is not None:
         make_folder(files.animation.parent)
         save_animation(target, moved, files.animation)

@@ -6,15 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchface.errors import NameMismatchError
+import torch
+
+from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, mapping
-from torchface.take import Take
+from torchface.take import Take, Track
 
 _SHOWN = 8
+_ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,34 @@ class WeightFiles:
 
     def check(self, folder: Path | None = None) -> None:
         """Raises where one of them, or a folder beside, cannot be written to or has another ending than it may have."""
+        for csv in (self.out, self.live_link):
+            if csv is not None and csv.suffix.lower() != ".csv":
+                raise FileFormatError(f"{csv}: found the ending {csv.suffix!r}, expected .csv for weights")
         check_writable(self.out, self.live_link, self.animation, folder=folder)
         if self.animation is not None:
             check_animation_ending(self.animation)
+
+
+def weight_faults(weights: Track) -> list[str]:
+    """What is wrong with weights (T,N,1), in lines for people to read: missing ones, and those beyond 0 and 1."""
+    values = weights.values[..., 0]
+    lines = []
+    for what, wrong in (
+        ("missing", ~torch.isfinite(values)),
+        ("below 0 or above 1", (values < -_ROUNDED) | (values > 1 + _ROUNDED)),
+    ):
+        count = int(wrong.sum())
+        if not count:
+            continue
+        frame, channel = wrong.nonzero()[0].tolist()
+        shapes = [weights.names[row] for row in wrong.any(0).nonzero()[:, 0].tolist()]
+        more = f" and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
+        first = "" if what == "missing" else f", {float(values[frame, channel]):g}"
+        lines.append(
+            f"{count} weights are {what}, of {', '.join(shapes[:_SHOWN])}{more}; the first is {weights.names[channel]} "
+            f"in frame {frame}{first}"
+        )
+    return lines
 
 
 def check_live_link(names: Sequence[str], target: Path | str | None) -> None:

@@ -44,6 +44,7 @@ from torchface.synthetic.stages.makeup_layout import MakeupLayout, makeup_layout
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.take import Take
+from torchface.workflows.weight_files import weight_faults
 
 FLAWS = StageFlaws(noise=0.3, missing=0.02, gaps=1.0, gap_seconds=0.4)
 """What a well run stage leaves: 0.3 mm noise, one sample in fifty lost, a short gap a marker and minute."""
@@ -158,6 +159,7 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
         ValueRangeError: a template that has no identity modes needs a target; a take must hold weights.
         TopologyError: the target has other triangles than the template.
     """
+    played = None if take is None else _weight_take(take)
     generator = torch.Generator().manual_seed(seed)
     if template is None:
         scene = embedded_scene(seed)
@@ -181,15 +183,22 @@ def scene_from(template: Path | None, take: Path | None, target: Path | None, se
         performed = perform(1800, generator)
         assert performed.weights is not None
         scene = Scene(title, rig, head, truth, truth.weights_from(performed.weights), performed.fps)
-    if take is None:
+    if played is None:
         return scene
-    played = load_take(take)
+    assert played.weights is not None
+    weights = scene.truth.weights_from(played.weights).float().clamp(0, 1)
+    return Scene(f"{scene.title}, {take and take.name}", scene.template, scene.head, scene.truth, weights, played.fps)
+
+
+def _weight_take(path: Path) -> Take:
+    played = load_take(path)
     if played.weights is None:
         raise ValueRangeError(
-            f"{take}: found no weights, expected a take of blendshape weights such as Live Link Face's"
+            f"{path}: found no weights, expected a take of blendshape weights such as Live Link Face's"
         )
-    weights = scene.truth.weights_from(played.weights).float().clamp(0, 1)
-    return Scene(f"{scene.title}, {take.name}", scene.template, scene.head, scene.truth, weights, played.fps)
+    if not bool(torch.isfinite(played.weights.values).all()):
+        raise ValueRangeError(f"{path}: found that {weight_faults(played.weights)[0]}; expected numbers")
+    return played
 
 
 def run_demo(
