@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import torch
 from torch import Tensor
 
-__all__ = ["ARKIT", "arkit_sources", "mapping", "mirror"]
+__all__ = ["ARKIT", "arkit_sources", "mapping", "mirror", "spelled_as"]
 
 ARKIT: tuple[str, ...] = (
     *("eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft"),
@@ -32,6 +33,29 @@ def _canonical(name: str) -> str:
 
 def _halves(canonical: str) -> tuple[str, str]:
     return canonical + "left", canonical + "right"
+
+
+def spelled_as(name: str, names: Sequence[str]) -> str | None:
+    """How names spell a shape: the name itself if it is one of them, else the one that means the same; None if none.
+
+    Example:
+        >>> spelled_as("EyeBlinkLeft", ["jawOpen", "eyeBlink_L"])
+        'eyeBlink_L'
+    """
+    if name in names:
+        return name
+    return next((other for other in names if _canonical(other) == _canonical(name)), None)
+
+
+def near_names(unknown: Sequence[str], names: Sequence[str], shown: int = 8) -> str:
+    """What to expect in place of unknown names: the near misses among names, else the first of them.
+
+    Example:
+        >>> near_names(["jawOpne"], ["jawOpen", "mouthPucker"])
+        'did you mean jawOpen?'
+    """
+    near = sorted({close for name in unknown for close in get_close_matches(name, names, 2)})
+    return f"did you mean {' or '.join(near)}?" if near else f"{', '.join(names[:shown])}, ..."
 
 
 def mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:

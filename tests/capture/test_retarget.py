@@ -126,3 +126,19 @@ def test_a_real_performance_reaches_every_shape_that_both_rigs_have(ict_folder: 
     assert set(shapes.undriven) == {"cheekRaiser_L", "cheekRaiser_R"} & set(rig.names)
     assert set(shapes.unused) == {"TongueOut"}
     assert torch.allclose(shapes(track.values[..., 0]), rig.weights_from(track).clamp(0, 1))
+
+
+def test_a_table_may_spell_names_in_any_way_and_near_misses_are_told() -> None:
+    source, target = ["MouthSmileLeft", "CheekSquintLeft"], ["mouthSmile_L", "smile_with_squint"]
+    rules = {
+        "mouthSmileLeft": ShapeRule({"mouthSmileLeft": 0.5, "cheekSquint_L": 0.25}),
+        "smile_with_squint": ShapeRule(product=("mouthSmile_L", "CheekSquintLeft")),
+    }
+    found = shape_map(source, target, rules)(torch.tensor([[0.8, 0.5]]))
+    torch.testing.assert_close(found, torch.tensor([[0.525, 0.4]]))
+    with pytest.raises(NameMismatchError, match=r"names cheekSqint, expected .*: did you mean cheekSquintLeft\?"):
+        shape_map(["mouthSmileLeft", "cheekSquintLeft"], target, {"mouthSmile_L": ShapeRule({"cheekSqint": 1.0})})
+    with pytest.raises(NameMismatchError, match="two rules for mouthSmile_L"):
+        shape_map(source, target, {"mouthSmileLeft": ShapeRule(), "MouthSmileLeft": ShapeRule()})
+    with pytest.raises(NameMismatchError, match="names a shape twice"):
+        shape_map(source, target, {"mouthSmile_L": ShapeRule({"mouthSmile_L": 1.0, "mouthSmileLeft": 1.0})})

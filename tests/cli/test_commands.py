@@ -379,3 +379,15 @@ def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
     run("attach", shoot / "rig.glb", shoot / "helmet.c3d", *common, "--insist")
     assert "warning: markers: M006" in " ".join(capsys.readouterr().err.split())
     assert site_distances(dome_rig, Attachment.load(out), true).median() < 0.5
+
+
+@pytest.mark.parametrize(("word", "told"), [("sovle", "did you mean solve?"), ("xyz", "demo, register, rig,")])
+def test_what_is_no_command_is_told_with_what_there_is(
+    word: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([word, "take.c3d"])
+    assert ended.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"found the command '{word}', expected one: {told}" in said
+    assert word != "xyz" or said.count("train") == said.count("zoo") == said.count("export") == 1

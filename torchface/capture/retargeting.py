@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value, read_toml
-from torchface.shape_names import mapping
+from torchface.shape_names import mapping, near_names, spelled_as
 from torchface.take import Take, Track
 
 __all__ = ["ShapeMap", "ShapeRule", "load_shape_rules", "retarget_take", "shape_map"]
@@ -124,7 +124,7 @@ def shape_map(
     Args:
         from_names: of the weights that are there.
         to_names: of the rig that shall move.
-        rules: for shapes of the target rig, in place of what their names say.
+        rules: for shapes of the target rig, in place of what their names say; in any spelling of either's names.
 
     Raises:
         NameMismatchError: a rule is for a shape that the target lacks, names one that the source lacks, or nothing
@@ -137,7 +137,7 @@ def shape_map(
         >>> shapes(torch.tensor([[1.0, 0.5]])).tolist()
         [[1.0, 0.25]]
     """
-    rules = rules or {}
+    rules = _spelled(rules or {}, from_names, to_names)
     _check_rules(rules, from_names, to_names)
     matrix = mapping(from_names, to_names)
     column = {name: i for i, name in enumerate(from_names)}
@@ -225,19 +225,39 @@ def _rule(entry: Value) -> ShapeRule:
     )
 
 
+def _spelled(
+    rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_names: Sequence[str]
+) -> dict[str, ShapeRule]:
+    """The rules in the names' own spelling; what neither knows stays."""
+
+    def source(name: str) -> str:
+        return spelled_as(name, from_names) or name
+
+    found: dict[str, ShapeRule] = {}
+    for name, rule in rules.items():
+        own = spelled_as(name, to_names) or name
+        if own in found:
+            raise NameMismatchError(f"retarget: found two rules for {own}, expected one")
+        factors = {source(given): factor for given, factor in rule.sum.items()}
+        if len(factors) < len(rule.sum):
+            raise NameMismatchError(f"retarget: the rule of {name} names a shape twice, {', '.join(rule.sum)}")
+        found[own] = replace(rule, sum=factors, product=tuple(map(source, rule.product)))
+    return found
+
+
 def _check_rules(rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_names: Sequence[str]) -> None:
     lacking = sorted(set(rules) - set(to_names))
     if lacking:
         raise NameMismatchError(
             f"retarget: found rules for {', '.join(lacking[:5])}, expected shapes of the target rig: "
-            f"{', '.join(to_names[:5])}, ..."
+            f"{near_names(lacking, to_names)}"
         )
     for name, rule in rules.items():
         unknown = sorted({*rule.sum, *rule.product} - set(from_names))
         if unknown:
             raise NameMismatchError(
                 f"retarget: the rule of {name} names {', '.join(unknown[:5])}, expected shapes of the source: "
-                f"{', '.join(from_names[:5])}, ..."
+                f"{near_names(unknown, from_names)}"
             )
         numbers = (rule.gain, rule.lower, rule.upper, *rule.sum.values())
         if not all(map(math.isfinite, numbers)) or rule.lower > rule.upper:

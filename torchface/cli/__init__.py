@@ -39,6 +39,7 @@ from torchface.cli.train import train
 from torchface.cli.transfer import transfer
 from torchface.cli.view import view
 from torchface.cli.zoo import ZOO
+from torchface.errors import NameMismatchError
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
@@ -105,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not words or words in (["--help"], ["-h"]):
             _overview()
             raise SystemExit(0 if words else 2)
+        _check_command(words[0])
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
             tyro.cli(plain_options(export_model), prog="torchface export", args=words[1:])
         elif words[0] == "train":
@@ -120,6 +122,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             commands = {name: plain_options(command) for name, command in COMMANDS.items()}
             tyro.extras.subcommand_cli_from_dict(commands, prog="torchface", description=DESCRIPTION, args=words)
+
+
+def _check_command(word: str) -> None:
+    """Raises ``NameMismatchError`` where a first word is no command."""
+    names = [*COMMANDS, *GROUPS, "train"]
+    if not word.startswith("-") and word not in names:
+        from torchface.shape_names import near_names  # brings torch
+
+        raise NameMismatchError(
+            f"found the command {word!r:.40}, expected one: {near_names([word], names, len(names))}"
+        )
 
 
 def _overview() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 
 import torch
@@ -14,7 +13,7 @@ from torchface.io import load_mesh, load_rig, load_take
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
-from torchface.shape_names import mapping
+from torchface.shape_names import mapping, near_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +73,7 @@ def load_posed(
         matrix = mapping(names, rig.names)
         unknown = [name for name, used in zip(names, matrix.any(0), strict=True) if not used]
         if unknown:
-            near = sorted({close for name in unknown for close in get_close_matches(name, rig.names, 2)})
-            hint = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(rig.names[:8])}, ..."
+            hint = near_names(unknown, rig.names)
             raise NameMismatchError(f"weights: found {', '.join(unknown)}; expected shapes of the rig: {hint}")
         row = matrix @ torch.tensor([weights[name] for name in names])
     else:
