@@ -425,3 +425,13 @@ def test_torch_hub_gives_the_models_of_the_checkout(home: Path) -> None:
     model = torch.hub.load(str(REPOSITORY), "mine", source="local")
     assert isinstance(model, MorphableModel)
     assert torch.equal(model.mean, morphable().mean)
+
+
+def test_a_folder_of_trained_models_is_pointed_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models" / "people").mkdir(parents=True)
+    (tmp_path / "models" / "people" / "model.toml").write_text("")
+    with pytest.raises(NameMismatchError, match=r"found no 'people', .* \(there is models.people: name it so\)"):
+        zoo.find("people")
+    with pytest.raises(NameMismatchError, match=r"the path of a model's folder, which goes by its name if it lies in "):
+        zoo.find("persons")

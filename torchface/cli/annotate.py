@@ -29,9 +29,9 @@ def annotate(
 
     The video is tracked, and frames are proposed that span what the face does in it. On the page every landmark can be
     dragged; Save writes the frame as an image and iBUG's .pts beside it into OUT and turns to the next. Started again,
-    it goes on where it was. Then: python -m train.appearance --data OUT --out models/NAME. The page is at 127.0.0.1,
-    no other machine can open it, and none but who knows the whole address that is printed; it needs the extra:
-    pip install '.[viewer]' in a checkout.
+    it goes on where it was. Then: torchface train appearance --data OUT --out models/NAME. The page is at 127.0.0.1,
+    no other machine can open it, and none but who knows the whole address that is printed; it needs viser
+    (torchface's extra `viewer`).
 
     Args:
         video: A video of the actor, extreme faces among what it shows.

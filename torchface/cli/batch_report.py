@@ -22,7 +22,7 @@ Cluster = Annotated[
     str | None,
     arg(
         help='Address of a Ray cluster, or "auto" on one of its machines, instead of --jobs; inputs and OUT must lie '
-        "where all its machines see them. Needs the extra: pip install '.[cluster]' in a checkout."
+        "where all its machines see them. Needs Ray (torchface's extra `cluster`)."
     ),
 ]
 TimeLimit = Annotated[

@@ -21,8 +21,7 @@ def convert(
     """Write a rig with its animation, or a mesh, as another kind of file, FBX and Blender's own among them.
 
     FBX and Blender files go through Blender in a process of its own: the program, or its package bpy
-    (pip install '.[blender]' in a checkout, Python 3.11); TORCHFACE_BLENDER names the one to take, or a Python with
-    bpy. See docs/how_to/blender.md.
+    (torchface's extra `blender`, Python 3.11); TORCHFACE_BLENDER names the one to take, or a Python with bpy.
 
     Args:
         source: A rig (.glb, .gltf, USD, .fbx, .blend, a folder of OBJ files, ICT-FaceKit's FaceXModel folder) or a mesh

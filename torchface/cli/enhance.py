@@ -54,7 +54,7 @@ def enhance(
 
     Args:
         animation: What is to be enhanced.
-        model: The actor's model, by name or folder; see `python -m train.enhancement`.
+        model: The actor's model, by name or folder; see `torchface train enhancement`.
         out: Folder for everything.
         rig: The rig that weights move, that meshes belong to, or on which the attachment's markers sit.
         attachment: Where the markers sit, on the rig or on the model's own mesh, as JSON; at least 12.

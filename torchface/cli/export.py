@@ -80,7 +80,7 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     rest. Output: `intensities` (B,A). The names of regions and units are in the file's metadata.
 
     Args:
-        model: Its name in the zoo, or a folder that `python -m train.action_units` wrote.
+        model: Its name in the zoo, or a folder that `torchface train action_units` wrote.
         out: The .onnx file to write.
         quiet: Show no progress.
     """

@@ -29,7 +29,7 @@ def export_enhancement(
     blends them: export/README.md.
 
     Args:
-        model: The actor's model, by name or folder; see `python -m train.enhancement`.
+        model: The actor's model, by name or folder; see `torchface train enhancement`.
         rig: The rig that the engine moves, with texture coordinates; of any topology.
         out: Folder for everything.
         maps: How many wrinkle maps; each region has a weight for each.

@@ -30,8 +30,8 @@ def live(
 
     A page in the browser shows the character and the camera's picture with what was found in it, and has sliders for
     gain and smoothing, a guided calibration of ten seconds, and a button to record. It is at 127.0.0.1, no other
-    machine can open it, and no picture leaves this one. Ends with Ctrl+C. The page needs the extra: pip install
-    '.[viewer]' in a checkout; --no-page does without.
+    machine can open it, and no picture leaves this one. Ends with Ctrl+C. The page needs viser
+    (torchface's extra `viewer`); --no-page does without.
 
     Args:
         camera: A camera's number, from 0, or a video file that is played in its own time, of which --record

@@ -27,8 +27,7 @@ def pick(
 
     Save writes into the folder OUT what has been picked: landmarks.json, annotated.glb (once every landmark is there),
     attachment.json for the markers, correspondences.json for pairs. The page is at 127.0.0.1, no other machine can
-    open it, and none but who knows the whole address that is printed. Needs the extra: pip install '.[viewer]' in a
-    checkout.
+    open it, and none but who knows the whole address that is printed. Needs viser (torchface's extra `viewer`).
 
     Args:
         mesh: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel

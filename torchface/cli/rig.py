@@ -73,7 +73,7 @@ def rig(
         detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from
             coloured scans with closed eyes. Without it the face is found by its shape.
         model: Model of heads in the template's topology, by name or folder, from which the neutral's registration
-            starts; see `python -m train.morphable`.
+            starts; see `torchface train morphable`.
         texture_size: Texels a side of the rig's texture; 0 makes none.
         detail_size: Texels a side of each normal map.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its

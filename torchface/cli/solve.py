@@ -75,7 +75,7 @@ def solve(
         frame_by_frame: Solve every frame on its own, with the markers' noise in the curves. Otherwise the whole take is
             solved at once: smooth curves, gaps bridged, fast motion keeps its height.
         video: What a head camera saw of painted patterns during the take; leads the shapes that markers hardly see.
-        action_units: The classifier for the video, by name or folder; see `python -m train.action_units`.
+        action_units: The classifier for the video, by name or folder; see `torchface train action_units`.
         video_labels: Where helmet, markers and regions are in the video, TOML; VIDEO with .toml for its ending if
             absent.
         table: What action units mean in the rig's shapes, TOML; built in for ARKit's and ICT-FaceKit's names.

@@ -66,7 +66,7 @@ def track(
         landmarks: What finds the 68 landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`; or
             a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
-        prior: What weights faces have, for names of shapes that the rig has too, or none; see `python -m train.priors`.
+        prior: What weights faces have, for names of shapes that the rig has too, or none; see `torchface train priors`.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
         offsets: Fixed offsets between the rig's landmarks and those found, as an earlier take wrote them; those in OUT,
             or estimated with the take, if absent.

@@ -21,7 +21,7 @@ def view(
     saving edited weights.
 
     The page is at 127.0.0.1, no other machine can open it, and none but who knows the whole address that is printed.
-    Needs the extra: pip install '.[viewer]' in a checkout.
+    Needs viser (torchface's extra `viewer`).
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.

@@ -69,8 +69,11 @@ def find(name_or_path: str | Path) -> Path:
     known = ", ".join(list_models()) or "none at all"
     home = os.environ.get(HOME)
     missing = f"; ${HOME} is {home!r}, which is no folder" if home and not is_folder(Path(home)) else ""
+    own = Path("models") / given
+    trained = f" (there is {own}: name it so)" if given and is_folder(own) and (own / DESCRIPTION).is_file() else ""
     raise NameMismatchError(
-        f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder{missing}"
+        f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder{trained}, "
+        f"which goes by its name if it lies in ${HOME}{missing}"
     )
 
 

@@ -34,7 +34,7 @@ PROGRAM = "TORCHFACE_BLENDER"
 _SECONDS_ALWAYS, _SECONDS_A_MEGABYTE = 600.0, 10.0
 _INSTALL = (
     "install Blender, or bpy in a Python 3.11 of its own (python3.11 -m venv ~/bpy && ~/bpy/bin/pip install "
-    f"bpy==5.0.1, then export {PROGRAM}=~/bpy/bin/python), or in a checkout pip install '.[blender]'"
+    f"bpy==5.0.1, then export {PROGRAM}=~/bpy/bin/python)"
 )
 
 

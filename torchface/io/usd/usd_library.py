@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,8 +24,8 @@ def require_usd() -> None:
     """
     if importlib.util.find_spec("pxr") is None:
         raise MissingExtraError(
-            "USD: usd-core is not installed, expected it for .usd, .usda, .usdc and .usdz; pip install usd-core, or in "
-            "a checkout pip install '.[usd]'"
+            "USD: usd-core is not installed, expected it for .usd, .usda, .usdc and .usdz; "
+            f"{sys.executable} -m pip install usd-core"
         )
 
 

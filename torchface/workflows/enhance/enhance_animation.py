@@ -112,7 +112,7 @@ def load_model(name_or_path: str) -> EnhancementModel:
     if not isinstance(model, EnhancementModel):
         raise NameMismatchError(
             f"--model: found {name_or_path}, a {type(model).__name__}, expected an EnhancementModel "
-            "(python -m train.enhancement makes one)"
+            "(torchface train enhancement makes one)"
         )
     return model
 
