@@ -31,7 +31,8 @@ def box_qp(
     differentiation at the solution, and under the transforms of ``torch.func``.
 
     Args:
-        H: symmetric and positive semidefinite, (N,N) or (B,N,N), float32 or float64; only its symmetric part counts.
+        H: symmetric up to rounding, which is taken off, and positive semidefinite, (N,N) or (B,N,N), float32 or
+            float64.
         f: (B,N), of the same dtype and device.
         lower: a number or (N,); ``-inf`` for none. Bounds are constants: no gradient flows to them.
         upper: a number or (N,); ``inf`` for none.

@@ -82,7 +82,7 @@ def register(
     *,
     detector: Detector | None = None,
     model: ShapeModel | HasShape | None = None,
-    schedule: Schedule = DEFAULT_SCHEDULE,
+    schedule: Schedule | None = None,
     texture_size: int = 1024,
     progress: Progress | None = None,
 ) -> Registration:
@@ -106,7 +106,7 @@ def register(
         model: of faces in the template's topology (a ``MorphableModel`` or ``HeadModel``). It is fitted to the scan
             first and the template bends from there: what the model knows no longer slides along the surface. The
             schedule's first stage, which does the same roughly, is left out.
-        schedule: which steps, see ``Schedule``.
+        schedule: which steps, see ``Schedule``; ``DEFAULT_SCHEDULE`` if absent.
         texture_size: texels a side of the texture that is made where the scan has colours and the template
             texture coordinates; 0 makes none.
         progress: called with each step and how far it is.
@@ -140,6 +140,7 @@ def register(
     progress("checking the scan")
     prepared = prepare_scan(scan, template)
     progress("laying the template on the scan")
+    schedule = schedule or DEFAULT_SCHEDULE
     start = _start(template, scan, prepared, landmarks, detector, schedule)
     laid = start.pose.apply(template.vertices.detach().cpu().double())[0]
     contacts = contact_pull(laid, template)

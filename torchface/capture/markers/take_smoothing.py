@@ -48,7 +48,8 @@ class WholeTakeSolver(nn.Module):
 
     Args:
         markers: rig, attachment, alignment and ridge; its sparsity is for single frames, see ``sparsity``.
-        smoothness: :math:`\lambda` at 60 frames a second, mm² a marker.
+        smoothness: :math:`\lambda` at 60 frames a second, mm² a marker: more is calmer, and rounds quick motion off;
+            change it by factors of three.
         huber_threshold: :math:`\tau` at 60 frames a second; infinite for a quadratic term.
         sparsity: :math:`\beta`, mm² a marker for a weight of 1; a tenth of the marker solver's if absent.
 

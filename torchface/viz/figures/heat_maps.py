@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.mesh import Mesh
-from torchface.rendering.compositing import caption, headed, heat_colors, sheet
+from torchface.rendering.compositing import headed, heat_colors, sheet
 from torchface.viz.figures.face_views import clay_colors, color_bar, face_views
 
 __all__ = ["compared_views", "error_colors", "error_views"]
@@ -83,9 +83,9 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
     """
     width = height * 4 // 5
     rows = [
-        caption(face_views(true, colors=clay_colors(true), width=width, height=height, framed_by=true), "truth"),
-        caption(face_views(found, colors=clay_colors(found), width=width, height=height, framed_by=true), "result"),
-        caption(
+        headed(face_views(true, colors=clay_colors(true), width=width, height=height, framed_by=true), "truth"),
+        headed(face_views(found, colors=clay_colors(found), width=width, height=height, framed_by=true), "result"),
+        headed(
             face_views(found, colors=error_colors(errors, maximum), width=width, height=height, framed_by=true),
             "error",
         ),
@@ -97,4 +97,4 @@ def compared_views(found: Mesh, true: Mesh, errors: Tensor, maximum: float, titl
 def _scale(maximum: float, height: int) -> Tensor:
     part = min(0.84, 3.4 / (height / 100))
     bar = (0.12, 0.5 - part / 2, 0.2, part)
-    return color_bar(maximum, f"mm ({GREEN_TO_RED})", height, bar, GREEN_TO_RED, "max")
+    return color_bar(maximum, "mm", height, bar, GREEN_TO_RED, "max")
