@@ -172,8 +172,8 @@ def save(
 def _check_one_source(settings: Settings) -> None:
     if (settings.scans is not None) + (settings.ict is not None) + (settings.performers > 0) != 1:
         raise TorchfaceError(
-            f"found scans={settings.scans}, ict={settings.ict} and performers={settings.performers}; expected a folder "
-            "of registered meshes, ICT-FaceKit's FaceXModel, or a number of performers, one of them"
+            f"found --scans {settings.scans}, --ict {settings.ict}, --performers {settings.performers}; expected one "
+            "of a folder of registered meshes, ICT-FaceKit's FaceXModel, and a number of performers"
         )
 
 

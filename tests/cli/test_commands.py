@@ -17,9 +17,13 @@ from torchface.cli import COMMANDS, GROUPS, main, progress
 from torchface.evaluation import weight_jitter
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig, load_take, save_animation, save_mesh, save_rig, save_take
+from torchface.io.images.image_files import save_image
 from torchface.io.landmarks.picks import LandmarkVertices, save_landmarks
+from torchface.io.video import write_video
+from torchface.io.weights.live_link_csv import save_live_link
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
 from torchface.workflows.attach.attach_markers import load_sites
@@ -391,3 +395,24 @@ def test_what_is_no_command_is_told_with_what_there_is(
     said = " ".join(capsys.readouterr().err.split())
     assert f"found the command '{word}', expected one: {told}" in said
     assert word != "xyz" or said.count("train") == said.count("zoo") == said.count("export") == 1
+
+
+def test_info_tells_a_films_and_a_pictures_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_video([torch.zeros(10, 3, 32, 48, dtype=torch.uint8)], tmp_path / "film.avi", 20.0)
+    save_image(torch.zeros(3, 20, 30), tmp_path / "photo.png")
+    told = []
+    for name in ("film.avi", "photo.png"):
+        main(["info", str(tmp_path / name)])
+        told.append(" ".join(capsys.readouterr().err.replace("│", "").split()))
+    assert "frames 10 at 20 a second, 0.5 s" in told[0]
+    assert "pixels 48 x 32" in told[0]
+    assert "pixels 30 x 20" in told[1]
+
+
+def test_weights_in_place_of_markers_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_live_link(Take(60.0, weights=Track(("jawOpen",), torch.zeros(5, 1, 1))), tmp_path / "take.csv")
+    save_rig(performer(texture=False), tmp_path / "rig.glb")
+    with pytest.raises(SystemExit):
+        main(["attach", str(tmp_path / "rig.glb"), str(tmp_path / "take.csv"), "--out", str(tmp_path / "sites.json")])
+    told = " ".join(capsys.readouterr().err.split())
+    assert "found 52 weights, expected a marker take (.c3d, .trc, .csv); such weights go to another rig by" in told

@@ -185,7 +185,7 @@ def test_meshes_that_teach_nothing_are_named(heads: list[Mesh], tmp_path: Path, 
     save_mesh(Mesh(heads[0].vertices, heads[0].faces[:-5]), scans / "d.glb")
     with pytest.raises(TopologyError, match=r"d\.glb: found 6419 vertices and 12755 triangles, expected.*12760"):
         train(settings)
-    with pytest.raises(TorchfaceError, match="or a number of performers"):
+    with pytest.raises(TorchfaceError, match="and a number of performers"):
         train(replace(settings, performers=5))
 
 

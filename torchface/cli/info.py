@@ -14,7 +14,7 @@ from torchface.cli.progress import console
 def info(
     path: Annotated[Positional[Path], arg(metavar="FILE")], attachment: Path | None = None, part: str | None = None
 ) -> None:
-    """Say what a file holds: a rig, mesh, take, attachment or solver.
+    """Say what a file holds: a rig, mesh, take, attachment, solver, video or image.
 
     Args:
         path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .json (attachment) or .onnx file, or a rig's

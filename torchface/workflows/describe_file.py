@@ -14,8 +14,10 @@ from torchface.capture.webcam.examples.example_shapes import is_examples
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_animation, load_mesh, load_rig, load_take
+from torchface.io.images.image_files import load_image
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
+from torchface.io.video import open_video
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -25,10 +27,12 @@ Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
 _MAX_NAMED = 8
+_VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".gif")
+_IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def describe(path: Path, attachment: Path | None = None, part: str | None = None) -> Rows:
-    """Rows (what, value) about a mesh, rig, take, attachment or solver.
+    """Rows (what, value) about a mesh, rig, take, attachment, solver, video or image.
 
     Args:
         path: the file or folder.
@@ -67,8 +71,28 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         return _attachment_rows(Attachment.load(path))
     if suffix == ".onnx":
         return _graph_rows(path)
+    if suffix in _VIDEO_ENDINGS:
+        video = open_video(path)
+        return [
+            ("frames", f"{video.count} at {video.fps:g} a second, {video.count / video.fps:.1f} s"),
+            ("pixels", f"{video.width} x {video.height}"),
+        ]
+    if suffix in _IMAGE_ENDINGS:
+        _, height, width = load_image(path).shape
+        return [("pixels", f"{width} x {height}")]
+    endings = (
+        *SCENE_ENDINGS,
+        *MESH_ENDINGS,
+        *_VIDEO_ENDINGS,
+        *_IMAGE_ENDINGS,
+        ".c3d",
+        ".trc",
+        ".csv",
+        ".json",
+        ".onnx",
+    )
     raise FileFormatError(
-        f"{path}: found the ending {suffix!r}, expected .glb .usdc .obj .ply .stl .off .c3d .trc .csv .json .onnx"
+        f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(set(endings)))}"
     )
 
 
@@ -142,7 +166,9 @@ def _take_rows(take: Take) -> Rows:
     if take.weights is not None:
         rows += [("warning", fault) for fault in weight_faults(take.weights)]
     if take.extras:
-        rows.append(("kept besides", ", ".join(map(str, take.extras))))
+        columns = take.extras.get("columns")
+        named = {"columns": f"columns {', '.join(columns)}"} if isinstance(columns, dict) else {}
+        rows.append(("kept besides", "; ".join(named.get(name, name) for name in map(str, take.extras))))
     return rows
 
 

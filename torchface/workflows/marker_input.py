@@ -73,7 +73,11 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
     """
     take = load_take(path, options.unit)
     if take.markers is None:
-        raise ValueRangeError(f"{path}: found no markers, expected a marker take (.c3d, .trc, .csv)")
+        other = "; such weights go to another rig by torchface retarget" if take.weights is not None else ""
+        held = ", ".join(
+            f"{len(track.names)} {kind}" for kind in ("weights", "landmarks") if (track := getattr(take, kind))
+        )
+        raise ValueRangeError(f"{path}: found {held or 'no markers'}, expected a marker take (.c3d, .trc, .csv){other}")
     renamed = None if options.labels is None else load_label_map(options.labels)
     try:
         found = take.markers.names

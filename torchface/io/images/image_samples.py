@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from torchface.errors import FileFormatError
@@ -108,6 +108,10 @@ def _decoded(header: ImageHeader | None, data: bytes, source: str, planes: int) 
                     _check_memory(plain, planes, len(data), source)
                 image.load()
                 return _of_pillow(image, source)
+    except UnidentifiedImageError as error:
+        raise FileFormatError(
+            f"{source}: no readable image: found no kind that is known, expected PNG or JPEG"
+        ) from error
     # Pillow's decoders let most kinds of errors escape on broken bytes; whatever they are, it is no image.
     except (OSError, ValueError, SyntaxError, TypeError, IndexError, KeyError, EOFError, ArithmeticError) as error:
         raise FileFormatError(f"{source}: no readable image ({error})") from error
