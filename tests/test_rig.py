@@ -1,5 +1,6 @@
 """BlendshapeRig: equation 1, parts, names."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -78,3 +79,14 @@ def test_under_arkits_names_the_face_moves_as_before() -> None:
     assert renamed.names == ("jawOpen", "browInnerUp", "wink")
     weights = torch.tensor([[0.3, 0.7, 0.2]])
     torch.testing.assert_close(renamed(weights), own(torch.tensor([[0.2, 0.7, 0.3, 0.7]])))
+
+
+def test_arrays_and_lists_do_as_tensors_do(dome_rig: BlendshapeRig) -> None:
+    given = dome_rig.neutral
+    rig = BlendshapeRig.from_tensors(
+        given.vertices.numpy(), given.faces.numpy(), dome_rig.deltas.numpy(), dome_rig.names
+    )  # type: ignore[arg-type]
+    weights = [[0.5] * len(rig.names)]
+    expected = dome_rig(torch.tensor(weights))
+    for kind in (weights, np.array(weights), torch.tensor(weights, dtype=torch.float64)):
+        torch.testing.assert_close(rig(kind), expected)

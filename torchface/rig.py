@@ -91,7 +91,7 @@ class BlendshapeRig(nn.Module):
         correctives: Correctives | None = None,
         **rest: Any,
     ) -> BlendshapeRig:
-        """A rig of plain tensors, as other PyTorch code has them.
+        """A rig of plain tensors, as other PyTorch code has them, or of NumPy's arrays.
 
         Args:
             vertices: at rest, (V,3) float, millimetres; gradients flow through them and through the deltas.
@@ -113,6 +113,7 @@ class BlendshapeRig(nn.Module):
             >>> rig.names
             ('shape_0', 'shape_1')
         """
+        vertices, faces, deltas = (torch.as_tensor(given) for given in (vertices, faces, deltas))
         faces, uv_faces = faces.long(), rest.pop("uv_faces", None)
         if faces.ndim == 2 and faces.shape[1] > 3:
             uv_polygons = None if uv_faces is None else uv_faces.long()
@@ -156,7 +157,8 @@ class BlendshapeRig(nn.Module):
         return self.without_correctives()
 
     def forward(self, weights: Tensor) -> Tensor:
-        """Vertices (B,V,3) at weights (B,N)."""
+        """Vertices (B,V,3) at weights (B,N), taken in the rig's dtype; NumPy's arrays and lists do as well."""
+        weights = torch.as_tensor(weights).to(self.deltas.dtype)
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
         moved = weights @ self.deltas.flatten(1)
