@@ -79,7 +79,7 @@ def test_a_folder_of_takes_is_solved_as_each_alone(
 def test_what_many_would_write_over_one_another_is_refused(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("solve", stage / "rig.glb", stage / "takes", "--attachment", stage / "sites_calm.json", "--quiet")
     for more, message in (
-        (("--out", stage / "weights.csv"), "found {0}/weights.csv, a file, for the results of many"),
+        (("--out", stage / "weights.csv"), "found {0}/weights.csv, a file, for the results of a folder"),
         (("--out", stage / "out", "--animation", stage / "a.glb"), "one place for the results of many"),
         (("--out", stage / "out", "--stream", "udp://127.0.0.1:9"), "found many takes"),
         (("--out", stage / "takes"), "which holds takes"),

@@ -158,3 +158,11 @@ def test_mutated_indices_are_read_or_refused(tmp_path: Path) -> None:
     (tmp_path / "good.json").write_text(json.dumps(INDICES))
     report = check_reader(load_with_these_indices, [tmp_path / "good.json"], ".json")
     assert report.refused > report.cases / 4
+
+
+def test_the_repository_in_place_of_its_model_is_told(tmp_path: Path) -> None:
+    (tmp_path / "FaceXModel").mkdir()
+    for name in ("vertex_indices.json", "generic_neutral_mesh.obj"):
+        (tmp_path / "FaceXModel" / name).write_text("{}")
+    with pytest.raises(FileFormatError, match=r"found ICT-FaceKit's repository, expected .*FaceXModel"):
+        load_identity_modes(tmp_path)

@@ -196,6 +196,8 @@ def _read_deltas(folder: Path, names: Sequence[str], neutral: Mesh, topology: by
 
 
 def _read_indices(folder: Path) -> dict[str, list]:
+    if is_ict_folder(folder / "FaceXModel"):
+        raise FileFormatError(f"{folder}: found ICT-FaceKit's repository, expected {folder / 'FaceXModel'}")
     document = read_json(folder / _INDICES, max_bytes=_MAX_INDICES)
     document["expressions"].texts()
     document["idx_to_landmark_verts"].tensor(None, dtype=torch.int64, expected="a list of vertex ids")

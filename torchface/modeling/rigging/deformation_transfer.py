@@ -170,7 +170,9 @@ def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
         raise TopologyError(
             f"transfer_deformation: found a target of {len(target.vertices)} vertices and {len(target.faces)} "
             f"triangles ({target.fingerprint()}), expected the source's topology of {len(source.neutral.vertices)} "
-            f"vertices and {len(source.neutral.faces)} triangles ({source.neutral.fingerprint()})"
+            f"vertices and {len(source.neutral.faces)} triangles ({source.neutral.fingerprint()}); "
+            "a head of another topology is first laid out in it by "
+            "torchface register, or rigged at once by torchface rig"
         )
     for what, vertices in (("source", source.vertices), ("target", target.vertices)):
         if not torch.isfinite(vertices).all():

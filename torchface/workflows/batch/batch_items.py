@@ -153,7 +153,9 @@ def check_for_each(option: str, path: Path | None) -> None:
 def check_folder(out: Path) -> None:
     """Raises a ``ValueRangeError`` where ``--out`` names a file, and many results need a folder."""
     if out.suffix and not out.is_dir():
-        raise ValueRangeError(f"--out: found {out}, a file, for the results of many; expected a folder")
+        raise ValueRangeError(
+            f"--out: found {out}, a file, for the results of a folder or of several inputs; expected a folder"
+        )
 
 
 def _others(paths: Sequence[Path], kind: ItemKind) -> str:
