@@ -142,3 +142,28 @@ def test_parts_that_registration_left_before_the_lips_go_behind_them(ict_folder:
     assert float(parts.depth(placed.vertices).max()) <= TOLERANCE
     moved = (placed.vertices - head.vertices)[parts.vertices[parts.hard]]
     assert float(moved.norm(dim=-1).mean()) < 3.0
+
+
+@pytest.mark.real
+def test_lids_that_are_a_millimetre_off_do_not_turn_eyes_inward(ict_folder: Path) -> None:
+    """Eyeballs of people's heads, against their true places, where the skin is a registration's."""
+    template = load_ict_facekit(ict_folder, ["eyeBlink_L"])
+    parts = inner_parts(template)
+    skin = parts.label == parts.body
+    modes, off = load_identity_modes(ict_folder), []
+    for seed in range(4):
+        head = modes.random_head(seed)
+        generator = torch.Generator().manual_seed(seed)
+        at = head.vertices[skin][torch.randint(int(skin.sum()), (600,), generator=generator)]
+        near = torch.exp(-(torch.cdist(head.vertices[skin], at) ** 2) / (2 * 6.0**2))
+        bumps = near @ torch.randn(600, 3, generator=generator)
+        spoiled = head.vertices.clone()
+        spoiled[skin] += bumps / bumps.std()
+        placed = place_parts(template, head.with_vertices(spoiled), parts)
+        for group in (1, 2):
+            ball = parts.vertices[(parts.group == group) & parts.hard]
+            off.append((placed.vertices - head.vertices)[ball].mean(0))
+    across, up, front = torch.stack(off).square().mean(0).sqrt().tolist()
+    assert across < 1.2
+    assert up < 1.6
+    assert front < 2.2
