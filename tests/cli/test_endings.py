@@ -47,6 +47,52 @@ def test_a_place_that_cannot_be_written_to_is_named_before_the_solve(
     assert not (stage / "weights.csv").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "ending"),
+    [
+        ("solve rig.glb take.c3d --attachment a.json --out w.xlsx", ".csv"),
+        ("solve rig.glb take.c3d --attachment a.json --out w.csv --live-link w.xlsx", ".csv"),
+        ("solve rig.glb take.c3d --attachment a.json --out w.csv --animation w.xlsx", ".glb"),
+        ("retarget take.csv --to rig.glb --out w.xlsx", ".csv"),
+        ("attach rig.glb take.c3d --out w.xlsx", ".json"),
+        ("attach rig.glb take.c3d --picture w.xlsx", ".png"),
+        ("calibrate board.png --out w.xlsx", ".toml"),
+        ("examples --rig rig.glb --out w.xlsx", ".json"),
+        ("render rig.glb --out w.xlsx", ".png"),
+        ("rig scan.obj --template rig.glb --out w.xlsx", ".glb"),
+        ("fit photo.png --model head --out w.xlsx", ".glb"),
+        ("transfer rig.glb neutral.obj --out w.xlsx", ".glb"),
+        ("convert rig.glb w.xlsx", ".glb"),
+        ("export solver --rig rig.glb --attachment a.json --out w.xlsx", ".onnx"),
+        ("export examples --examples e.json --out w.xlsx", ".onnx"),
+        ("export webcam --out w.xlsx", ".onnx"),
+        ("export head --out w.xlsx", ".onnx"),
+    ],
+)
+def test_a_result_of_another_ending_is_refused_before_anything_is_read(
+    words: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where none of the inputs is
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"w.xlsx: found the ending '.xlsx', expected {ending}" in told
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", ["render rig.glb --out", "export solver --rig rig.glb --attachment attachment.json --out"]
+)
+def test_a_missing_folder_of_a_result_is_made(
+    stage: Path, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(stage)
+    out = tmp_path / "new" / ("a.png" if words.startswith("render") else "a.onnx")
+    main([*words.split(), str(out), "--quiet"])
+    assert out.is_file()
+
+
 def test_folders_are_made_or_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     assert make_folder(tmp_path / "a" / "b").is_dir()

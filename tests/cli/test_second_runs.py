@@ -27,18 +27,22 @@ Lock = Callable[[Path], AbstractContextManager[Path]]
         (job_lock, "annotate video.mp4 --no-browser"),
         (file_lock, "rig scan.ply --template template.glb"),
         (file_lock, "fit photo.jpg --model head"),
-        (file_lock, "solve rig.glb take.c3d --attachment attachment.json"),
-        (file_lock, "attach rig.glb take.c3d"),
+        (file_lock, "solve rig.glb take.c3d --attachment attachment.json --out out.csv"),
+        (file_lock, "attach rig.glb take.c3d --out out.json"),
+        (file_lock, "export webcam --out out.onnx"),
+        (file_lock, "calibrate board.png --out out.toml"),
+        (file_lock, "retarget take.csv --to rig.glb --out out.csv"),
     ],
 )
 def test_a_second_run_of_a_command_is_refused(
     lock: Lock, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
+    given, _, name = words.partition(" --out ")
+    out = tmp_path / (name or "out")
     with lock(out):
         there = sorted(tmp_path.rglob("*"))
         with pytest.raises(SystemExit) as ended:
-            main([*words.split(), "--out", str(out), "--quiet"])
+            main([*given.split(), "--out", str(out), "--quiet"])
         assert sorted(tmp_path.rglob("*")) == there
     assert ended.value.code == 2
     assert f"found another run writing into {out} (process" in " ".join(capsys.readouterr().err.split())

@@ -75,7 +75,7 @@ def test_texture_is_sampled_with_its_first_row_on_top() -> None:
 
 
 def test_pictures_of_other_kinds_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"found the ending '.gif', expected .png or .jpg"):
+    with pytest.raises(FileFormatError, match=r"found the ending '.gif', expected .png, .jpg, .jpeg"):
         save_rendered_image(torch.zeros(3, 4, 4), tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 

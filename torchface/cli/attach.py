@@ -85,7 +85,7 @@ def attach(
             batch = run_batch(job, MOTIONS, find_items(rom, MOTIONS), out, where, progress, skipped_lines(quiet))
         show_batch(batch, _COLUMNS, "error_mm")
         return
-    with file_lock(out), progress_bars(quiet) as progress:
+    with file_lock(out, ".json"), progress_bars(quiet) as progress:
         report = find_sites(rig, rom[0], out, settings, picture, progress)
     print_lines(report.lines())
     print_path(out)

@@ -31,13 +31,14 @@ def calibrate(
         square: A square's side, millimetres.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.workflows.calibrate_camera import Board
     from torchface.workflows.calibrate_camera import calibrate as run
 
     match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", corners.strip())
     if match is None:
         raise ValueRangeError(f"--corners: found {corners!r}, expected columns x rows such as 9x6")
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".toml"), progress_bars(quiet) as progress:
         report = run(images, Board(int(match[1]), int(match[2]), square), out, progress)
     for line in report.lines():
         console.print(line, highlight=False)

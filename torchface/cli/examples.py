@@ -47,6 +47,7 @@ def examples(
         rig_examples,
     )
     from torchface.errors import ValueRangeError
+    from torchface.files.job_lock import file_lock
     from torchface.io import load_rig
     from torchface.workflows.examples.guided_session import guided_examples
     from torchface.workflows.examples.picture_examples import picture_examples
@@ -56,17 +57,18 @@ def examples(
         raise ValueRangeError(
             f"examples: found {' and '.join(given) or 'nothing'}, expected PICTURES, --camera or --rig"
         )
-    if camera is not None:
-        made = guided_examples(camera, lambda words: console.print(words, highlight=False), seconds, landmarks)
-    else:
-        with progress_bars(quiet) as progress:
-            if rig is not None:
-                progress("reading the rig")
-                loaded = load_rig(rig)
-                made = paper_examples(loaded) if paper else rig_examples(loaded)
-            else:
-                made = picture_examples(pictures, landmarks, progress)
-    made.save(out)
+    with file_lock(out, ".json"):
+        if camera is not None:
+            made = guided_examples(camera, lambda words: console.print(words, highlight=False), seconds, landmarks)
+        else:
+            with progress_bars(quiet) as progress:
+                if rig is not None:
+                    progress("reading the rig")
+                    loaded = load_rig(rig)
+                    made = paper_examples(loaded) if paper else rig_examples(loaded)
+                else:
+                    made = picture_examples(pictures, landmarks, progress)
+        made.save(out)
     if not quiet:
         remarks = [] if rig is not None else example_remarks(made)
         print_lines([*remarks, *str(landmark_observability(ExampleSolver(made))).splitlines()])

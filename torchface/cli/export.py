@@ -58,9 +58,10 @@ def _write_solver(
     export: Callable[..., SolverReport], rig: Path, attachment: Path, out: Path, part: str | None, quiet: bool
 ) -> None:
     from torchface.attachment import Attachment
+    from torchface.files.job_lock import file_lock
     from torchface.io import load_rig
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded, where = load_rig(rig, part=part), Attachment.load(attachment)
         where.check(loaded.neutral, attachment, rig)
@@ -86,9 +87,10 @@ def action_units(model: str, out: Path, quiet: Quiet = False) -> None:
     """
     from torchface import zoo
     from torchface.capture import ActionUnitClassifier
+    from torchface.files.job_lock import file_lock
     from torchface.onnx import export_action_units
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("reading the classifier")
         classifier = zoo.get_model(model, ActionUnitClassifier)
         progress("exporting and checking")
@@ -132,13 +134,14 @@ def video_solver(
         quiet: Show no progress.
     """
     from torchface.errors import FileFormatError, ValueRangeError
+    from torchface.files.job_lock import file_lock
     from torchface.io import load_rig, load_take
     from torchface.io.camera_files import load_calibration
     from torchface.number_checks import check_rate
     from torchface.onnx import export_video_solver
     from torchface.workflows.track.track_models import load_priors
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         if fps is not None:
             check_rate(fps, "--fps", ValueRangeError)
         progress("reading rig, camera and priors")
@@ -177,9 +180,10 @@ def examples(
         quiet: Show no progress.
     """
     from torchface.capture.webcam import AllAtOnce, ExampleMethod, ExampleShapes, ExampleSolver, LandmarkModel, Regional
+    from torchface.files.job_lock import file_lock
     from torchface.onnx import export_example_solver
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("reading the examples")
         shapes = ExampleShapes.load(examples)
         methods: dict[str, Callable[[], ExampleMethod]] = {
@@ -211,9 +215,10 @@ def webcam(out: Path, quiet: Quiet = False) -> None:
         out: The .onnx file to write.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.workflows.webcam.webcam_export import export_webcam
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         report = export_webcam(out, progress)
     table = Table(show_header=False)
     for row in report.rows():

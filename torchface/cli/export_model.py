@@ -23,9 +23,10 @@ def export_model(name: str, /, out: Path, quiet: Quiet = False) -> None:
         quiet: Show no progress.
     """
     from torchface import zoo
+    from torchface.files.job_lock import file_lock
     from torchface.onnx import export_model as export
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".onnx"), progress_bars(quiet) as progress:
         progress("loading the model")
         record = zoo.describe(name)
         model = zoo.get_model(name)

@@ -37,13 +37,14 @@ def render(
         part: Keep this region only, such as face.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.number_checks import checked_count
-    from torchface.rendering.compositing import save_rendered_image
+    from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image
     from torchface.viz.figures.face_views import PICTURE_HEIGHTS, clay_colors, face_views
     from torchface.workflows.posed_mesh import load_posed, pose_weights
 
     checked_count("--height", height, *PICTURE_HEIGHTS)
-    with progress_bars(quiet) as progress:
+    with file_lock(out, *PICTURE_ENDINGS), progress_bars(quiet) as progress:
         progress("reading")
         posed = load_posed(path, pose_weights(weights), take, frame, part)
         progress("rendering")

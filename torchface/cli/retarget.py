@@ -43,10 +43,11 @@ def retarget(
         part: Keep this region of the target rig only, such as face.
         quiet: Show no progress.
     """
+    from torchface.files.job_lock import file_lock
     from torchface.workflows.retarget_weights import retarget_weights
     from torchface.workflows.weight_files import WeightFiles
 
-    with progress_bars(quiet) as progress:
+    with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         files = WeightFiles(out, animation, live_link)
         done = retarget_weights(weights, to, files, from_, table, part, progress)
     driven = len(done.shapes.to_names) - len(done.shapes.undriven)

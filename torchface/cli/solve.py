@@ -126,7 +126,7 @@ def solve(
             batch = run_batch(job, MARKER_TAKES, found, out, where, progress, skipped_lines(quiet))
         show_batch(batch, _COLUMNS, "rmse_mm")
         return
-    with file_lock(out), progress_bars(quiet) as progress:
+    with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         inputs = TakeInputs(rig, take[0], attachment, part, camera, options)
         done = solve_take(inputs, TakeOutputs(out, animation, live_link, report, stream), settings, progress)
     print_lines(done.lines())

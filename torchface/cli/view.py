@@ -31,6 +31,8 @@ def view(
         port: The first port to try.
         quiet: Show no progress.
     """
+    from torchface.files.file_endings import check_ending
+    from torchface.files.whole_files import check_writable
     from torchface.io import load_detail_maps, load_rig, load_take
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, import_viser
@@ -41,6 +43,8 @@ def view(
     free_port(HOST, port)
     if out is None:
         out = Path("edited_weights.csv") if weights is None else weights.with_name(f"{weights.stem}_edited.csv")
+    check_ending(out, ".csv")
+    check_writable(out)
     with progress_bars(quiet) as progress:
         progress("reading the rig")
         loaded = load_rig(rig, part=part)

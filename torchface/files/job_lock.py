@@ -12,6 +12,7 @@ from pathlib import Path
 from platform import node
 
 from torchface.errors import ValueRangeError
+from torchface.files.file_endings import check_ending
 from torchface.files.temporary_files import open_plain, remove_left_over, shortened
 from torchface.files.whole_files import check_writable, made_folder
 from torchface.files.write_errors import unwritten
@@ -76,20 +77,23 @@ def job_lock(folder: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def file_lock(file: str | Path) -> Iterator[Path]:
+def file_lock(file: str | Path, *endings: str) -> Iterator[Path]:
     """Holds one file of results, and what is written beside it, for one run; see :func:`job_lock`.
 
     Args:
         file: what ``--out`` names, or a folder that is written as a whole; what is missing above is made.
+        endings: those that the file may have; any if absent.
 
     Returns:
         The file.
 
     Raises:
         ValueRangeError: another run is writing it.
-        FileFormatError: its folder cannot be made or written to.
+        FileFormatError: it has another ending, or its folder cannot be made or written to.
     """
     file = Path(file)
+    if endings:
+        check_ending(file, *endings)
     if file.is_dir():
         check_writable(folder=file)
     else:

@@ -16,11 +16,15 @@ from matplotlib.text import Text
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from torchface.errors import FileFormatError
+from torchface.files.file_endings import check_ending
 from torchface.files.whole_files import make_folder, write_file
 from torchface.shown_text import visible
 
 __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]
+
+_KINDS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+PICTURE_ENDINGS = tuple(_KINDS)
+"""Of the files that :func:`save_rendered_image` writes."""
 
 
 def heat_colors(values: Tensor, maximum: float, colormap: str = "turbo") -> Tensor:
@@ -122,10 +126,8 @@ def save_rendered_image(image: Tensor, path: str | Path) -> None:
         0.0
     """
     path = Path(path)
-    kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-    if path.suffix.lower() not in kinds:
-        raise FileFormatError(f"{path}: found the ending {path.suffix!r}, expected .png or .jpg")
+    check_ending(path, *_KINDS)
     make_folder(path.parent)
     content = BytesIO()
-    to_pillow(image).save(content, kinds[path.suffix.lower()])
+    to_pillow(image).save(content, _KINDS[path.suffix.lower()])
     write_file(path, content.getvalue())

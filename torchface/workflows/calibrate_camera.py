@@ -14,6 +14,8 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
+from torchface.files.file_endings import check_ending
+from torchface.files.whole_files import check_writable, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.camera_files import save_calibration
 from torchface.io.images.image_files import load_image
@@ -132,16 +134,15 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     Source: Zhang 2000; thesis 4.2.4.
     """
     progress = progress or silent
-    if out.suffix.lower() != ".toml":
-        raise FileFormatError(f"{out}: found the ending {out.suffix!r}, expected .toml")
-    if not out.parent.is_dir():
-        raise FileFormatError(f"{out}: found no folder {out.parent}, expected an existing one")
+    check_ending(out, ".toml")
+    check_writable(out)
     if not paths:
         raise FileFormatError("calibrate: found no image, expected some of a checkerboard, or a video")
     views, left_out = find_boards(_images(paths), board, progress)
     progress(f"calibrating from {len(views)} views")
     report = calibrate_views(views, board, left_out)
     progress("writing the calibration and the overlay")
+    make_folder(out.parent)
     overlay_path = out.with_suffix(".png")
     save_calibration(report.calibration, out)
     save_rendered_image(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface.errors import FileFormatError
+from torchface.files.file_endings import check_ending
 from torchface.files.whole_files import check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
@@ -14,7 +15,7 @@ from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS, check_rig_ending, write_rig
 from torchface.io.rigs.ict_facekit import region
 from torchface.io.scenes.weight_keys import weight_keys
-from torchface.io.usd import require_usd
+from torchface.io.usd import USD_ENDINGS, require_usd
 from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -68,6 +69,7 @@ def convert_file(
     if {source.suffix.lower(), out.suffix.lower()} & set(BLENDER_ENDINGS):
         blender_program()
     if out.suffix:
+        check_ending(out, ".glb", *USD_ENDINGS, *BLENDER_ENDINGS, *MESH_ENDINGS)
         check_writable(out)
     else:
         check_writable(folder=out)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import torch
 
-from torchface.errors import FileFormatError, NameMismatchError
+from torchface.errors import NameMismatchError
+from torchface.files.file_endings import check_ending
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
@@ -36,9 +37,9 @@ class WeightFiles:
 
     def check(self, folder: Path | None = None) -> None:
         """Raises where one of them, or a folder beside, cannot be written to or has another ending than it may have."""
-        for csv in (self.out, self.live_link):
-            if csv is not None and csv.suffix.lower() != ".csv":
-                raise FileFormatError(f"{csv}: found the ending {csv.suffix!r}, expected .csv for weights")
+        for table in (self.out, self.live_link):
+            if table is not None:
+                check_ending(table, ".csv")
         check_writable(self.out, self.live_link, self.animation, folder=folder)
         if self.animation is not None:
             check_animation_ending(self.animation)

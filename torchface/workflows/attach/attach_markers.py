@@ -15,12 +15,13 @@ from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, 
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.rest_pose import check_not_mirrored
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
+from torchface.files.file_endings import check_ending
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
-from torchface.rendering.compositing import save_rendered_image, sheet
+from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.viz.figures.site_views import errors_by_iteration, site_views
@@ -180,6 +181,8 @@ def attach(
     """
     progress = progress or silent
     check_writable(out, picture)
+    if picture is not None:
+        check_ending(picture, *PICTURE_ENDINGS)
     progress("reading the rig")
     loaded = load_rig(rig, part=settings.part)
     progress("reading the range of motion")
