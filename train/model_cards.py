@@ -18,7 +18,7 @@ _NOT_TOLD = ("out", "device", "resume", "seed")  # what does not change the mode
 def model_card(
     settings: RecipeSettings, licence: str, data: str, metrics: Mapping[str, float], text: str
 ) -> zoo.ModelCard:
-    """The card of a model, with the effective settings; of paths the names alone.
+    """The card of a model: the command with paths as given, the effective settings with their names alone.
 
     Args:
         settings: of the run.
@@ -34,7 +34,7 @@ def model_card(
 
 
 def command(settings: RecipeSettings) -> str:
-    """The command of these settings: what is not as by default, the seed, and where the model goes."""
+    """The command of these settings: what is not as by default, paths as given, the seed, and where the model goes."""
     words = ["torchface", "train", recipe_name(type(settings)), *_flags(settings, "")]
     return shlex.join([*words, "--seed", str(settings.seed), "--out", f"models/{settings.out.name}"])
 
@@ -52,11 +52,7 @@ def _flags(settings: Any, prefix: str) -> Iterator[str]:
         elif isinstance(value, bool):
             yield f"--{name}" if value else f"--{prefix}no-{field.name.replace('_', '-')}"
         else:
-            yield from (f"--{name}", *map(_word, value if isinstance(value, tuple) else [value]))
-
-
-def _word(value: Any) -> str:
-    return value.name if isinstance(value, Path) else str(value)
+            yield from (f"--{name}", *map(str, value if isinstance(value, tuple) else [value]))
 
 
 def _named(value: Any) -> Any:

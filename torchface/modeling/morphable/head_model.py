@@ -212,6 +212,10 @@ class HeadModel(nn.Module):
             annotations=mean.annotations,
         )
 
+    def extra_repr(self) -> str:
+        shapes = f", {len(self.rig_names)} shapes" if self.rig_names else ""
+        return f"{len(self.shape.mean)} vertices, {len(self.faces)} triangles{shapes}"
+
     def check_state(self) -> None:
         """Raises ``TorchfaceError`` where a loaded state makes no mesh or no rig."""
         self.template()

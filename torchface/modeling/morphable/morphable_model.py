@@ -98,6 +98,9 @@ class MorphableModel(nn.Module):
             len(samples),
         )
 
+    def extra_repr(self) -> str:
+        return f"{self.count} components of {len(self.mean)} vertices"
+
     @property
     def count(self) -> int:
         """How many components, K."""
