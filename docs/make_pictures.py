@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from torchface.capture.video.lighting import estimate_light
+from torchface.capture.own_rig.lighting import estimate_light
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_image, load_rig, save_image
 from torchface.io.video import open_video

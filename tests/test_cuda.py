@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from torchface import zoo
 from torchface.capture import DynamicsPrior, HelmetSolver, HybridSolver, MarkerSolver, ShapePrior, VideoSolver
+from torchface.capture.own_rig import solve_whole_take
+from torchface.capture.own_rig.head_pose import PoseTracker, track_pose
+from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter, smooth_landmarks
 from torchface.capture.priors import adapt_dynamics
-from torchface.capture.video import solve_whole_take
-from torchface.capture.video.head_pose import PoseTracker, track_pose
-from torchface.capture.video.landmark_smoothing import LandmarkFilter, smooth_landmarks
 from torchface.geometry.cameras.robust_pnp import robust_pnp
 from torchface.optim import BoxQP
 from torchface.rig import BlendshapeRig

@@ -46,8 +46,8 @@ UNSHOWN = {
     "takes seconds": (
         "capture.markers.check_attachment",
         "capture.markers.sites_by_shape",
-        "capture.video.lighting.LightFit",
-        "capture.video.lighting.estimate_light",
+        "capture.own_rig.lighting.LightFit",
+        "capture.own_rig.lighting.estimate_light",
         "landmarks.AppearanceFit",
         "landmarks.AppearanceModel",
         "onnx.export_dynamics_prior",

@@ -12,8 +12,8 @@ import torch
 
 from torchface.capture import HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.energy import ridge_term, sparsity_term
+from torchface.capture.own_rig.video_settings import VideoSettings
 from torchface.capture.priors.shape_prior import ShapePrior
-from torchface.capture.video.video_settings import VideoSettings
 from torchface.enhancement import EnhancementSettings
 from torchface.errors import ValueRangeError
 from torchface.modeling import BakeSettings, ExpressionSettings, FitSettings

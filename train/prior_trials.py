@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig
+from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior, windows_of
-from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.shape_names import mapping
 
 _FOCAL, _DISTANCE = 900.0, 600.0  # pixels, millimetres

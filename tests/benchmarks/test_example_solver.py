@@ -25,8 +25,7 @@ from test_video_solver import Faces, faces, head, wander
 from torch import Tensor
 
 from torchface.capture import ExampleSolver
-from torchface.capture.video.face_points import FacePoints
-from torchface.capture.webcam import (
+from torchface.capture.anybody import (
     AllAtOnce,
     Distances,
     ExampleFit,
@@ -38,6 +37,7 @@ from torchface.capture.webcam import (
     character_matrix,
     paper_examples,
 )
+from torchface.capture.own_rig.face_points import FacePoints
 from torchface.geometry.rotations import rotation_matrix
 from torchface.onnx.example_graph import example_model
 from torchface.rig import BlendshapeRig

@@ -15,8 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from torchface.capture.video.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
-from torchface.capture.video.landmark_smoothing import LandmarkFilter
+from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS, PoseTracker, filter_poses, measure_poses, smooth_poses
+from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pnp import Pose, pixel_jacobian, solve_pnp
 from torchface.geometry.cameras.robust_pnp import robust_pnp

@@ -17,7 +17,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchface.capture.video.lighting import estimate_light
+from torchface.capture.own_rig.lighting import estimate_light
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
+from torchface.capture.own_rig import VideoSettings, VideoSolution, VideoSolver
+from torchface.capture.own_rig.face_points import LANDMARKS
+from torchface.capture.own_rig.landmark_smoothing import filter_landmarks
+from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.capture.priors import DynamicsPrior, adapt_dynamics
-from torchface.capture.video import VideoSettings, VideoSolution, VideoSolver
-from torchface.capture.video.face_points import LANDMARKS
-from torchface.capture.video.landmark_smoothing import filter_landmarks
-from torchface.capture.video.offset_estimate import estimate_offsets
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io import load_rig
 from torchface.io.rigs.ict_facekit import load_identity_modes

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.capture.video import VideoSettings
+from torchface.capture.own_rig import VideoSettings
 from torchface.cli import main
 from torchface.io.camera_files import save_calibration
 from torchface.workflows.track.track_result import Tracked

@@ -17,6 +17,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
+from torchface.capture.own_rig import video_solver as frame_solve
+from torchface.capture.own_rig.face_points import FacePoints
+from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.capture.priors import (
     DynamicsPrior,
     DynamicsSettings,
@@ -25,10 +29,6 @@ from torchface.capture.priors import (
     ShapePrior,
 )
 from torchface.capture.retargeting import retarget_take, shape_map
-from torchface.capture.video import VideoSettings, VideoSolver, solve_whole_take
-from torchface.capture.video import video_solver as frame_solve
-from torchface.capture.video.face_points import FacePoints
-from torchface.capture.video.state_estimate import Expectation, StateEstimate
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.geometry.rotations import rotation_matrix

@@ -16,9 +16,7 @@ from onnx import ModelProto, TensorProto
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from torchface.capture.video import VideoState
-from torchface.capture.video.landmark_smoothing import LandmarkFilter
-from torchface.capture.webcam import (
+from torchface.capture.anybody import (
     AllAtOnce,
     ExampleShapes,
     ExampleSolver,
@@ -28,7 +26,9 @@ from torchface.capture.webcam import (
     character_matrix,
     paper_examples,
 )
-from torchface.capture.webcam.examples.example_methods import ExampleMethod
+from torchface.capture.anybody.examples.example_methods import ExampleMethod
+from torchface.capture.own_rig import VideoState
+from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration

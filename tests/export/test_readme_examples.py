@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
-from torchface.capture.video import VideoSolver
+from torchface.capture.own_rig import VideoSolver
 from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector

@@ -14,6 +14,11 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
 from torchface.capture.action_units.regions import RegionGroup
+from torchface.capture.anybody import ExampleSolver, WebcamSolver
+from torchface.capture.anybody.examples.example_shapes import ExampleShapes
+from torchface.capture.anybody.examples.landmark_model import LandmarkModel
+from torchface.capture.anybody.webcam_state import WebcamControls
+from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.priors import (
     AdaptedDynamicsPrior,
     DynamicsPrior,
@@ -21,11 +26,6 @@ from torchface.capture.priors import (
     ReciprocalPrior,
     ShapePrior,
 )
-from torchface.capture.video import VideoSettings, VideoSolver
-from torchface.capture.webcam import ExampleSolver, WebcamSolver
-from torchface.capture.webcam.examples.example_shapes import ExampleShapes
-from torchface.capture.webcam.examples.landmark_model import LandmarkModel
-from torchface.capture.webcam.webcam_state import WebcamControls
 from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals

@@ -26,7 +26,7 @@ from pretended_device import pretended
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
-from torchface.capture.video import VideoSolver
+from torchface.capture.own_rig import VideoSolver
 from torchface.errors import TraceError
 from torchface.onnx import VideoGraph
 from torchface.onnx.corrective_graph import CorrectiveGraph, HybridCorrectiveGraph

@@ -11,7 +11,7 @@ import torch
 
 from torchface import zoo
 from torchface.capture import ExampleSolver
-from torchface.capture.webcam import (
+from torchface.capture.anybody import (
     AllAtOnce,
     Distances,
     ExampleShapes,

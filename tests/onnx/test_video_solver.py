@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from torchface import __version__
+from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, GaussianMixture, ShapePrior
-from torchface.capture.video import VideoSettings, VideoSolver
 from torchface.cli import main
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ShapeError, ValueRangeError

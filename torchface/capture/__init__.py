@@ -1,6 +1,7 @@
 """Blendshape weights from what cameras and marker systems saw."""
 
 from torchface.capture.action_units import ActionUnitClassifier, CurveSettings, action_unit_curves
+from torchface.capture.anybody import ExampleSolver, WebcamControls, WebcamSolver
 from torchface.capture.markers import (
     HelmetSolver,
     HybridSolver,
@@ -11,9 +12,8 @@ from torchface.capture.markers import (
     fit_attachment,
     rest_residual,
 )
+from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ShapePrior
-from torchface.capture.video import VideoSolver
-from torchface.capture.webcam import ExampleSolver, WebcamControls, WebcamSolver
 
 __all__ = [
     "ActionUnitClassifier",

@@ -39,7 +39,7 @@ def examples(
         landmarks: What finds landmarks: a model of the zoo by name or folder, an .onnx file, or `mediapipe`.
         quiet: Show no progress.
     """
-    from torchface.capture.webcam import (
+    from torchface.capture.anybody import (
         ExampleSolver,
         example_remarks,
         landmark_observability,

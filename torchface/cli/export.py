@@ -179,7 +179,14 @@ def examples(
         solver: All shapes at once, the head first and then regions, or projected on a linear model of landmarks.
         quiet: Show no progress.
     """
-    from torchface.capture.webcam import AllAtOnce, ExampleMethod, ExampleShapes, ExampleSolver, LandmarkModel, Regional
+    from torchface.capture.anybody import (
+        AllAtOnce,
+        ExampleMethod,
+        ExampleShapes,
+        ExampleSolver,
+        LandmarkModel,
+        Regional,
+    )
     from torchface.files.job_lock import file_lock
     from torchface.onnx import export_example_solver
 

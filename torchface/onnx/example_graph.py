@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchface import __version__
-from torchface.capture.webcam import AllAtOnce, ExampleSolver, LandmarkBoxes, LandmarkModel, Regional, SquaredDistances
-from torchface.capture.webcam.examples.example_methods import head_rows, regional_basis
-from torchface.capture.webcam.examples.example_shapes import EYE_CORNERS
-from torchface.capture.webcam.examples.expression_regions import HEAD
+from torchface.capture.anybody import AllAtOnce, ExampleSolver, LandmarkBoxes, LandmarkModel, Regional, SquaredDistances
+from torchface.capture.anybody.examples.example_methods import head_rows, regional_basis
+from torchface.capture.anybody.examples.example_shapes import EYE_CORNERS
+from torchface.capture.anybody.examples.expression_regions import HEAD
 from torchface.errors import ValueRangeError
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.optim.operator_splitting import RELAXATION

@@ -13,7 +13,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import ExampleSolver
+from torchface.capture.anybody import ExampleSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.onnx.example_graph import STEPS, STEPS_AT_ONCE, example_model
@@ -104,7 +104,7 @@ def export_example_solver(
             written.
 
     Example:
-        >>> from torchface.capture.webcam import ExampleSolver, rig_examples
+        >>> from torchface.capture.anybody import ExampleSolver, rig_examples
         >>> from torchface.synthetic import performer
         >>> examples = rig_examples(performer(texture=False), ["jawOpen", "browInnerUp"])
         >>> export_example_solver(ExampleSolver(examples), "examples.onnx").size < 100_000

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from torchface.capture.own_rig.face_points import FacePoints
+from torchface.capture.own_rig.reprojection import HeadState, linearise
+from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.priors.student_groups import StudentGroups
-from torchface.capture.video.face_points import FacePoints
-from torchface.capture.video.reprojection import HeadState, linearise
-from torchface.capture.video.video_solver import VideoSolver
 from torchface.optim.exported_operators import split_box_program
 
 _SLIDING_STEPS = 3

@@ -8,8 +8,8 @@ from pathlib import Path
 from torch import nn
 
 from torchface.capture import ExampleSolver, MarkerSolver
+from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior
-from torchface.capture.video import VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.eyes import EyeNetwork

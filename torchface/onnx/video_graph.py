@@ -8,10 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
-from torchface.capture.video.face_points import LANDMARKS
-from torchface.capture.video.reprojection import HeadState
-from torchface.capture.video.solver_components import (
+from torchface.capture.own_rig.face_points import LANDMARKS
+from torchface.capture.own_rig.reprojection import HeadState
+from torchface.capture.own_rig.solver_components import (
     DEFAULT_WEIGHT_STEP,
     INITIAL_ROTATION,
     INITIAL_TRANSLATION,
@@ -19,8 +18,9 @@ from torchface.capture.video.solver_components import (
     ROTATION_STEP,
     TRANSLATION_STEP,
 )
-from torchface.capture.video.video_solver import VideoSolver
-from torchface.capture.video.weight_walk import faded, relative_trust, unseen_time, walk_information
+from torchface.capture.own_rig.video_solver import VideoSolver
+from torchface.capture.own_rig.weight_walk import faded, relative_trust, unseen_time, walk_information
+from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.onnx.gauss_newton_step import GaussNewtonStep

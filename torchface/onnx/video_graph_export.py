@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from torchface import __version__
+from torchface.capture.own_rig import VideoSettings, VideoSolver
+from torchface.capture.own_rig.landmark_smoothing import filter_landmarks
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior
-from torchface.capture.video import VideoSettings, VideoSolver
-from torchface.capture.video.landmark_smoothing import filter_landmarks
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import CameraCalibration

@@ -8,9 +8,9 @@ import onnx
 import torch
 
 from torchface.attachment import Attachment
+from torchface.capture.anybody import ExampleShapes, ExampleSolver, landmark_observability
+from torchface.capture.anybody.examples.example_shapes import is_examples
 from torchface.capture.markers import MarkerSolver, observability
-from torchface.capture.webcam import ExampleShapes, ExampleSolver, landmark_observability
-from torchface.capture.webcam.examples.example_shapes import is_examples
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import read_file
 from torchface.io import load_animation, load_mesh, load_rig, load_take

@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import nn
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
+from torchface.capture.anybody.examples.example_solver import ExampleSolver
 from torchface.capture.markers.marker_solver import MarkerSolver
+from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
-from torchface.capture.video.video_solver import VideoSolver
-from torchface.capture.webcam.examples.example_solver import ExampleSolver
 from torchface.enhancement.enhancement_model import EnhancementModel
 from torchface.landmarks.images.appearance_model import AppearanceModel
 from torchface.landmarks.images.box_network import BoxNetwork

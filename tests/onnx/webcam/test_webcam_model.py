@@ -12,7 +12,7 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 from torch import Tensor
 
 from torchface import zoo
-from torchface.capture.webcam.webcam_state import CONTROLS
+from torchface.capture.anybody.webcam_state import CONTROLS
 from torchface.landmarks import LandmarkTracker
 from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop

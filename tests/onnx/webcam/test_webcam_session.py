@@ -9,7 +9,7 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.shape_names import ARKIT

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from torchface import zoo
-from torchface.capture.webcam import WebcamSettings, WebcamSolver
-from torchface.capture.webcam.webcam_state import CONTROLS
+from torchface.capture.anybody import WebcamSettings, WebcamSolver
+from torchface.capture.anybody.webcam_state import CONTROLS
 from torchface.onnx.webcam.webcam_solver_graph import INPUTS, OUTPUTS, READING, empty_reading, webcam_solver_model
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import ExampleShapes, paper_examples, paper_expressions
+from torchface.capture.anybody import ExampleShapes, paper_examples, paper_expressions
 from torchface.cli import main
 from torchface.errors import NameMismatchError
 from torchface.io import save_rig

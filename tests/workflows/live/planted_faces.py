@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.io.video import VideoFile, write_video
 from torchface.shape_names import ARKIT
 from torchface.workflows.live.solved_frames import LiveFrame

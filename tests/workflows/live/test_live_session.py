@@ -14,7 +14,7 @@ import torch
 from planted_faces import JAW, SMILE, Endless, ShadeSolver, film
 
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights

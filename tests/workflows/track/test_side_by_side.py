@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from torchface.capture.video import VideoSolution
+from torchface.capture.own_rig import VideoSolution
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.io.video import VideoFile
 from torchface.synthetic import performer

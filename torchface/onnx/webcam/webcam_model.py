@@ -9,8 +9,8 @@ import torch
 from onnx import TensorProto
 
 from torchface import __version__
-from torchface.capture.webcam import WebcamControls
-from torchface.capture.webcam.webcam_state import CONTROLS, POSES
+from torchface.capture.anybody import WebcamControls
+from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.errors import ShapeError
 from torchface.landmarks.images.network import COUNT
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph

@@ -11,7 +11,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 
 SMALLEST = 64

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from torchface import __version__
-from torchface.capture.webcam import WebcamSolver
-from torchface.capture.webcam.webcam_state import CONTROLS, POSES
+from torchface.capture.anybody import WebcamSolver
+from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import ExampleExpression, ExampleShapes, paper_expressions, shown_examples
+from torchface.capture.anybody import ExampleExpression, ExampleShapes, paper_expressions, shown_examples
 from torchface.io.video import open_video
 from torchface.landmarks import LandmarkTracker, NoFaceError
 from torchface.number_checks import checked_number

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from torchface.capture.webcam import ExampleShapes, paper_expressions, shown_examples
-from torchface.capture.webcam.examples.example_expressions import NEUTRAL
+from torchface.capture.anybody import ExampleShapes, paper_expressions, shown_examples
+from torchface.capture.anybody.examples.example_expressions import NEUTRAL
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.images.image_files import load_image
 from torchface.landmarks import NoFaceError, find_landmarks

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from torchface.capture.video import VideoState
-from torchface.capture.video.landmark_offsets import LandmarkOffsets
-from torchface.capture.video.landmark_smoothing import LandmarkFilter
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
+from torchface.capture.own_rig import VideoState
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.landmark_smoothing import LandmarkFilter
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort

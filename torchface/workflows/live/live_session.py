@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.errors import FileFormatError
 from torchface.progress import Progress, silent
 from torchface.viz.browser.live_view import LiveView

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.onnx.webcam.webcam_session import WebcamSession
 from torchface.progress import Progress
 from torchface.workflows.live.solved_frames import LiveFrame

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import WebcamControls
+from torchface.capture.anybody import WebcamControls
 from torchface.workflows.live.live_frames import FrameSource
 from torchface.workflows.track.head_rotations import eye_angles, head_angles
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchface.capture.video import VideoSolver
-from torchface.capture.video.landmark_offsets import LandmarkOffsets
-from torchface.capture.video.offset_estimate import estimate_offsets
+from torchface.capture.own_rig import VideoSolver
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.offset_estimate import estimate_offsets
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.rig import BlendshapeRig

@@ -7,7 +7,7 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from torchface.capture.video import VideoSolution
+from torchface.capture.own_rig import VideoSolution
 from torchface.errors import FileFormatError, TorchfaceError
 from torchface.files.whole_files import delete_file, make_folder, read_file, write_file
 from torchface.io import save_animation

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from torchface.capture.video import VideoSettings, VideoSolver
+from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.io import load_rig

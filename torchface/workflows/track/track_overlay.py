@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.capture.video.face_points import FacePoints
-from torchface.capture.video.lighting import PointLight, estimate_light
+from torchface.capture.own_rig.face_points import FacePoints
+from torchface.capture.own_rig.lighting import PointLight, estimate_light
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera

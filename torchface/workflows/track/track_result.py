@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.video import VideoSolution
-from torchface.capture.video.head_pose import STABLE_LANDMARKS
-from torchface.capture.video.landmark_offsets import LandmarkOffsets
-from torchface.capture.video.weight_walk import HIDDEN
+from torchface.capture.own_rig import VideoSolution
+from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS
+from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
+from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.landmarks.images.landmark_measures import landmark_jitter

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-from torchface.capture.video.landmark_smoothing import filter_landmarks, smooth_landmarks
-from torchface.capture.video.weight_walk import frame_intervals
+from torchface.capture.own_rig.landmark_smoothing import filter_landmarks, smooth_landmarks
+from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.capture.video import VideoSolution, VideoSolver
-from torchface.capture.video.even_frames import even_times, solution_at, values_at
-from torchface.capture.video.video_smoothing import interpolated, solve_whole_take
-from torchface.capture.video.weight_walk import frame_intervals
+from torchface.capture.own_rig import VideoSolution, VideoSolver
+from torchface.capture.own_rig.even_frames import even_times, solution_at, values_at
+from torchface.capture.own_rig.video_smoothing import interpolated, solve_whole_take
+from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.progress import Progress
 from torchface.workflows.track.track_result import MIN_STABLE
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchface import zoo
-from torchface.capture.webcam import WebcamSettings, WebcamSolver
+from torchface.capture.anybody import WebcamSettings, WebcamSolver
 from torchface.errors import NameMismatchError
 from torchface.modeling import HeadModel
 from torchface.synthetic.head.performer import performer

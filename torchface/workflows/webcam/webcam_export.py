@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.capture.webcam import WebcamControls, WebcamSolver
+from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import check_writable, write_file
 from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes

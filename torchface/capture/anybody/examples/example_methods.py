@@ -1,0 +1,111 @@
+"""Two ways to solve landmarks for the weights of examples: all shapes at once, or the head first, then regions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchface.capture.anybody.examples.expression_regions import HEAD, HEAD_LANDMARKS, REGION_LANDMARKS
+from torchface.capture.anybody.examples.landmark_equations import LandmarkEquations, Unknowns
+from torchface.capture.anybody.examples.landmark_objectives import LandmarkObjective, SquaredDistances
+
+
+class ExampleMethod(Protocol):
+    """Finds weights in [0,1], and the placement, from the equations of landmarks.
+
+    Example:
+        >>> ways: list[ExampleMethod] = [AllAtOnce(), Regional()]
+        >>> len(ways)
+        2
+    """
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns: ...
+
+
+@dataclass(frozen=True)
+class AllAtOnce:
+    """All shapes from all landmarks in one problem.
+
+    Args:
+        objective: what is minimised.
+
+    Source: realtime_facial_animation 5.2.2, listings 3 and 4.
+
+    Example:
+        >>> from torchface.capture.anybody import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, AllAtOnce())
+        >>> weights = solver(examples.landmarks[:4].double())
+        >>> weights.argmax(1).tolist()  # each of four is found to be itself
+        [0, 1, 2, 3]
+    """
+
+    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
+        """Weights of N shapes, whatever their regions (N,)."""
+        return self.objective.minimise(equations, initial)
+
+
+@dataclass(frozen=True)
+class Regional:
+    """Shapes of the head first; then those of brows, eyes and mouth, each from its region's landmarks alone.
+
+    The head's are solved from nose and corners of the eyes, which expressions move least. What they and the neutral
+    make is the base of the expressions. The paper's code took a base that held the expression of the frame before as
+    well, so that it was counted twice, and gave ``suck`` to the brows; both are mended.
+
+    Args:
+        objective: what is minimised in each of the two steps.
+
+    Source: realtime_facial_animation 5.2.2, listings 5 and 6.
+
+    Example:
+        >>> from torchface.capture.anybody import ExampleSolver, paper_examples
+        >>> from torchface.synthetic import performer
+        >>> examples = paper_examples(performer(texture=False))
+        >>> solver = ExampleSolver(examples, Regional())
+        >>> weights = solver(examples.landmarks[:4].double())
+        >>> weights.argmax(1).tolist()  # each of four is found to be itself
+        [0, 1, 2, 3]
+    """
+
+    objective: LandmarkObjective = field(default_factory=SquaredDistances)
+
+    def solve(self, equations: LandmarkEquations, regions: tuple[str, ...], initial: Tensor | None) -> Unknowns:
+        """Weights of N shapes in their regions (N,)."""
+        basis = equations.basis
+        of_head = torch.tensor([region == HEAD for region in regions], device=basis.device)
+        head, others = of_head.nonzero()[:, 0], (~of_head).nonzero()[:, 0]
+        rows = head_rows(basis)
+        # Where a hand hides nose and eyes the whole face must do.
+        shown = (equations.seen & rows).sum(1, keepdim=True) >= len(HEAD_LANDMARKS) // 2
+        first = equations.with_basis(basis[..., head]).among(torch.where(shown, rows, True))
+        if len(head):
+            placed = self.objective.minimise(first, None if initial is None else initial[:, head])
+        else:  # the placement alone
+            placed = first.least_squares(first.share).unknowns(first.offset.new_zeros(len(first.offset), 0))
+        rest = equations.moved(basis[..., head], placed).with_basis(regional_basis(basis, regions)[..., others])
+        expression = self.objective.minimise(rest, None if initial is None else initial[:, others])
+        order = torch.cat([head, others]).argsort()
+        return Unknowns(torch.cat([placed.weights, expression.weights], dim=1)[:, order], placed.free)
+
+
+def head_rows(like: Tensor) -> Tensor:
+    """The landmarks that say how the head is turned, (68,) bool, on the device of ``like``."""
+    rows = torch.zeros(68, dtype=torch.bool, device=like.device)
+    rows[list(HEAD_LANDMARKS)] = True
+    return rows
+
+
+def regional_basis(basis: Tensor, regions: tuple[str, ...]) -> Tensor:
+    """The basis (68,2,N) with each shape of a region moving that region's landmarks alone."""
+    kept = torch.zeros(len(basis), len(regions), dtype=torch.bool, device=basis.device)
+    for column, region in enumerate(regions):
+        if region != HEAD:
+            kept[list(REGION_LANDMARKS[region]), column] = True
+    return torch.where(kept[:, None], basis, 0.0)

@@ -1,0 +1,95 @@
+"""From a solved frame, or one without a face, to the state that is shown: held, relaxed, calmed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchface.capture.anybody.guided_gains import gain_factors
+from torchface.capture.anybody.webcam_state import PARTS, WebcamState
+from torchface.capture.anybody.weight_filter import one_euro_step
+from torchface.geometry.rotations import rotation_matrix
+
+_HOLD, _RELAX = 0.3, 0.5
+"""For how long a lost face is held, and how long it then takes to rest, seconds."""
+_MISFIT, LOST_FIT = 0.06, 0.14  # of the eyes' distance
+
+
+@dataclass(frozen=True, eq=False)
+class ShownOutputs:
+    """What outputs are made by.
+
+    Args:
+        gain_shapes: which shapes each gain is of, as ``gain_factors`` wants them.
+        to_arkit: from the rig's weights to ARKit's, (52,N).
+        filter_units: what counts as one in the filter, of weights, radians and millimetres, (58,).
+    """
+
+    gain_shapes: Tensor
+    to_arkit: Tensor
+    filter_units: Tensor
+
+
+def lost_state(before: WebcamState, interval: Tensor) -> WebcamState:
+    """The state of a frame without a face: as it was, then on its way to rest."""
+    lost = before.lost + interval
+    left = (_HOLD + _RELAX - before.lost).clamp(max=_RELAX)
+    left_now = (_HOLD + _RELAX - lost).clamp(min=0, max=_RELAX)
+    share = torch.where(left > 0, left_now / left.clamp(min=1e-6), 0.0)
+    return replace(
+        before,
+        weights=before.weights * share,
+        shapes=before.shapes * share,
+        gaze=before.gaze * share,
+        speeds=torch.zeros_like(before.speeds),
+        shown=torch.zeros_like(before.shown),
+        tracked=torch.zeros_like(before.tracked),
+        lost=torch.where((before.pose.abs().sum() > 0), lost, 0.0),
+    )
+
+
+def shown_state(
+    outputs: ShownOutputs,
+    after: WebcamState,
+    before: WebcamState,
+    found: Tensor,
+    present: Tensor,
+    interval: Tensor,
+    gain: Tensor,
+    smoothing: Tensor,
+) -> WebcamState:
+    """The state with its outputs: weights by ARKit's names with gains, calmed."""
+    gains = gain_factors(after.gains, outputs.gain_shapes)
+    weights = (gain * (outputs.to_arkit @ (after.shapes / gains))).clamp(0, 1)
+    pose = after.pose
+    first = (before.pose.abs().sum() < 1e-9) | (after.shown < 1.5 * interval)
+    turned = pose[:9].reshape(3, 3)
+    # The sine of the turn for the turn: between two frames it is small.
+    apart = 0.5 * (turned @ before.rotation.T - before.rotation @ turned.T)
+    turn = torch.stack([apart[2, 1], apart[0, 2], apart[1, 0]])
+    motion = torch.cat([turn, pose[9:] - before.translation])
+    speeds = torch.where(first, 0.0, before.speeds)
+    old = torch.cat([before.weights, torch.zeros_like(motion)])
+    unit = outputs.filter_units
+    calm, speeds = one_euro_step(torch.cat([weights, motion]), old, speeds, interval, smoothing, unit)
+    rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
+    translation = torch.where(first, pose[9:], before.translation + calm[-3:])
+    fit = ((LOST_FIT - after.error) / (LOST_FIT - _MISFIT)).clamp(0, 1)
+    return replace(
+        after,
+        weights=torch.where(found, calm[:-6].clamp(0, 1), after.weights),
+        rotation=torch.where(found, rotation, before.rotation),
+        translation=torch.where(found, translation, before.translation),
+        speeds=torch.where(found, speeds, after.speeds),
+        tracked=torch.where(found, present * fit, 0.0),
+    )
+
+
+def double_state(state: WebcamState) -> WebcamState:
+    return WebcamState(*(getattr(state, name).double() for name in PARTS))
+
+
+def chosen_state(condition: Tensor, one: WebcamState, other: WebcamState) -> WebcamState:
+    return WebcamState(*(torch.where(condition, getattr(one, name), getattr(other, name)) for name in PARTS))

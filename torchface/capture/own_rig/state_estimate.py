@@ -1,0 +1,82 @@
+"""Estimates of weights and head pose, with their covariance, from one frame to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.reprojection import HeadState
+
+
+@dataclass(frozen=True, eq=False)
+class StateEstimate:
+    r"""A Gaussian over B faces' weights and poses, from landmarks and dynamics alone.
+
+    The prior of which weights faces have and the weights' bounds are left out: they hold in every frame anew, and were
+    they folded in, each frame would count them again. So the means may lie outside [0,1] where little was seen.
+
+    Args:
+        mean: weights (B,N) and pose.
+        covariance: of weights, rotation and translation in the camera's frame, (B,N+6,N+6).
+    """
+
+    mean: HeadState
+    covariance: Tensor
+
+    def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> StateEstimate:
+        """One frame on.
+
+        Args:
+            steps: by which the weights are expected to change, (B,N).
+            variance: of that, (B,N).
+            motion_variance: of the head's motion between frames, (6,).
+        """
+        noise = torch.cat([variance, motion_variance.expand(len(variance), 6)], dim=1)
+        mean = HeadState(self.mean.weights + steps, self.mean.rotation, self.mean.translation)
+        return StateEstimate(mean, self.covariance + torch.diag_embed(noise))
+
+    def expectation(self) -> Expectation:
+        """As an energy."""
+        return Expectation(self.mean, torch.cholesky_inverse(torch.linalg.cholesky(self.covariance)))
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    r"""What is expected of a frame before it is seen, :math:`E(x) = \tfrac12 (x - m)^\top \Lambda (x - m)`.
+
+    Args:
+        mean: m, weights (B,N) and pose.
+        information: :math:`\Lambda`, of weights, rotation and translation, (B,N+6,N+6).
+    """
+
+    mean: HeadState
+    information: Tensor
+
+    def residual(self, head: HeadState) -> Tensor:
+        """From the mean to a state, (B,N+6)."""
+        motion = head.motion_from(self.mean.rotation, self.mean.translation)
+        return torch.cat([head.weights - self.mean.weights, motion], dim=1)
+
+    def quadratic(self, head: HeadState) -> Quadratic:
+        """Over the weights and the head's motion from a state."""
+        motion = head.motion_from(self.mean.rotation, self.mean.translation)
+        beyond = torch.cat([-self.mean.weights, motion], dim=1)
+        return Quadratic(self.information, (self.information @ beyond[..., None])[..., 0])
+
+    def updated(self, head: HeadState, seen: Quadratic) -> StateEstimate:
+        """After a frame whose landmarks were linearised at a state.
+
+        Args:
+            head: the state.
+            seen: the landmarks' energy, over the weights and the head's motion from there.
+
+        Source: Kalman 1960, in its information form.
+        """
+        shapes = head.weights.shape[1]
+        both = seen + self.quadratic(head)
+        covariance = torch.cholesky_inverse(torch.linalg.cholesky(both.H))
+        least = -(covariance @ both.f[..., None])[..., 0]
+        return StateEstimate(head.moved(least[:, :shapes], least[:, shapes:]), covariance)

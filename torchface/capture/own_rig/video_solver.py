@@ -1,0 +1,404 @@
+"""Blendshape weights from landmarks in the images of one camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchface.capture.energy import Quadratic
+from torchface.capture.own_rig.face_points import LANDMARKS
+from torchface.capture.own_rig.frame_states import FrameTerms, Solved, VideoSolution, VideoState
+from torchface.capture.own_rig.reprojection import HeadState, linearise
+from torchface.capture.own_rig.solver_components import DEFAULT_WEIGHT_STEP, VideoSolverParts, check_not_negative
+from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
+from torchface.capture.own_rig.weight_walk import faded, frame_intervals, unseen_time, walk_information
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.geometry.cameras.pnp import solve_pnp
+from torchface.optim.active_set import projected_newton
+from torchface.optim.box_problem import BoxProblem
+from torchface.optim.data_dependent import data_dependent
+from torchface.optim.fixed_point_gradient import attach_gradients
+from torchface.optim.warm_active_set import solve_from_active_set
+
+_MIN_LANDMARKS = 6
+_SLIDING_STEPS = 3
+_NEAR = 0.5  # of the eyes' distance
+_COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
+_NEWTON_STEPS = 50
+
+
+class VideoSolver(VideoSolverParts):
+    r"""Solves 68 landmarks in one camera's frames for blendshape weights, and the head's pose with them.
+
+    .. math::
+        \min_{0 \le w \le 1,\, R,\, t} \; \tfrac12 \sum_l \frac{c_l}{\sigma^2}
+        \lVert \pi(K (R (b_l + B_l w) + t)) - q_l \rVert^2
+        - \lambda \log p(w) + \beta \sum_i w_i + \varepsilon \lVert w \rVert^2
+        + \tfrac12 (x - m)^\top (V + P)^{-1} (x - m) + \kappa \, D(R, t; \hat R, \hat t)
+
+    Every term is a negative log likelihood, so each is in units of its own variance. It is solved by Gauss-Newton's
+    steps, quadratic programs in a box, each frame from the one before, in float64. Contour landmarks slide to where the
+    face is seen to end; their errors along the contour count less.
+
+    The term before the last is the dynamics prior's: x are weights and pose, m where the last frames lead to and V the
+    variance of that. The thesis divides by V alone, as if the last frames' weights were true. They have a
+    covariance P, which a Kalman filter of the landmarks carries on; it tells directions in which the landmarks show
+    little, such as depth, from those that they show well, and so averages over the more frames the less one tells.
+    Without a dynamics prior m is the last frame's weights and V the variance of a random walk, where
+    ``settings.motion`` says how far weights wander; otherwise each frame is solved on its own.
+
+    A pose tracked from stable landmarks is noisy, and biased by what the face does, so it is where the search starts,
+    no more, unless ``pose_trust`` is positive: D is the distance from it in what the frame's landmarks tell of a pose.
+
+    Args:
+        rig: N shapes, of the person in the image.
+        landmark_vertices: the 68 in iBUG's order, vertex ids; the rig's annotated ones if absent.
+        intrinsics: K, (3,3), pixels; of images without distortion.
+        prior: which weights faces have; its ``strength`` is :math:`\lambda`.
+        dynamics: how weights go on.
+        settings: what the terms weigh, and when steps end; :math:`\sigma` grows with the face where they say so.
+        landmark_weights: :math:`c`, (68,); 1 for inner landmarks, half for those of the contour if absent.
+
+    Raises:
+        NameMismatchError: a prior was learned for other shapes than the rig has.
+        ShapeError, ValueRangeError: an argument is not as above.
+
+    Source: thesis 4.2.6, 4.2.9, 4.2.10; equations 40, 44, 65.
+
+    Example:
+        >>> from torchface import zoo
+        >>> from torchface.synthetic import performer
+        >>> rig = performer(texture=False)
+        >>> camera = torch.tensor([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+        >>> head = rig.vertices[rig.neutral.landmarks] * torch.tensor([1.0, -1, -1]) + torch.tensor([0.0, 0, 700])
+        >>> pixels = 900 * head[:, :2] / head[:, 2:] + torch.tensor([320.0, 240.0])
+        >>> solution = VideoSolver(rig, None, camera, zoo.get_model("shape_prior"))(pixels[None])
+        >>> bool(solution.weights.max() < 0.1), bool((solution.translation[0, 2] - 700).abs() < 10)
+        (True, True)
+    """
+
+    @data_dependent("torchface.onnx.VideoGraph, which `torchface export video-solver` writes")
+    def forward(
+        self,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+        seconds: Tensor | None = None,
+    ) -> VideoSolution:
+        """Weights and poses of consecutive frames, each from what was seen until then.
+
+        Args:
+            landmarks: (T,68,2), pixels; NaN for not seen.
+            rotation, translation: tracked poses, rig to camera, (T,3,3) and (T,3), NaN for lost; found here if absent.
+            confidence: how far each landmark is trusted, (T,68) in [0,1].
+            seconds: when each frame is shown, (T,), rising; ``settings.interval`` apart if absent.
+
+        Returns:
+            What the face did, in the dtype of the landmarks; differentiable in all arguments, through all frames. A
+            pose that is found here counts as given.
+
+        Raises:
+            ShapeError: the shapes do not fit each other.
+            ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
+        """
+        states, enough = self.states(landmarks, rotation, translation, confidence, seconds)
+        weights, rotations, translations = (
+            torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
+            for name in ("weights", "rotation", "translation")
+        )
+        errors = self.reprojection_errors(landmarks, weights, rotations, translations)
+        told = self.shape_confidence(self.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
+        return VideoSolution(weights, rotations, translations, errors, enough, told)
+
+    def states(
+        self,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+        seconds: Tensor | None = None,
+    ) -> tuple[list[VideoState], Tensor]:
+        """The states after each of T frames, and which frames showed a face, (T,) bool; arguments as ``forward``.
+
+        Frames before the first face have its state.
+        """
+        count = self._check(landmarks, rotation, translation, confidence)
+        enough = (self.landmark_trust(landmarks, confidence) > 0).sum(1) >= _MIN_LANDMARKS
+        if not bool(enough.any()):
+            raise ValueRangeError(
+                f"landmarks: found fewer than {_MIN_LANDMARKS} in each of {count} frames, expected a face in some"
+            )
+        states, state = [], self.start()
+        first = int(enough.nonzero()[0, 0])
+        intervals = frame_intervals(seconds, count, self.settings.interval)
+        # A frame leans on the one before, so frames come one after the other.
+        for t in range(first, count):
+            turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
+            state = self.step(state, landmarks[t], turn, place, sure, intervals[t])
+            states.append(state)
+        return [states[0]] * first + states, enough
+
+    def start(self) -> VideoState:
+        """The state before the first frame."""
+        return VideoState(None, None, self.lower.new_zeros(1, 0, len(self.names), dtype=torch.float64))
+
+    @data_dependent("torchface.onnx.VideoGraph, which `torchface export video-solver` writes")
+    def step(
+        self,
+        state: VideoState,
+        landmarks: Tensor,
+        rotation: Tensor | None = None,
+        translation: Tensor | None = None,
+        confidence: Tensor | None = None,
+        interval: float | None = None,
+    ) -> VideoState:
+        """The next frame's state; its ``weights``, ``rotation`` and ``translation`` are the frame's.
+
+        A frame with fewer than six landmarks keeps the weights of the frame before: rest is likeliest of all faces, but
+        not of one that smiled a moment ago. So do shapes whose landmarks are hidden, where ``settings.motion`` says how
+        weights wander; after a third of a second those go to rest, and all of a face that is lost.
+
+        Args:
+            state: of the frame before; ``start()`` for the first.
+            landmarks: (68,2), pixels; NaN for not seen.
+            rotation, translation: the tracked pose, (3,3) and (3,); the last one's if absent or NaN.
+            confidence: (68,) in [0,1].
+            interval: seconds since the frame before; ``settings.interval`` if absent.
+
+        Raises:
+            ShapeError: an argument is not as above.
+            ValueRangeError: the first frame shows fewer than six landmarks, or a landmark is infinite.
+        """
+        given = [None if x is None else x[None] for x in (rotation, translation, confidence)]
+        self._check(landmarks[None], *given)
+        found = landmarks[None].double()
+        rotation, translation, confidence = (None if x is None else x.double() for x in given)
+        seen = torch.isfinite(found).all(-1)
+        # Filtered landmarks go on for some frames after a face was lost, with a confidence of 0.
+        trusted = int((self.landmark_trust(found, confidence) > 0).sum())
+        enough = trusted >= _MIN_LANDMARKS
+        if state.head is None and not enough:
+            raise ValueRangeError(
+                f"landmarks: found {trusted} in the first frame, expected at least {_MIN_LANDMARKS} to start"
+            )
+        if rotation is None or translation is None or not _finite(rotation, translation):
+            rotation, translation = self._pose_of(state, found, confidence, enough)
+        trust = self.landmark_trust(found, confidence) * enough
+        interval = self.settings.interval if interval is None else interval
+        told = self.shape_confidence(trust)
+        hidden = unseen_time(state.hidden, told, interval)
+        expected = self._expected(state, rotation, translation, told, hidden, interval)
+        at = HeadState(expected.mean.weights, rotation, translation) if state.head is None else state.head
+        noise = self.noise(at.rotation, at.translation)
+        precision = self._precision(seen if enough else torch.zeros_like(seen), confidence, noise)
+        terms = FrameTerms(found.nan_to_num(0.0), precision, rotation, translation, expected)
+        if state.head is not None and not enough:
+            weights = expected.mean.weights if self.walks else state.head.weights
+            held = HeadState(weights, rotation, translation)
+            return self._handed_on(state, terms, expected, Solved(held, self._chosen(held)), enough, hidden)
+        # After a gap the tracked pose is nearer than where the head was left.
+        near = (
+            expected.mean
+            if state.solved and state.estimate is not None
+            else HeadState(expected.mean.weights, rotation, translation)
+        )
+        begin = expected.mean.weights if state.head is None else state.head.weights
+        solved = self.solve(terms, HeadState(begin.clamp(0, 1), near.rotation, near.translation).detached())
+        return self._handed_on(state, terms, expected, solved, enough, hidden)
+
+    def _handed_on(
+        self,
+        state: VideoState,
+        terms: FrameTerms,
+        expected: Expectation,
+        solved: Solved,
+        enough: bool,
+        hidden: Tensor,
+    ) -> VideoState:
+        head = solved.head
+        if self.dynamics is None:
+            return VideoState(head, None, state.window, enough, hidden)
+        estimate = expected.updated(head, self.seen(terms, head, solved.rows))
+        window = torch.cat([state.window, head.weights[:, None]], dim=1)[:, -self.dynamics.window :]
+        return VideoState(head, estimate, window, enough, hidden)
+
+    def _expected(
+        self,
+        state: VideoState,
+        rotation: Tensor,
+        translation: Tensor,
+        told: Tensor,
+        hidden: Tensor,
+        interval: float,
+    ) -> Expectation:
+        """The prediction for the next frame from those before."""
+        if state.estimate is not None and self.dynamics is not None:
+            return self.predicted(state, state.estimate).expectation()
+        information = self.initial_information.double()
+        if state.head is None or not self.walks:
+            mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
+            return Expectation(mean, information.diag()[None])
+        walked = walk_information(self.walk_variance.double(), told, interval)
+        weights = state.head.weights * faded(hidden, interval)
+        information = torch.cat([walked, information[None, -6:]], dim=1)
+        return Expectation(HeadState(weights, rotation, translation), torch.diag_embed(information))
+
+    def predicted(self, state: VideoState, estimate: StateEstimate) -> StateEstimate:
+        """The prediction for the next frame from a frame's estimate."""
+        if self.dynamics is None or state.window.shape[1] < self.dynamics.window:
+            steps = torch.zeros_like(estimate.mean.weights)
+            variance = torch.full_like(steps, DEFAULT_WEIGHT_STEP**2)
+        else:
+            mean, variance = self.dynamics(state.window.to(self.dynamics.center.dtype))
+            steps, variance = mean.double() - state.window[:, -1], variance.double() / self.settings.dynamics_strength
+        return estimate.predicted(steps, variance, self.motion_variance.double())
+
+    def solve(self, terms: FrameTerms, start: HeadState) -> Solved:
+        """Weights (B,N) in [0,1] and poses of B frames on their own, from a start, float64."""
+        # Steps are many and small; what tensors keep for derivatives is a fifth of their cost.
+        with torch.inference_mode():
+            head, rows = start, self._chosen(start)
+            for iteration in range(self.settings.steps):
+                # Which points the contour's landmarks are is settled first; later it could go back and forth.
+                if 0 < iteration < _SLIDING_STEPS:
+                    rows = self._chosen(head)
+                before, head = head, self._advanced(terms, head, rows)
+                if float((head.weights - before.weights).abs().max()) < self.settings.tolerance:
+                    break
+        # Copies, as autograd refuses tensors that were made without it.
+        head, rows = HeadState(head.weights.clone(), head.rotation.clone(), head.translation.clone()), rows.clone()
+        if torch.is_grad_enabled() and any(x.requires_grad for x in terms.tensors()):
+            head = self._attached(terms, head, rows)
+        return Solved(head, rows)
+
+    def _chosen(self, head: HeadState) -> Tensor:
+        return self.points.chosen(head.weights, head.rotation, head.translation, self.intrinsics.double())
+
+    def _advanced(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
+        """One Gauss-Newton step: a quadratic program, warm-started."""
+        shapes, lower, upper = len(self.names), self.lower.double(), self.upper.double()
+        energy = self.energy(terms, head, rows)
+        begin = torch.nn.functional.pad(head.weights, (0, 6))
+        exactness = min(max(0.1 * self.settings.tolerance, _FINEST), _COARSEST)
+        if len(begin) == 1:
+            H, f = energy.H[0], energy.f[0]
+            found = solve_from_active_set(H, f, lower, upper, begin[0], exactness, _NEWTON_STEPS)[None]
+        else:
+            H = 0.5 * (energy.H + energy.H.transpose(1, 2))
+            problem = BoxProblem.of(H, energy.f, lower, upper)
+            found = projected_newton(problem, begin, exactness, _NEWTON_STEPS)
+        return head.moved(found[:, :shapes], found[:, shapes:])
+
+    def energy(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
+        """All terms about a state, over the weights and the head's motion from there, (B,N+6)."""
+        penalty = Quadratic(self.ridge.double().diag(), self.l1_penalty.double()[None])
+        total = self.seen(terms, head, rows) + terms.expected.quadratic(head) + penalty
+        return total if self.prior is None else total + _beside_motion(self.prior.energy(head.weights))
+
+    def seen(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> Quadratic:
+        """Landmarks and tracked poses, linearised at a state, over weights and motion from there, (B,N+6)."""
+        K, slide = self.intrinsics.double(), self.settings.contour_slide
+        at = linearise(self.points, head, rows, K, terms.landmarks, terms.precision, slide)
+        data = at.quadratic(head.weights)
+        if self.settings.pose_trust == 0:
+            return data
+        shapes = len(self.names)
+        by_motion = at.jacobian[..., shapes:].flatten(1, 2)
+        precision = self.settings.pose_trust * (by_motion.transpose(1, 2) @ by_motion)
+        residual = head.motion_from(terms.rotation, terms.translation)
+        H = torch.nn.functional.pad(precision, (shapes, 0, shapes, 0))
+        return data + Quadratic(H, torch.nn.functional.pad((precision @ residual[..., None])[..., 0], (shapes, 0)))
+
+    def _attached(self, terms: FrameTerms, head: HeadState, rows: Tensor) -> HeadState:
+        """The converged state as a differentiable function of the terms."""
+        shapes = len(self.names)
+
+        def gradient(x: Tensor) -> Tensor:
+            near = head.moved(x[:, :shapes], x[:, shapes:])
+            energy = self.energy(terms, near, rows)
+            here = torch.nn.functional.pad(near.weights, (0, 6))
+            return (energy.H @ here[..., None])[..., 0] + energy.f
+
+        x = torch.nn.functional.pad(head.weights, (0, 6))
+        free = (x > self.lower) & (x < self.upper)
+        x = attach_gradients(gradient, x, free)
+        return head.moved(x[:, :shapes], x[:, shapes:])
+
+    def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+        """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen."""
+        weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
+        points, K = self.points, self.intrinsics.double()
+        rows = points.chosen(weights, rotation, translation, K)
+        placed = points.at(weights)[torch.arange(len(rows), device=rows.device)[:, None], rows]
+        image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
+        squared = (image[..., :2] / image[..., 2:] - landmarks.detach().double()).square().sum(-1)
+        return squared.nanmean(1).sqrt().to(landmarks.dtype)
+
+    def noise(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The standard deviation of landmarks of heads at poses (B,3,3), (B,3), (B,), pixels."""
+        apart = self.points.eyes_distance(rotation, translation, self.intrinsics.double())
+        return (self.settings.relative_noise * apart).clamp(min=self.settings.pixel_noise)
+
+    def _precision(self, seen: Tensor, confidence: Tensor | None, noise: Tensor) -> Tensor:
+        weights = self.landmark_weights.double() * seen
+        if confidence is not None:
+            weights = weights * confidence
+        # The root's slope is infinite at 0.
+        return torch.where(weights > 0, weights, 1.0).sqrt() * (weights > 0) / noise[:, None]
+
+    def landmark_trust(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
+        """How much each of landmarks (B,68,2) counts beside one that is surely seen, (B,68) float64."""
+        seen = torch.isfinite(landmarks).all(-1).double()
+        return seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+
+    def _near(self, head: HeadState, landmarks: Tensor) -> bool:
+        """Whether most landmarks (1,68,2) are within half the eyes' distance of where a pose shows the rig at rest."""
+        K = self.intrinsics.double()
+        rest = self.rest[:LANDMARKS].double() @ head.rotation[0].detach().T + head.translation[0].detach()
+        image = rest @ K.T
+        off = (image[:, :2] / image[:, 2:] - landmarks[0].detach()).norm(dim=1).nanmedian()
+        return float(off) < _NEAR * float(self.points.eyes_distance(head.rotation, head.translation, K).detach())
+
+    def _pose_of(
+        self, state: VideoState, landmarks: Tensor, confidence: Tensor | None, enough: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Of the frame before, or by all landmarks where that showed no face, or one far from here."""
+        if state.head is not None and (not enough or (state.solved and self._near(state.head, landmarks))):
+            return state.head.rotation, state.head.translation
+        trust = self.landmark_weights.double() * self.landmark_trust(landmarks, confidence)
+        pose = solve_pnp(self.rest[:LANDMARKS], landmarks.detach(), self.intrinsics, trust)
+        if state.head is not None and not _finite(pose.rotation, pose.translation):
+            return state.head.rotation, state.head.translation
+        return pose.rotation, pose.translation
+
+    def _check(
+        self, landmarks: Tensor, rotation: Tensor | None, translation: Tensor | None, confidence: Tensor | None
+    ) -> int:
+        count = len(landmarks)
+        expected = {"landmarks": (count, LANDMARKS, 2), "rotation": (count, 3, 3), "translation": (count, 3)}
+        expected["confidence"] = (count, LANDMARKS)
+        given = {"landmarks": landmarks, "rotation": rotation, "translation": translation, "confidence": confidence}
+        for name, value in given.items():
+            if value is not None and value.shape != expected[name]:
+                raise ShapeError(f"{name}: found {tuple(value.shape)}, expected {expected[name]}")
+        if torch.isinf(landmarks).any():
+            raise ValueRangeError("landmarks: found infinite ones, expected pixels, or NaN for not seen")
+        if confidence is not None:
+            check_not_negative("confidence", confidence)
+        return count
+
+
+def _beside_motion(weights: Quadratic) -> Quadratic:
+    """An energy of weights as one of weights and motion."""
+    return replace(
+        weights,
+        H=torch.nn.functional.pad(weights.H, (0, 6, 0, 6)),
+        f=torch.nn.functional.pad(weights.f, (0, 6)),
+    )
+
+
+def _finite(*tensors: Tensor) -> bool:
+    return all(bool(torch.isfinite(x).all()) for x in tensors)
