@@ -1,4 +1,4 @@
-"""What people look at: images and curves of faces; reports and the browser are rooms of their own."""
+"""Images and curves of faces; reports and browser pages have packages of their own."""
 
 from torchface.rendering.compositing import caption, headed, save_rendered_image, sheet, to_pillow
 from torchface.viz.figures.curves import error_curve, named_bars, weight_curves
