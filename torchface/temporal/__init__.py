@@ -1,7 +1,7 @@
 """What time does to signals: smoothing and filtering along frames."""
 
 from torchface.temporal.adaptive_kalman import AdaptiveFilter, AdaptiveSettings, adaptive_filter, adaptive_smoother
-from torchface.temporal.gap_filling import bridged, nearest_rows
+from torchface.temporal.interpolation import interpolated, nearest_rows
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, estimate_settings, kalman_filter, kalman_smoother
 from torchface.temporal.one_euro import OneEuroFilter, OneEuroSettings, one_euro_filter
 from torchface.temporal.savitzky_golay import savitzky_golay
@@ -15,8 +15,8 @@ __all__ = [
     "OneEuroSettings",
     "adaptive_filter",
     "adaptive_smoother",
-    "bridged",
     "estimate_settings",
+    "interpolated",
     "kalman_filter",
     "kalman_smoother",
     "nearest_rows",

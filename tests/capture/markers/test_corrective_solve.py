@@ -19,7 +19,7 @@ from torchface.errors import NameMismatchError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.planted_correctives import planted_correctives
-from torchface.temporal import bridged
+from torchface.temporal import interpolated
 
 SHAPES = 16
 
@@ -152,7 +152,7 @@ def test_a_whole_take_is_smoothed_with_correctives(rig: BlendshapeRig, attachmen
     whole = WholeTakeSolver(solver)
     smooth = whole(seen)
     shown = ~torch.isnan(seen).any(-1).all(1)
-    alone = bridged(solver(seen[shown]), shown.nonzero()[:, 0], len(seen))
+    alone = interpolated(solver(seen[shown]), shown.nonzero()[:, 0], len(seen))
     assert whole.energy(seen, smooth) < whole.energy(seen, alone)
     far, further = ((rig(w) - rig(curves)).norm(dim=-1).mean() for w in (smooth, alone))
     assert far < 0.7 * further

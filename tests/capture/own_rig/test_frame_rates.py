@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import VideoSettings, VideoSolver
-from torchface.capture.own_rig.even_frames import even_times, rotations_at, values_at
 from torchface.capture.own_rig.landmark_smoothing import filter_landmarks
+from torchface.capture.own_rig.take_solve import even_times, rotations_at
 from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
+from torchface.temporal.interpolation import values_at
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 SHAPES = ("jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft", "mouthLeft")
@@ -87,5 +88,5 @@ def test_frames_are_brought_to_an_even_rate_and_back() -> None:
     axis = torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64)
     turns = rotation_matrix(seconds[:, None] * axis)
     torch.testing.assert_close(rotations_at(turns, seconds, even), rotation_matrix(even[:, None] * axis))
-    with pytest.raises(ValueRangeError, match="do not rise"):
-        even_times(seconds[[0, 1, 1]])
+    with pytest.raises(ValueRangeError, match="expected times that rise"):
+        frame_intervals(seconds[[0, 1, 1]], 3, 1 / 30)

@@ -305,7 +305,7 @@ def test_bad_input(small: BlendshapeRig) -> None:
         VideoSolver(small, None, K, ShapePrior.fit([acted(20, 3)], ("a", "b", "c")))
     few = found.clone()
     few[:, 5:] = torch.nan
-    with pytest.raises(ValueRangeError, match="fewer than 6"):
+    with pytest.raises(ValueRangeError, match="at most 5 that are trusted in any of 2 frames"):
         solver(few)
     with pytest.raises(ValueRangeError, match="found 5 in the first frame"):
         solver.step(solver.start(), few[0])

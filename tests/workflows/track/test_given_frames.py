@@ -60,6 +60,28 @@ def test_a_table_is_solved_without_a_video(take: tuple[Path, Path, Tensor], tmp_
     assert (again.presence == 1).all()
 
 
+@pytest.mark.parametrize(
+    ("shown", "confidence", "message"),
+    [(5, "1", "at most 4 that are trusted in any of 6 frames"), (68, "0", "at most 0 that are trusted")],
+)
+def test_a_table_without_enough_landmarks_is_refused_by_its_name(
+    take: tuple[Path, Path, Tensor], tmp_path: Path, shown: int, confidence: str, message: str
+) -> None:
+    """Of a frame's landmarks too few are there, or none is trusted."""
+    header, *rows = (line.split(",") for line in take[1].read_text().splitlines())
+    for row in rows:
+        for i, name in enumerate(header):
+            number = name[2:]
+            if name[:2] in ("x_", "y_") and number.isdigit() and int(number) >= shown:
+                row[i] = ""
+        row[header.index("confidence")] = confidence
+    table = tmp_path / "few.csv"
+    table.write_text("\n".join(",".join(row) for row in [header, *rows]))
+    settings = TrackSettings(landmarks=table, size=(WIDTH, HEIGHT))
+    with pytest.raises(ValueRangeError, match=rf"few.csv: landmarks: found {message}.* expected at least 6 in some"):
+        track_video(None, take[0], tmp_path / "out", settings)
+
+
 def test_tables_that_do_not_fit_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = tmp_path / "take.csv"
     points = 100 + 100 * torch.rand(COUNT, 68, 2, generator=torch.Generator().manual_seed(0))

@@ -18,7 +18,7 @@ from torchface.optim import BoxQP, box_qp
 from torchface.optim.data_dependent import data_dependent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.temporal import bridged, nearest_rows
+from torchface.temporal import interpolated, nearest_rows
 
 # Rotations are scaled to the motion of a point this far from the pivot, in mm, so that all six columns are of one size.
 _ARM = 30.0
@@ -167,7 +167,7 @@ class HelmetSolver(nn.Module):
         markers = self.markers.arrange(take.markers)
         rows = frames_seen(markers)
         seen, steps = self(markers[rows])
-        weights = bridged(seen, rows, len(markers))
+        weights = interpolated(seen, rows, len(markers))
         nearest = nearest_rows(rows, len(markers))
         motion = HelmetMotion(steps.rotation[nearest], steps.translation[nearest], steps.pivot)
         return replace(take, weights=Track(self.names, weights[..., None])), motion

@@ -15,7 +15,7 @@ from torchface.number_checks import LARGEST_WEIGHT, checked_number
 from torchface.optim import box_qp
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
-from torchface.temporal import bridged, savitzky_golay
+from torchface.temporal import interpolated, savitzky_golay
 
 GAMMA = 4.0
 """Largest weight of a prediction, mm² over all markers for a squared weight of 1."""
@@ -158,7 +158,7 @@ class HybridSolver(nn.Module):
         markers = self.markers.arrange(take.markers)
         rows = frames_seen(markers)
         seen = self(markers[rows], self._in_rig_order(predicted)[rows], self._in_rig_order(gamma)[rows])
-        weights = bridged(seen, rows, len(markers))
+        weights = interpolated(seen, rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
 
     def _in_rig_order(self, curves: Track) -> Tensor:

@@ -22,7 +22,7 @@ from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.temporal import bridged
+from torchface.temporal import interpolated
 
 # On six real takes with 0.3 mm of noise the paper's rule (``sparsity_by_rule``) gives 0.03 to 0.07, where the weights
 # come out a fifth too small. At 0.01, of the rule's order of magnitude still, as many shapes are active as in truth (25
@@ -294,7 +294,7 @@ class MarkerSolver(nn.Module):
             raise NameMismatchError("take: has no markers, expected a track of them")
         markers = self.arrange(take.markers)
         rows = frames_seen(markers)
-        weights = bridged(self(markers[rows]), rows, len(markers))
+        weights = interpolated(self(markers[rows]), rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
 
     def arrange(self, markers: Track) -> Tensor:

@@ -17,7 +17,7 @@ from torchface.errors import NameMismatchError, ShapeError, TraceError, ValueRan
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
-from torchface.temporal import bridged
+from torchface.temporal import interpolated
 
 SMOOTHNESS = 10.0
 """At 60 frames a second, mm² a marker for a squared second difference of 1: noise of 0.3 mm hardly shows."""
@@ -183,7 +183,7 @@ class WholeTakeSolver(nn.Module):
         solver = with_sparsity(self.markers, self.sparsity)
         data = _TakeData.of(solver, markers)
         rows = frames_seen(markers)
-        w = bridged(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
+        w = interpolated(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
         H = data.hessian(w)
         smooth = _SmoothProblem.of(H, len(w), smoothness, huber_threshold)
         dual = torch.zeros_like(w)

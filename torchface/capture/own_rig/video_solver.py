@@ -21,6 +21,7 @@ from torchface.optim.box_problem import BoxProblem
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.fixed_point_gradient import attach_gradients
 from torchface.optim.warm_active_set import solve_from_active_set
+from torchface.progress import Progress, silent
 
 _MIN_LANDMARKS = 6
 _SLIDING_STEPS = 3
@@ -87,6 +88,7 @@ class VideoSolver(VideoSolverParts):
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
         seconds: Tensor | None = None,
+        progress: Progress | None = None,
     ) -> VideoSolution:
         """Weights and poses of consecutive frames, each from what was seen until then.
 
@@ -95,6 +97,7 @@ class VideoSolver(VideoSolverParts):
             rotation, translation: tracked poses, rig to camera, (T,3,3) and (T,3), NaN for lost; found here if absent.
             confidence: how far each landmark is trusted, (T,68) in [0,1].
             seconds: when each frame is shown, (T,), rising; ``settings.interval`` apart if absent.
+            progress: called with how many frames are solved.
 
         Returns:
             What the face did, in the dtype of the landmarks; differentiable in all arguments, through all frames. A
@@ -102,16 +105,31 @@ class VideoSolver(VideoSolverParts):
 
         Raises:
             ShapeError: the shapes do not fit each other.
-            ValueRangeError: infinite landmarks, confidences below 0, or no frame with six landmarks.
+            ValueRangeError: infinite landmarks, confidences below 0, or no frame with six trusted landmarks.
         """
-        states, enough = self.states(landmarks, rotation, translation, confidence, seconds)
+        states, _ = self.states(landmarks, rotation, translation, confidence, seconds, progress)
         weights, rotations, translations = (
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)
             for name in ("weights", "rotation", "translation")
         )
-        errors = self.reprojection_errors(landmarks, weights, rotations, translations)
-        told = self.shape_confidence(self.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
-        return VideoSolution(weights, rotations, translations, errors, enough, told)
+        return self.solution(landmarks, confidence, weights, rotations, translations)
+
+    def solution(
+        self, landmarks: Tensor, confidence: Tensor | None, weights: Tensor, rotation: Tensor, translation: Tensor
+    ) -> VideoSolution:
+        """Weights (T,N) and poses (T,3,3), (T,3) of T frames, with what the frames' landmarks say of them.
+
+        Args:
+            landmarks, confidence: as of ``forward``.
+            weights, rotation, translation: as solved.
+        """
+        errors = self.reprojection_errors(landmarks, weights, rotation, translation)
+        seen = self.shape_confidence(self.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
+        return VideoSolution(weights, rotation, translation, errors, self.shows_face(landmarks, confidence), seen)
+
+    def shows_face(self, landmarks: Tensor, confidence: Tensor | None) -> Tensor:
+        """Which of frames (T,68,2) show at least six landmarks that are trusted, (T,) bool."""
+        return (self.landmark_trust(landmarks, confidence) > 0).sum(1) >= _MIN_LANDMARKS
 
     def states(
         self,
@@ -120,17 +138,21 @@ class VideoSolver(VideoSolverParts):
         translation: Tensor | None = None,
         confidence: Tensor | None = None,
         seconds: Tensor | None = None,
+        progress: Progress | None = None,
     ) -> tuple[list[VideoState], Tensor]:
         """The states after each of T frames, and which frames showed a face, (T,) bool; arguments as ``forward``.
 
         Frames before the first face have its state.
         """
         count = self._check(landmarks, rotation, translation, confidence)
-        enough = (self.landmark_trust(landmarks, confidence) > 0).sum(1) >= _MIN_LANDMARKS
+        enough = self.shows_face(landmarks, confidence)
         if not bool(enough.any()):
+            trusted = (self.landmark_trust(landmarks, confidence) > 0).sum(1)
             raise ValueRangeError(
-                f"landmarks: found fewer than {_MIN_LANDMARKS} in each of {count} frames, expected a face in some"
+                f"landmarks: found at most {max(trusted.tolist(), default=0)} that are trusted in any of {count} "
+                f"frames, expected at least {_MIN_LANDMARKS} in some frame"
             )
+        progress = progress or silent
         states, state = [], self.start()
         first = int(enough.nonzero()[0, 0])
         intervals = frame_intervals(seconds, count, self.settings.interval)
@@ -139,6 +161,7 @@ class VideoSolver(VideoSolverParts):
             turn, place, sure = (None if x is None else x[t] for x in (rotation, translation, confidence))
             state = self.step(state, landmarks[t], turn, place, sure, intervals[t])
             states.append(state)
+            progress("solving for weights", t + 1, count)
         return [states[0]] * first + states, enough
 
     def start(self) -> VideoState:

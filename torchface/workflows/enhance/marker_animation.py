@@ -18,7 +18,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
-from torchface.temporal.gap_filling import bridged
+from torchface.temporal.interpolation import interpolated
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale
 from torchface.workflows.enhance.head_correspondence import HeadCorrespondence
 from torchface.workflows.enhance.mesh_input import PLACE, placed
@@ -178,7 +178,7 @@ def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
     if enough.all():
         return markers, []
     filled = markers.clone()
-    filled[~enough] = bridged(markers[rows], rows, len(markers))[~enough]
+    filled[~enough] = interpolated(markers[rows], rows, len(markers))[~enough]
     still = torch.isfinite(filled).all(-1).sum(1) < LEAST_POINTS
     if still.any():  # the frames beside show other markers
         nearest = torch.searchsorted(rows, still.nonzero()[:, 0]).clamp(max=len(rows) - 1)

@@ -8,8 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.capture.own_rig.landmark_smoothing import filter_landmarks, smooth_landmarks
+from torchface.capture.own_rig.take_solve import solve_take
 from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
@@ -50,7 +52,6 @@ from torchface.workflows.track.track_overlay import video_light
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_settings import TrackSettings
 from torchface.workflows.track.track_state import TrackState
-from torchface.workflows.track.weight_curves import solved_weights, times_of
 
 _AT_ITS_TIMES = "solved at the frames' own times; the overlay and live_link.csv's timecodes run at the mean rate"
 _METHOD = "track/4"
@@ -117,7 +118,7 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
         state.clear()
         raise ValueRangeError(f"{clip.path}: found no face in any of its {len(frames)} frames, expected one")
     begin = time.perf_counter()
-    times = None if times is None else times_of(times, len(frames), clip.fps)
+    times = None if times is None else _times_of(times, len(frames), clip.fps)
     intervals = None
     if times is not None:
         intervals = [clip.fps * step for step in frame_intervals(times, len(frames), 1 / clip.fps)]
@@ -149,7 +150,10 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
     solution = kept_solution(state, solve_key, len(frames), len(actor.names))
     if solution is None:
         begin = time.perf_counter()
-        solution = solved_weights(solver, pinhole, trust, settings.whole_take, progress, times)
+        try:
+            solution = solve_take(solver, pinhole, trust, times, settings.whole_take, progress)
+        except ValueRangeError as error:
+            raise ValueRangeError(f"{clip.path}: {error}") from error
         seconds["weights"] = time.perf_counter() - begin
         keep_solution(state, solve_key, solution)
     products: dict[str, Path] = {}
@@ -184,6 +188,12 @@ def _track_video(video: Path | None, rig: Path, out: Path, settings: TrackSettin
             state.made(out / OVERLAY, overlay_key)
     write_json(out / SUMMARY, summary(tracked))
     return tracked
+
+
+def _times_of(times: Tensor, count: int, fps: float) -> Tensor:
+    """Times of as many frames as could be decoded: a file that was cut lacks some at its end."""
+    more = times[-1] + torch.arange(1, max(count - len(times), 0) + 1, dtype=times.dtype) / fps
+    return torch.cat([times, more])[:count]
 
 
 def _light(tracked: Tracked, state: TrackState, key: str, progress: Progress) -> PointLight:

@@ -1,4 +1,4 @@
-"""Blendshape weights of a whole video at once: every frame leans on those before and after it."""
+"""The solve of a whole take: frame after frame or from all frames at once, at even times or at the frames' own."""
 
 from __future__ import annotations
 
@@ -12,10 +12,60 @@ from torchface.capture.own_rig.frame_states import FrameTerms, VideoSolution, Vi
 from torchface.capture.own_rig.reprojection import HeadState
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
 from torchface.capture.own_rig.video_solver import VideoSolver
+from torchface.capture.own_rig.weight_walk import frame_intervals
 from torchface.errors import ValueRangeError
+from torchface.geometry.rotations import rotation_matrix, rotation_vector
+from torchface.progress import Progress
+from torchface.temporal.interpolation import frames_beside, values_at
 
 # Added to variances before they are inverted: what rounding leaves of a direction that is known exactly.
 _ROUNDING = 1e-9
+
+
+def solve_take(
+    solver: VideoSolver,
+    landmarks: Tensor,
+    confidence: Tensor,
+    seconds: Tensor | None = None,
+    whole_take: bool = False,
+    progress: Progress | None = None,
+) -> VideoSolution:
+    """Weights and poses of a take, as ``torchface track`` solves it.
+
+    A dynamics prior has learned how faces go on in frames of one length: with one, uneven frames are solved at their
+    mean rate and what was solved is read off at their own times.
+
+    Args:
+        solver: of the rig and the camera.
+        landmarks: (T,68,2), pixels; NaN for not seen.
+        confidence: how far each landmark is trusted, (T,68) in [0,1].
+        seconds: when each frame is shown, (T,), rising; even if absent.
+        whole_take: each frame is solved from all frames, with a dynamics prior; without one, frames that show no face
+            lie between those before and after.
+        progress: called with how many frames are solved.
+
+    Raises:
+        ShapeError: the shapes do not fit each other.
+        ValueRangeError: no frame shows six trusted landmarks, or times do not rise.
+    """
+    if seconds is not None and solver.dynamics is not None:
+        frame_intervals(seconds, len(landmarks), solver.settings.interval)  # checks them
+        even = even_times(seconds)
+        points, trust = (values_at(x, seconds, even) for x in (landmarks, confidence))
+        if bool(solver.shows_face(points, trust).any()):
+            solution = solve_take(solver, points, trust, None, whole_take, progress)
+            weights, translation = (values_at(x, even, seconds) for x in (solution.weights, solution.translation))
+            rotation = rotations_at(solution.rotation, even, seconds)
+            return solver.solution(landmarks, confidence, weights, rotation, translation)
+    if whole_take and solver.dynamics is not None:
+        return solve_whole_take(solver, landmarks, confidence=confidence, progress=progress)
+    with torch.no_grad():
+        solution = solver(landmarks, confidence=confidence, seconds=seconds, progress=progress)
+    if not whole_take or bool(solution.solved.all()):
+        return solution
+    when = torch.arange(len(landmarks), device=landmarks.device) if seconds is None else seconds
+    weights = values_at(solution.weights[solution.solved], when[solution.solved], when)
+    return solver.solution(landmarks, confidence, weights, solution.rotation, solution.translation)
 
 
 def solve_whole_take(
@@ -24,6 +74,7 @@ def solve_whole_take(
     rotation: Tensor | None = None,
     translation: Tensor | None = None,
     confidence: Tensor | None = None,
+    progress: Progress | None = None,
 ) -> VideoSolution:
     r"""Weights and poses of consecutive frames, each from all of them.
 
@@ -36,7 +87,7 @@ def solve_whole_take(
 
     Args:
         solver: with a dynamics prior; without one no frame tells of another.
-        landmarks, rotation, translation, confidence: as of ``VideoSolver.forward``.
+        landmarks, rotation, translation, confidence, progress: as of ``VideoSolver.forward``.
 
     Raises:
         ShapeError: the shapes do not fit each other.
@@ -61,33 +112,30 @@ def solve_whole_take(
     if solver.dynamics is None:
         raise ValueRangeError("whole take: found a solver without a dynamics prior, expected one that has it")
     with torch.no_grad():
-        states, enough = solver.states(landmarks, rotation, translation, confidence)
+        states, enough = solver.states(landmarks, rotation, translation, confidence, progress=progress)
         first = int(enough.nonzero()[0, 0])
         smoothed = _smoothed(solver, states[first:])
         head = _solved(solver, states[first:], smoothed)
     frames = torch.arange(len(landmarks), device=landmarks.device)
     rows = (frames - first).clamp(min=0)  # frames before the first face have its state
     weights, turned, moved = (x[rows].to(landmarks.dtype) for x in (head.weights, head.rotation, head.translation))
-    weights = interpolated(weights, enough)
-    errors = solver.reprojection_errors(landmarks, weights, turned, moved)
-    told = solver.shape_confidence(solver.landmark_trust(landmarks, confidence)).to(landmarks.dtype)
-    return VideoSolution(weights, turned, moved, errors, enough, told)
+    weights = values_at(weights[enough], frames[enough], frames)
+    return solver.solution(landmarks, confidence, weights, turned, moved)
 
 
-def interpolated(weights: Tensor, solved: Tensor, seconds: Tensor | None = None) -> Tensor:
-    """Weights (T,N) with straight lines where ``solved`` (T,) is false; at both ends they stay.
+def even_times(seconds: Tensor) -> Tensor:
+    """As many times as of frames (T,), rising, the first and last the same, evenly between: their mean rate's."""
+    seconds = seconds.double()
+    steps = torch.arange(len(seconds), dtype=torch.float64, device=seconds.device) / max(len(seconds) - 1, 1)
+    return torch.lerp(seconds[0], seconds[-1], steps)
 
-    ``seconds`` (T,) say when frames are shown; evenly if absent.
-    """
-    known = solved.nonzero()[:, 0]
-    at = torch.arange(len(weights), device=weights.device)
-    after = torch.searchsorted(known, at).clamp(max=len(known) - 1)
-    before = (torch.searchsorted(known, at, right=True) - 1).clamp(min=0)
-    left, right = known[before], known[after]
-    when = at.double() if seconds is None else seconds.to(weights.device).double()
-    length = when[right] - when[left]
-    fraction = torch.where(length > 0, (when - when[left]) / length, 0.0).clamp(0, 1).to(weights)[:, None]
-    return torch.lerp(weights[left], weights[right], fraction)
+
+def rotations_at(rotations: Tensor, seconds: Tensor, times: Tensor) -> Tensor:
+    """Rotations (T,3,3) of frames shown at ``seconds`` (T,) at other ``times`` (S,), turning evenly between."""
+    before, fraction = frames_beside(seconds, times)
+    here, after = rotations[before].double(), rotations[(before + 1).clamp(max=len(rotations) - 1)].double()
+    turn = rotation_vector(here.transpose(1, 2) @ after) * fraction.to(here)[:, None]
+    return (here @ rotation_matrix(turn)).to(rotations)
 
 
 @dataclass(frozen=True, eq=False)
