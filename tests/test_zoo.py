@@ -141,7 +141,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     """Where models may lie, none there yet: a checkout's folder, the package's, the user's."""
     package = tmp_path / "site" / "torchface"
     package.mkdir(parents=True)
-    monkeypatch.setattr("torchface.zoo.places.__file__", str(package / "zoo" / "places.py"))
+    monkeypatch.setattr("torchface.zoo.model_folders.__file__", str(package / "zoo" / "model_folders.py"))
     monkeypatch.setenv(zoo.HOME, str(tmp_path / "home"))
     return {"checkout": package.parent / "models", "package": package / "_models", "home": tmp_path / "home"}
 

@@ -1,4 +1,4 @@
-"""What can go wrong at the user's end, one class a kind; every message says what was found and what was expected."""
+"""Errors that bad input causes, one class a kind; every message says what was found and what was expected."""
 
 __all__ = [
     "AlignmentError",
@@ -90,7 +90,7 @@ class TopologyError(TorchfaceError):
 
 
 class AlignmentError(TorchfaceError):
-    """Two things could not be laid on one another without help.
+    """Two things could not be aligned without help.
 
     Example:
         >>> from torchface.registration.scan_preparation import check_same_hand

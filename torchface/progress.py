@@ -1,4 +1,4 @@
-"""How long work tells what it is doing and how far it is: one signature for every function."""
+"""Progress reports of long work: one signature for every function."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ class Progress(Protocol):
     """Called as work goes on: ``progress("rendering")``, or ``progress("rendering", 3, 20)`` after 3 of 20 images.
 
     Example:
-        >>> def tell(step: str, done: int = 0, total: int = 0) -> None:
+        >>> def report(step: str, done: int = 0, total: int = 0) -> None:
         ...     print(f"{step}: {done} of {total}")
-        >>> progress: Progress = tell
+        >>> progress: Progress = report
         >>> progress("rendering", 3, 20)
         rendering: 3 of 20
     """
 
     def __call__(self, step: str, done: int = 0, total: int = 0) -> None:
-        """Tells how far the work is.
+        """Reports how far the work is.
 
         Args:
             step: what is being done; the next step's name ends this one.
@@ -40,9 +40,9 @@ class ValueLog(Protocol):
     """Called with what is measured while something is learned: ``log(300, "loss", 0.25)``.
 
     Example:
-        >>> def tell(step: int, name: str, value: float) -> None:
+        >>> def report(step: int, name: str, value: float) -> None:
         ...     print(f"{name} {value} at step {step}")
-        >>> log: ValueLog = tell
+        >>> log: ValueLog = report
         >>> log(300, "loss", 0.25)
         loss 0.25 at step 300
     """

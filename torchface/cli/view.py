@@ -31,8 +31,7 @@ def view(
         port: The first port to try.
         quiet: Show no progress.
     """
-    from torchface.files.file_endings import check_ending
-    from torchface.files.whole_files import check_writable
+    from torchface.files.whole_files import check_ending, check_writable
     from torchface.io import load_detail_maps, load_rig, load_take
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, import_viser

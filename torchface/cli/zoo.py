@@ -25,7 +25,7 @@ def list_models() -> None:
     with what was found. `torchface zoo describe NAME` tells more of one, `torchface zoo verify` reads every file.
     """
     from torchface import zoo
-    from torchface.zoo.places import all_names
+    from torchface.zoo.model_folders import all_names
 
     table = Table(box=None, padding=(0, 2, 0, 0))
     for title in ("name", "kind", "size", "licence"):
@@ -99,7 +99,7 @@ def verify(names: Annotated[Positional[tuple[str, ...]], arg(metavar="[NAME ...]
     """
     from torchface import zoo
     from torchface.errors import FileFormatError
-    from torchface.zoo.places import all_names
+    from torchface.zoo.model_folders import all_names
 
     page, damaged = PlainConsole(stderr=False), False
     for name in names or sorted(all_names()):

@@ -1,4 +1,4 @@
-"""Where lies what can be made again: graphs and pages, each made once."""
+"""Folders of files that can be made again: graphs and pages, each made once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchface.files.whole_files import make_folder
 
 
 def cache_folder(kind: str) -> Path:
-    """The folder for what is kept of one kind, made if it is not there; whoever deletes it loses time alone.
+    """The folder for cached files of one kind, made if it is missing; deleting it costs time alone.
 
     It lies in ``$TORCHFACE_CACHE`` if that is set, else where the system has a user's caches.
 
@@ -24,8 +24,8 @@ def cache_folder(kind: str) -> Path:
 
 
 def _root() -> Path:
-    if own := os.environ.get("TORCHFACE_CACHE"):
-        return Path(own)
+    if chosen := os.environ.get("TORCHFACE_CACHE"):
+        return Path(chosen)
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "torchface" / "cache"
     if sys.platform == "darwin":

@@ -1,4 +1,4 @@
-"""What unfinished work has done so far, on disk: tensors in one safetensors file that names what they were made of."""
+"""Checkpoints of unfinished work: tensors in one safetensors file that names what they were made of."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def read_checkpoint(path: Path, key: str) -> dict[str, Tensor] | None:
         return None
     try:
         with safe_open(path, framework="pt") as file:
-            told = file.metadata() or {}
-        if (told.get("format"), told.get("key")) != (_FORMAT, key):
+            metadata = file.metadata() or {}
+        if (metadata.get("format"), metadata.get("key")) != (_FORMAT, key):
             return None
-        found = load(read_file(path))
-        if _content(found) == told.get("content"):
-            return found
+        tensors = load(read_file(path))
+        if _content(tensors) == metadata.get("content"):
+            return tensors
         fault = "its numbers are not those that were written"
     except (SafetensorError, OSError, ValueError, KeyError, RuntimeError, FileFormatError) as error:
         fault = str(error)
@@ -58,8 +58,8 @@ def checkpoint_key(path: Path) -> str | None:
     """The key that a checkpoint was written with; None where there is none, or it cannot be read."""
     try:
         with safe_open(path, framework="pt") as file:
-            told = file.metadata() or {}
-        return told.get("key")
+            metadata = file.metadata() or {}
+        return metadata.get("key")
     except (SafetensorError, OSError, ValueError):
         return None
 

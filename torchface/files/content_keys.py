@@ -1,4 +1,4 @@
-"""What results were made of, as one key: only where it is the same does a run take up what an earlier one has left."""
+"""Keys of what results were made of: a run takes up an earlier run's results only where their keys are the same."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def _add(digest: hashlib._Hash, value: object) -> None:
     elif isinstance(value, Enum):
         _add_text(digest, f"{type(value).__qualname__} {value.name}")
     elif isinstance(value, Tensor):
-        own = value.detach().cpu().contiguous()
-        _add_text(digest, f"tensor {own.dtype} {tuple(own.shape)}")
-        digest.update(own.reshape(-1).view(torch.uint8).numpy().data)
+        tensor = value.detach().cpu().contiguous()
+        _add_text(digest, f"tensor {tensor.dtype} {tuple(tensor.shape)}")
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     elif isinstance(value, Path):
         _add_path(digest, value)
     elif isinstance(value, nn.Module):
@@ -74,24 +74,24 @@ def _add(digest: hashlib._Hash, value: object) -> None:
         _add(digest, {field.name: getattr(value, field.name) for field in fields(value)})
     elif isinstance(value, Mapping):
         _add_text(digest, f"mapping {len(value)}")
-        for name, own in value.items():
+        for name, item in value.items():
             _add(digest, name)
-            _add(digest, own)
+            _add(digest, item)
     elif isinstance(value, Sequence):
         _add_text(digest, f"sequence {len(value)}")
-        for own in value:
-            _add(digest, own)
+        for item in value:
+            _add(digest, item)
     else:
         raise TypeError(f"found a {type(value).__qualname__}, expected what has a content of numbers and texts")
 
 
 def _add_path(digest: hashlib._Hash, path: Path) -> None:
     if path.is_dir():
-        inside = sorted(found for found in path.rglob("*") if found.is_file())
-        names = [found.relative_to(path).as_posix() for found in inside]
-        shown = [number for number, name in enumerate(names) if not any(part[0] == "." for part in name.split("/"))]
-        _add_text(digest, f"folder {len(shown)}")
-        for number in shown:
+        inside = sorted(file for file in path.rglob("*") if file.is_file())
+        names = [file.relative_to(path).as_posix() for file in inside]
+        listed = [number for number, name in enumerate(names) if not any(part[0] == "." for part in name.split("/"))]
+        _add_text(digest, f"folder {len(listed)}")
+        for number in listed:
             _add_text(digest, names[number])
             _add_path(digest, inside[number])
         return

@@ -218,9 +218,9 @@ def _read(path: str | Path, parse: Callable[[bytes], Any], kind: str, marker: st
     except (ValueError, RecursionError) as error:  # what decoding and both parsers raise
         raise FileFormatError(f"{path}: not {kind} ({str(error)[:120]})") from error
     if marker is not None:
-        found = document.found.get("format") if isinstance(document.found, Mapping) else None
-        if found != marker:
-            raise FileFormatError(f'{path}: found format {_SHORT.repr(found):.60}, expected "{marker}"')
+        format_name = document.found.get("format") if isinstance(document.found, Mapping) else None
+        if format_name != marker:
+            raise FileFormatError(f'{path}: found format {_SHORT.repr(format_name):.60}, expected "{marker}"')
     return document
 
 

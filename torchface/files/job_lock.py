@@ -1,9 +1,9 @@
-"""One run at a time into one place: a lock of the operating system, which goes with the process that holds it."""
+"""One run at a time in one output folder or file: a lock of the operating system, which ends with its process."""
 
 from __future__ import annotations
 
+import errno
 import os
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -11,41 +11,16 @@ from contextvars import ContextVar
 from pathlib import Path
 from platform import node
 
+from filelock import FileLock, Timeout
+
 from torchface.errors import ValueRangeError
-from torchface.files.file_endings import check_ending
-from torchface.files.temporary_files import open_plain, remove_left_over, shortened
-from torchface.files.whole_files import check_writable, made_folder
+from torchface.files.temporary_files import remove_left_over, shortened
+from torchface.files.whole_files import check_ending, check_writable, made_folder
 from torchface.files.write_errors import unwritten
 
 LOCK = ".lock"
-_FAR = 2**30  # Windows locks bytes, and who holds the lock stands in the first ones
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
 _open_to_parts: ContextVar[frozenset[Path]] = ContextVar("open_to_parts", default=frozenset())
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _take(handle: int) -> bool:
-        os.lseek(handle, _FAR, os.SEEK_SET)
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-
-else:
-    import fcntl
-
-    def _take(handle: int) -> bool:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError as error:
-            warnings.warn(
-                f"the file system has no locks ({error.strerror}): another run into the same place goes unnoticed",
-                stacklevel=6,
-            )
-        return True
 
 
 @contextmanager
@@ -119,56 +94,49 @@ def within_job(folder: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _locked(path: Path, place: Path) -> Iterator[None]:
+def _locked(path: Path, target: Path) -> Iterator[None]:
+    """Holds the lock's file, which names its holder and is deleted at the end; ``target`` is for messages."""
+    # Whoever may write into the folder may lock the file that another user's killed run left there.
+    lock = FileLock(path, mode=0o666, blocking=False, on_acquired=_write_holder)
     try:
-        handle = _taken(path, place)
+        while not lock.is_locked:
+            try:
+                lock.acquire()
+            except Timeout:
+                if path.exists():  # else its holder deleted it as it was tried
+                    raise
+    except Timeout as error:
+        raise ValueRangeError(
+            f"out: found another run writing into {target} ({_holder(path)}), expected none; wait for its end or name "
+            "another place"
+        ) from error
     except OSError as error:
-        raise unwritten(path, error) from error
+        if error.errno not in _NO_LOCKS:
+            raise unwritten(path, error) from error
+        warnings.warn(
+            f"the file system has no locks ({error.strerror}): another run into the same place goes unnoticed",
+            stacklevel=5,
+        )
     try:
-        with suppress(OSError):  # a full disk is told by what is written first
-            os.ftruncate(handle, 0)
-            os.lseek(handle, 0, os.SEEK_SET)
-            os.write(handle, f"{os.getpid()} {node()}".encode())
         yield
     finally:
-        _let_go(handle, path)
-
-
-def _taken(path: Path, place: Path) -> int:
-    """The lock's file, open and locked."""
-    while True:
-        try:
-            handle = open_plain(path, os.O_RDWR | os.O_CREAT)
-        except PermissionError:  # another user's, left by a run that was killed: locked it can be all the same
-            handle = open_plain(path, os.O_RDONLY)
-        if not _take(handle):
-            os.lseek(handle, 0, os.SEEK_SET)
-            holder = os.read(handle, 300).decode(errors="replace").split()
-            os.close(handle)
-            who = f"process {holder[0]} on {holder[1]}" if len(holder) == 2 else "process unknown"
-            raise ValueRangeError(
-                f"out: found another run writing into {place} ({who}), expected none; wait for its end or name "
-                "another place"
-            )
-        if _is_still(handle, path):
-            return handle
-        os.close(handle)
-
-
-def _is_still(handle: int, path: Path) -> bool:
-    """Whether the locked file has its name still: whoever held it before has deleted it at the end."""
-    try:
-        return os.path.samestat(os.fstat(handle), path.lstat())
-    except FileNotFoundError:
-        return False
-
-
-def _let_go(handle: int, path: Path) -> None:
-    if sys.platform == "win32":  # where an open file cannot be deleted, nor one that another run has opened
-        os.close(handle)
-        with suppress(OSError):
+        with suppress(OSError):  # before it is released: whoever gets it afterwards sees that its name is gone
             path.unlink()
-    else:
-        with suppress(OSError):
-            path.unlink()  # before it is let go: whoever takes it afterwards sees that its name is gone
-        os.close(handle)
+        lock.release()  # on Windows, where an open file keeps its name, this deletes it
+
+
+def _write_holder(handle: int) -> None:
+    """Writes who holds the lock behind its file's first byte, which Windows locks and lets nobody read."""
+    with suppress(OSError):  # what is written next reports a full disk
+        os.ftruncate(handle, 0)
+        os.write(handle, f" {os.getpid()} {node()}".encode())
+
+
+def _holder(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            file.seek(1)
+            words = file.read(300).decode(errors="replace").split()
+    except OSError:
+        words = []
+    return f"process {words[0]} on {words[1]}" if len(words) == 2 else "process unknown"

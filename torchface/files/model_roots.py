@@ -1,4 +1,4 @@
-"""Where models lie: in the checkout, in the installed package, in the user's own folder; the first of a name wins."""
+"""Folders of models: the checkout's, the installed package's, the user's; of models of one name the first wins."""
 
 from __future__ import annotations
 

@@ -104,8 +104,8 @@ def read_record(folder: str | Path) -> ModelRecord:
         FileFormatError: the file is missing, too large, no TOML, of a newer format, or lacks a field.
     """
     document = read_toml(_inside(Path(folder), DESCRIPTION))
-    found = document["format"].whole(1, expected=str(FORMAT))
-    if found > FORMAT:
+    version = document["format"].whole(1, expected=str(FORMAT))
+    if version > FORMAT:
         raise document["format"].error(f"{FORMAT} at most: the file was made by a newer torchface")
     texts: dict[str, Any] = {name: document[name].text() for name in _TEXTS if document[name]}
     tables: dict[str, Any] = {name: document[name].plain_table() for name in ("settings", "config") if document[name]}
@@ -141,10 +141,10 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     path, state_path = folder / DESCRIPTION, _state_path(folder)
     model, expected = _bare_model(path, record, kinds)
     state, data = read_state(state_path, expected, record.size, record.kind)
-    found = hashlib.sha256(data).hexdigest()
-    if found != record.sha256:
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != record.sha256:
         raise FileFormatError(
-            f"{state_path}: found sha256 {found}, expected {record.sha256 or 'one'} as in {DESCRIPTION}: "
+            f"{state_path}: found sha256 {digest}, expected {record.sha256 or 'one'} as in {DESCRIPTION}: "
             "the file is damaged or of another model"
         )
     try:
@@ -186,7 +186,7 @@ def _bare_model(path: Path, record: ModelRecord, kinds: Mapping[str, type[Model]
 
 
 def model_fault(folder: str | Path, kinds: Collection[str]) -> str | None:
-    """Why a model of these kinds cannot be loaded, as far as its description and its state's size tell; else None."""
+    """Why a model of these kinds cannot be loaded, as far as its description and its state's size show; else None."""
     folder = Path(folder)
     try:
         check_size(_state_path(folder), _known_record(folder, kinds).size)

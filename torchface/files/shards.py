@@ -42,11 +42,11 @@ class Shards:
             with _opened(path) as file:
                 forms, rows = {}, set()
                 for name in self.names:
-                    told = file.get_slice(name)
-                    size = tuple(told.get_shape())
-                    if told.get_dtype() not in _DTYPES or not size or 0 in size:
-                        raise FileFormatError(f"{path}: found {name} {told.get_dtype()} {size}, expected rows")
-                    forms[name] = _DTYPES[told.get_dtype()], size[1:]
+                    rows_of_name = file.get_slice(name)
+                    size = tuple(rows_of_name.get_shape())
+                    if rows_of_name.get_dtype() not in _DTYPES or not size or 0 in size:
+                        raise FileFormatError(f"{path}: found {name} {rows_of_name.get_dtype()} {size}, expected rows")
+                    forms[name] = _DTYPES[rows_of_name.get_dtype()], size[1:]
                     rows.add(size[0])
             self.forms = self.forms or forms
             if forms != self.forms or len(rows) > 1:
@@ -72,14 +72,14 @@ class Shards:
         end = self.counts[number] if end is None else end
         path = self.paths[number]
         with _opened(path) as file:
-            found = {name: file.get_slice(name)[begin:end].clone() for name in self.names}
+            tensors = {name: file.get_slice(name)[begin:end].clone() for name in self.names}
         for name, (dtype, size) in self.forms.items():
-            if found[name].dtype != dtype or found[name].shape != (end - begin, *size):
+            if tensors[name].dtype != dtype or tensors[name].shape != (end - begin, *size):
                 raise FileFormatError(
-                    f"{path}: found {name} {found[name].dtype} {tuple(found[name].shape)}, expected {dtype} "
+                    f"{path}: found {name} {tensors[name].dtype} {tuple(tensors[name].shape)}, expected {dtype} "
                     f"{(end - begin, *size)}"
                 )
-        return found
+        return tensors
 
     def read(self, begin: int, end: int) -> dict[str, Tensor]:
         """Rows ``begin`` to ``end``, without the last, by name.
@@ -99,17 +99,17 @@ class Shards:
     def rows(self, numbers: Tensor) -> dict[str, Tensor]:
         """The rows of these numbers (B,), in their order, by name."""
         owners = torch.searchsorted(self._ends, numbers, right=True)
-        found = {name: torch.empty(len(numbers), *size, dtype=dtype) for name, (dtype, size) in self.forms.items()}
+        tensors = {name: torch.empty(len(numbers), *size, dtype=dtype) for name, (dtype, size) in self.forms.items()}
         for owner in owners.unique().tolist():  # a file is opened once
-            places = (owners == owner).nonzero()[:, 0]
+            rows = (owners == owner).nonzero()[:, 0]
             start = int(self._ends[owner]) - self.counts[owner]
             with _opened(self.paths[owner]) as file:
                 for name in self.names:
-                    told = file.get_slice(name)
-                    for place in places.tolist():
-                        row = int(numbers[place]) - start
-                        found[name][place] = told[row : row + 1][0]
-        return found
+                    rows_of_name = file.get_slice(name)
+                    for row in rows.tolist():
+                        file_row = int(numbers[row]) - start
+                        tensors[name][row] = rows_of_name[file_row : file_row + 1][0]
+        return tensors
 
 
 @contextmanager

@@ -93,9 +93,9 @@ def check_size(path: Path, size: int) -> None:
         FileFormatError: it has more or fewer.
         OSError: the file cannot be looked at.
     """
-    found = path.stat().st_size
-    if found != size:
-        raise FileFormatError(f"{path}: found {found} bytes, expected {size}: cut off, or of another model")
+    bytes_there = path.stat().st_size
+    if bytes_there != size:
+        raise FileFormatError(f"{path}: found {bytes_there} bytes, expected {size}: cut off, or of another model")
 
 
 def _smallest(values: Tensor) -> torch.dtype:

@@ -27,8 +27,8 @@ def shortened(name: str) -> str:
 
 def temporary_name(path: Path) -> Path:
     """A name beside ``path`` that is nobody else's: of this process, drawn at random, hidden."""
-    own = f"{os.getpid()}-{_machine()}-{secrets.token_hex(4)}"
-    return path.with_name(f".{shortened(path.name)}.{own}.part")
+    suffix = f"{os.getpid()}-{_machine()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{shortened(path.name)}.{suffix}.part")
 
 
 def new_temporary(path: Path, mode: int = 0o666) -> tuple[int, Path]:
@@ -69,12 +69,12 @@ def remove_left_over(folder: Path, name: str | None = None) -> None:
     begin = "." if name is None else f".{shortened(name)}."
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            found = _NAME.fullmatch(entry.name) if entry.name.startswith(begin) else None
-            if found is None or (name is not None and found["of"] != shortened(name)):
+            match = _NAME.fullmatch(entry.name) if entry.name.startswith(begin) else None
+            if match is None or (name is not None and match["of"] != shortened(name)):
                 continue
             with suppress(OSError):
-                if found["machine"] == _machine():
-                    dead = not _alive(int(found["process"]))
+                if match["machine"] == _machine():
+                    dead = not _alive(int(match["process"]))
                 else:
                     dead = time.time() - entry.stat(follow_symlinks=False).st_mtime > _DAY
                 if dead:

@@ -143,8 +143,8 @@ def made_folder(folder: str | Path) -> Iterator[Path]:
         yield folder
     finally:
         with suppress(OSError):
-            for one in missing:
-                one.rmdir()
+            for above in missing:
+                above.rmdir()
 
 
 def make_folder(folder: str | Path) -> Path:
@@ -159,6 +159,28 @@ def make_folder(folder: str | Path) -> Path:
     except (OSError, ValueError) as error:
         raise unmade(folder, error) from error
     return folder
+
+
+def check_ending(path: str | Path, *endings: str) -> None:
+    """Refuses a file whose name does not end as what is written into it.
+
+    Args:
+        path: of the file.
+        endings: those that it may have, with their dots, lower case; upper case will do, too.
+
+    Raises:
+        FileFormatError: another ending, or none.
+
+    Example:
+        >>> check_ending("weights.CSV", ".csv")
+        >>> check_ending("weights.xlsx", ".csv")
+        Traceback (most recent call last):
+            ...
+        torchface.errors.FileFormatError: weights.xlsx: found the ending '.xlsx', expected .csv
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() not in endings:
+        raise FileFormatError(f"{path}: found the ending {suffix!r}, expected {', '.join(endings)}")
 
 
 def check_writable(*files: Path | None, folder: Path | None = None) -> None:
@@ -229,16 +251,16 @@ def _is_time_to_look(folder: Path) -> bool:
 def _permissions(path: Path) -> int | None:
     """Those of the file that is there; None where there is none, or a link, which gives way."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return None
-    if stat.S_ISDIR(found.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if stat.S_ISLNK(found.st_mode):
+    if stat.S_ISLNK(status.st_mode):
         return None
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise FileFormatError(f"{path}: cannot be written: found a device or a pipe in its place, expected a file")
-    return stat.S_IMODE(found.st_mode) & 0o777
+    return stat.S_IMODE(status.st_mode) & 0o777
 
 
 def _put_in_place(waiting: list[tuple[Path | None, Path]]) -> None:
@@ -255,12 +277,12 @@ def _put_in_place(waiting: list[tuple[Path | None, Path]]) -> None:
         for folder in dict.fromkeys(path.parent for _, path in waiting):
             sync_folder(folder)
     except OSError as error:
-        for one, old in reversed(before):
+        for replaced, old in reversed(before):
             with suppress(OSError):
                 if old is None:
-                    one.unlink()
+                    replaced.unlink()
                 else:
-                    os.replace(old, one)
+                    os.replace(old, replaced)
         raise unwritten(path, error) from error
     finally:
         for _, old in before:

@@ -1,4 +1,4 @@
-"""Why something could not be written, said so that one knows what to do."""
+"""Errors of writing that say what to do about them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def unwritten(path: Path, error: Exception) -> FileFormatError:
         path: of the file, not of a temporary one.
         error: an ``OSError``, or the ``ValueError`` of a name that can be none.
     """
-    kept = "; what was there before is unchanged" if path_is_file(path) else ""
-    return FileFormatError(f"{path}: cannot be written: {_reason(path, error)}{kept}")
+    unchanged = "; what was there before is unchanged" if _is_file(path) else ""
+    return FileFormatError(f"{path}: cannot be written: {_reason(path, error)}{unchanged}")
 
 
 def unsettled(path: Path, error: Exception) -> FileFormatError:
@@ -33,7 +33,7 @@ def unmade(folder: Path, error: Exception) -> FileFormatError:
     return FileFormatError(f"{folder}: found no folder, and it cannot be made: {_reason(folder, error)}")
 
 
-def path_is_file(path: Path) -> bool:
+def _is_file(path: Path) -> bool:
     """Whether a plain file is there; whatever cannot be looked at is none."""
     try:
         return path.is_file()

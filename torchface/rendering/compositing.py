@@ -16,8 +16,7 @@ from matplotlib.text import Text
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from torchface.files.file_endings import check_ending
-from torchface.files.whole_files import make_folder, write_file
+from torchface.files.whole_files import check_ending, make_folder, write_file
 from torchface.shown_text import visible
 
 __all__ = ["caption", "heat_colors", "save_rendered_image", "sheet"]

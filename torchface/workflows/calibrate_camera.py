@@ -14,8 +14,7 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
-from torchface.files.file_endings import check_ending
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.files.whole_files import check_ending, check_writable, make_folder
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.camera_files import save_calibration
 from torchface.io.images.image_files import load_image

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface.errors import FileFormatError
-from torchface.files.file_endings import check_ending
-from torchface.files.whole_files import check_writable, make_folder
+from torchface.files.whole_files import check_ending, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_animation, load_detail_maps, load_mesh, load_rig, save_mesh
 from torchface.io.blender import BLENDER_ENDINGS, blender_program, read_blender_file, write_blender_file

@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 
 from torchface.errors import NameMismatchError
-from torchface.files.file_endings import check_ending
-from torchface.files.whole_files import all_or_none, check_writable, make_folder
+from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
 from torchface.io.animation_files import check_animation_ending
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv

@@ -4,7 +4,7 @@ from torchface.files.models import STATE
 from torchface.zoo.description import ModelDescription, describe
 from torchface.zoo.kinds import KINDS
 from torchface.zoo.loading import get_model, verify
-from torchface.zoo.places import HOME, damaged_models, find, list_models
+from torchface.zoo.model_folders import HOME, damaged_models, find, list_models
 from torchface.zoo.saving import ModelCard, save_model
 
 __all__ = [

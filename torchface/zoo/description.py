@@ -1,4 +1,4 @@
-"""What a model is, without loading it."""
+"""Descriptions of models, which need no loading."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torchface.files.models import ModelRecord, read_card, read_record
 from torchface.zoo.hub import fetch_description, hub_reference
-from torchface.zoo.places import find, is_path, named_folders
+from torchface.zoo.model_folders import find, is_path, named_folders
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ def describe(name_or_path: str | Path) -> ModelDescription:
     """
     reference = hub_reference(str(name_or_path))
     folder = find(name_or_path) if reference is None else fetch_description(reference)
-    found = dict(vars(read_record(folder)))
-    found["url"] = found["url"] or (folder.resolve().as_uri() if reference is None else str(reference))
+    record = dict(vars(read_record(folder)))
+    record["url"] = record["url"] or (folder.resolve().as_uri() if reference is None else str(reference))
     shadowed = () if is_path(name_or_path) else tuple(named_folders(str(name_or_path))[1:])
     return ModelDescription(
-        **found,
+        **record,
         name=folder.name if reference is None else reference.name,
         folder=folder,
         shadowed=shadowed,

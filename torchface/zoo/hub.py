@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from contextlib import suppress
@@ -13,8 +12,7 @@ from typing import Any
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.cache_folder import cache_folder
 from torchface.files.extra_packages import import_extra
-from torchface.files.models import CARD, DESCRIPTION, MAX_CARD_BYTES, STATE, ModelRecord, check_claims
-from torchface.files.whole_files import made_folder, write_file
+from torchface.files.models import CARD, DESCRIPTION, MAX_CARD_BYTES, STATE, check_claims
 from torchface.zoo.kinds import KINDS
 
 _MAX_DESCRIPTION_BYTES = 2**18
@@ -55,10 +53,10 @@ def hub_reference(text: str) -> HubReference | None:
     """
     if not text.startswith("hf:/"):
         return None
-    found = _REFERENCE.fullmatch(text)
-    if found is None:
+    match = _REFERENCE.fullmatch(text)
+    if match is None:
         raise NameMismatchError(f"model: found {text[:200]!r}, {_EXPECTED}")
-    return HubReference(found[1], found[2] or "main", found[3].strip("/"))
+    return HubReference(match[1], match[2] or "main", match[3].strip("/"))
 
 
 def fetch_description(reference: HubReference) -> Path:
@@ -66,120 +64,92 @@ def fetch_description(reference: HubReference) -> Path:
 
     Raises:
         MissingExtraError: ``huggingface_hub`` is not installed.
-        NameMismatchError: there is no such repository or revision, or it is not shown to this user.
+        NameMismatchError: there is no such repository or revision, or this user has no access to it.
         FileFormatError: it has another layout, a file is too large, or it cannot be reached and was not fetched before.
     """
-    repository = _Repository(reference)
-    repository.fetch_card()
-    return repository.folder
+    folder = _fetched(reference, DESCRIPTION, _MAX_DESCRIPTION_BYTES).parent
+    _fetch_card(reference)
+    return folder
 
 
 def fetch_model(reference: HubReference) -> Path:
     """A folder on this machine with a repository's model: its description, card and state.
 
     The description is read first. The state is fetched only where its kind is known and its size is what the
-    description says and no more than the config asks for; what was fetched is kept only if it has the hash.
+    description says and no more than the config asks for; whoever loads it checks its hash.
 
     Raises:
         as :func:`fetch_description`; and FileFormatError: the state is not what the description says.
     """
-    repository = _Repository(reference)
-    record = check_claims(repository.folder, KINDS)
-    repository.fetch_card()
-    repository.fetch_state(record)
-    return repository.folder
+    folder = _fetched(reference, DESCRIPTION, _MAX_DESCRIPTION_BYTES).parent
+    record = check_claims(folder, KINDS)
+    _fetch_card(reference)
+    _fetched(reference, STATE, record.size, exactly=True)
+    return folder
 
 
-class _Repository:
-    """One commit of a repository, and the folder in which what was fetched of it lies as plain files.
+def _fetch_card(reference: HubReference) -> None:
+    """Fetches the card, if there is one."""
+    with suppress(_MissingFileError):
+        _fetched(reference, CARD, MAX_CARD_BYTES)
 
-    The package's own cache holds links, which a model's folder may not have.
+
+def _fetched(reference: HubReference, file: str, size: int, exactly: bool = False) -> Path:
+    """A file of a model as a plain file on this machine, fetched where it is not there yet and its size is allowed.
+
+    Args:
+        reference: the model.
+        file: its name in the model's folder.
+        size: the most bytes that it may have.
+        exactly: it must have as many.
     """
+    owner, _, name = reference.repository.partition("/")
+    # The package's own cache holds links, which a model's folder may not have.
+    folder = cache_folder("hub") / owner / name / reference.revision
+    bytes_there = _ask(reference, file, folder, dry_run=True).file_size
+    if bytes_there is None or bytes_there > size or (exactly and bytes_there != size):
+        expected = f"{'' if exactly else 'at most '}{size}"
+        raise FileFormatError(f"{reference}: found {file} of {bytes_there} bytes, expected {expected}")
+    return Path(_ask(reference, file, folder))
 
-    def __init__(self, reference: HubReference) -> None:
-        self._hub = import_extra("huggingface_hub", "huggingface_hub", "hub", str(reference))
-        self._errors = import_extra("huggingface_hub.errors", "huggingface_hub", "hub", str(reference))
-        self._reference = reference
-        told = self._ask(DESCRIPTION, reference.revision, dry_run=True)
-        self._commit: str = told.commit_hash
-        owner, _, name = reference.repository.partition("/")
-        self.folder = cache_folder("hub").joinpath(owner, name, self._commit, *reference.folder.split("/"))
-        self._check_size(DESCRIPTION, told.file_size, _MAX_DESCRIPTION_BYTES)
-        # Asked for by its revision, so that the package knows without a network which commit that was.
-        fetched = self._ask(DESCRIPTION, reference.revision)
-        if self._commit not in Path(fetched).parts:
-            raise FileFormatError(f"{reference}: changed while it was fetched, expected one commit; try again")
-        self._keep(DESCRIPTION, Path(fetched).read_bytes())
 
-    def fetch_card(self) -> None:
-        """Brings the card into the folder, if there is one."""
-        with suppress(_MissingFileError):
-            self._keep(CARD, self._read(CARD, MAX_CARD_BYTES))
-
-    def fetch_state(self, record: ModelRecord) -> None:
-        """Brings the state into the folder, if it is the one of this record."""
-        if (self.folder / STATE).is_file():
-            return
-        data = self._read(STATE, record.size, exactly=True)
-        if (found := hashlib.sha256(data).hexdigest()) != record.sha256:
-            kept = self._ask(STATE, self._commit)
-            raise FileFormatError(
-                f"{self._reference}: found {STATE} with sha256 {found}, expected {record.sha256 or 'one'} as in "
-                f"{DESCRIPTION}: it is damaged or of another model; delete {kept} to fetch it again"
-            )
-        self._keep(STATE, data)
-
-    def _read(self, file: str, size: int, exactly: bool = False) -> bytes:
-        """A file's content, fetched where its size is what it may be."""
-        self._check_size(file, self._ask(file, self._commit, dry_run=True).file_size, size, exactly)
-        with Path(self._ask(file, self._commit)).open("rb") as opened:
-            return opened.read(size + 1)
-
-    def _check_size(self, file: str, found: int | None, size: int, exactly: bool = False) -> None:
-        if found is None or found > size or (exactly and found != size):
-            expected = f"{'' if exactly else 'at most '}{size}"
-            raise FileFormatError(f"{self._reference}: found {file} of {found} bytes, expected {expected}")
-
-    def _keep(self, file: str, data: bytes) -> None:
-        if not (self.folder / file).is_file():
-            with made_folder(self.folder):
-                write_file(self.folder / file, data)
-
-    def _ask(self, file: str, revision: str, dry_run: bool = False) -> Any:
-        """A file's path in the package's cache, or only what is known of it."""
-        errors, reference = self._errors, self._reference
-        try:
-            return self._hub.hf_hub_download(
-                reference.repository,
-                file,
-                subfolder=reference.folder or None,
-                revision=revision,
-                endpoint=os.environ.get("HF_ENDPOINT"),
-                library_name="torchface",
-                dry_run=dry_run,
-            )
-        except errors.GatedRepoError as error:
-            raise NameMismatchError(
-                f"{reference}: found a repository whose owner asks for consent, expected one that is shown to you: "
-                "agree on its page, then `hf auth login`"
-            ) from error
-        except errors.RepositoryNotFoundError as error:
-            raise NameMismatchError(
-                f"{reference}: found no such repository, expected one that is public or shown to you (`hf auth login`)"
-            ) from error
-        except errors.RevisionNotFoundError as error:
-            raise NameMismatchError(
-                f"{reference}: found no such revision, expected a branch, tag or commit of {reference.repository}"
-            ) from error
-        except errors.LocalEntryNotFoundError as error:  # is an EntryNotFoundError too
-            raise FileFormatError(
-                f"{reference}: cannot be reached, and {file} was not fetched before ({_first_line(error)}); "
-                "expected a connection, or what an earlier run has fetched"
-            ) from error
-        except errors.EntryNotFoundError as error:
-            raise _MissingFileError(f"{reference}: found no {file}, {_LAYOUT}") from error
-        except (errors.HTTPError, OSError, ValueError, RuntimeError) as error:
-            raise FileFormatError(f"{reference}: {file} cannot be fetched ({_first_line(error)})") from error
+def _ask(reference: HubReference, file: str, folder: Path, dry_run: bool = False) -> Any:
+    """A file's path below the folder, or only what is known of it."""
+    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", str(reference))
+    errors = import_extra("huggingface_hub.errors", "huggingface_hub", "hub", str(reference))
+    try:
+        return hub.hf_hub_download(
+            reference.repository,
+            file,
+            subfolder=reference.folder or None,
+            revision=reference.revision,
+            endpoint=os.environ.get("HF_ENDPOINT"),
+            library_name="torchface",
+            local_dir=folder,
+            dry_run=dry_run,
+        )
+    except errors.GatedRepoError as error:
+        raise NameMismatchError(
+            f"{reference}: found a repository whose owner asks for consent, expected one that is shown to you: "
+            "agree on its page, then `hf auth login`"
+        ) from error
+    except errors.RepositoryNotFoundError as error:
+        raise NameMismatchError(
+            f"{reference}: found no such repository, expected one that is public or shown to you (`hf auth login`)"
+        ) from error
+    except errors.RevisionNotFoundError as error:
+        raise NameMismatchError(
+            f"{reference}: found no such revision, expected a branch, tag or commit of {reference.repository}"
+        ) from error
+    except errors.LocalEntryNotFoundError as error:  # is an EntryNotFoundError too
+        raise FileFormatError(
+            f"{reference}: cannot be reached, and {file} was not fetched before ({_first_line(error)}); "
+            "expected a connection, or what an earlier run has fetched"
+        ) from error
+    except errors.EntryNotFoundError as error:
+        raise _MissingFileError(f"{reference}: found no {file}, {_LAYOUT}") from error
+    except (errors.HTTPError, OSError, ValueError, RuntimeError) as error:
+        raise FileFormatError(f"{reference}: {file} cannot be fetched ({_first_line(error)})") from error
 
 
 class _MissingFileError(FileFormatError):

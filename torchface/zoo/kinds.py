@@ -1,4 +1,4 @@
-"""Which class a kind of model is of."""
+"""Classes of models by kind."""
 
 from __future__ import annotations
 

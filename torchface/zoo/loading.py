@@ -1,4 +1,4 @@
-"""Models by name or folder, each known by its class to whoever checks types."""
+"""Models by name or folder, each with its class for type checkers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression
 from torchface.zoo.description import ModelDescription, describe
 from torchface.zoo.kinds import KINDS
-from torchface.zoo.places import find
+from torchface.zoo.model_folders import find
 
 Model = TypeVar("Model", bound=nn.Module)
 Device = str | torch.device
@@ -83,12 +83,12 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
             ...
         torchface.errors.NameMismatchError: model: found shape_prior, a ShapePrior, expected a MarkerSolver
     """
-    place = _checked(device)
+    target = _checked(device)
     if kind is not nn.Module:
-        found = KINDS.get(describe(name_or_path).kind)
-        if found is not None and not issubclass(found, kind):
-            raise NameMismatchError(f"model: found {name_or_path}, {_a(found)}, expected {_a(kind)}")
-    return read_model(find(name_or_path), KINDS).to(place)
+        model_class = KINDS.get(describe(name_or_path).kind)
+        if model_class is not None and not issubclass(model_class, kind):
+            raise NameMismatchError(f"model: found {name_or_path}, {_a(model_class)}, expected {_a(kind)}")
+    return read_model(find(name_or_path), KINDS).to(target)
 
 
 def verify(name_or_path: str | Path) -> ModelDescription:
@@ -106,11 +106,11 @@ def verify(name_or_path: str | Path) -> ModelDescription:
         'shape_prior'
     """
     folder = find(name_or_path)
-    found = describe(name_or_path)
+    description = describe(name_or_path)
     if not (folder / CARD).is_file():
         raise FileFormatError(f"{folder / CARD}: found no such file, expected the model's card")
     read_model(folder, KINDS)
-    return found
+    return description
 
 
 def _a(kind: type) -> str:
@@ -120,11 +120,11 @@ def _a(kind: type) -> str:
 def _checked(device: Device) -> torch.device:
     """A device on which a tensor can be made."""
     try:
-        place = torch.device(device)
-        torch.empty(0, device=place)
+        target = torch.device(device)
+        torch.empty(0, device=target)
     except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:
         there = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         there += ["mps"] if torch.backends.mps.is_available() else []
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueRangeError(f"device: found {str(device)!r} ({why}), expected one of {', '.join(there)}") from error
-    return place
+    return target

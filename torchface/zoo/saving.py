@@ -1,4 +1,4 @@
-"""Writes models into folders, with what is to be known of them."""
+"""Saved models: folders with a description, a state and a card."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def save_model(model: nn.Module, folder: str | Path, card: ModelCard, half: Coll
     """
     kinds = [kind for kind, known in KINDS.items() if type(model) is known]
     if not kinds:
-        known = ", ".join(one.__name__ for one in KINDS.values())
+        known = ", ".join(model_class.__name__ for model_class in KINDS.values())
         raise NameMismatchError(f"save_model: found a {type(model).__name__}, expected one of {known}")
     folder = Path(folder)
     if not MODEL_NAME.fullmatch(folder.name):

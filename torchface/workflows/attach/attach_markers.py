@@ -15,8 +15,7 @@ from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, 
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.rest_pose import check_not_mirrored
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
-from torchface.files.file_endings import check_ending
-from torchface.files.whole_files import all_or_none, check_writable, make_folder
+from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
 from torchface.io import load_rig
 from torchface.io.landmarks.picks import load_landmarks
 from torchface.mesh import Mesh

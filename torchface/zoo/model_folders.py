@@ -1,4 +1,4 @@
-"""Where models lie, and which of them can be loaded."""
+"""Folders of models by name, and the models that can be loaded."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def list_models() -> list[str]:
 
 
 def damaged_models() -> dict[str, str]:
-    """Models that cannot be loaded, by name, and why: as far as description, kind and the state's size tell.
+    """Models that cannot be loaded, by name, and why: as far as description, kind and the state's size show.
 
     Example:
         >>> damaged_models()
@@ -42,7 +42,7 @@ def damaged_models() -> dict[str, str]:
 
 
 def find(name_or_path: str | Path) -> Path:
-    """The folder of a model; see :func:`get_model`. A name that several folders have is told with a warning, once.
+    """The folder of a model; see :func:`get_model`. A name that several folders have gets a warning, once.
 
     Example:
         >>> sorted(path.name for path in find("head").iterdir())
@@ -69,8 +69,7 @@ def find(name_or_path: str | Path) -> Path:
     known = ", ".join(list_models()) or "none at all"
     home = os.environ.get(HOME)
     missing = f"; ${HOME} is {home!r}, which is no folder" if home and not is_folder(Path(home)) else ""
-    own = Path("models") / given
-    trained = f" (there is {own}: name it so)" if given and is_folder(own) and (own / DESCRIPTION).is_file() else ""
+    trained = f" (there is {Path('models') / given}: name it so)" if is_model(Path("models"), given) else ""
     raise NameMismatchError(
         f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder{trained}, "
         f"which goes by its name if it lies in ${HOME}{missing}"
