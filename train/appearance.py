@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchface import TorchfaceError, zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
-from torchface.landmarks.images.annotated_frames import AnnotatedFrame, load_annotated_frames
-from torchface.landmarks.images.appearance_level import sample_pixels
-from torchface.landmarks.images.shape_modes import planar_pose
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame, load_annotated_frames
+from torchface.landmarks.images.appearance.appearance_level import sample_pixels
+from torchface.landmarks.images.appearance.shape_modes import planar_pose
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 
 from .model_cards import model_card

@@ -17,9 +17,9 @@ from torch import Tensor
 from torchface import zoo
 from torchface.errors import ValueRangeError
 from torchface.landmarks import agreement
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.eyes.eye_augmentation import EyeAugmentation, augmented_eyes
-from torchface.landmarks.images.eyes.eye_training import EyeSettings, fit_eye_rows
+from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation, augmented_eyes
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.eye_training import EyeSettings
 
 from .eye_pictures import EACH, PART, StoredEyePictures, eye_picture_files
 from .model_cards import model_card
@@ -73,7 +73,7 @@ def train(settings: Settings, run: Run) -> EyeNetwork:
     )
     held_out = EACH * -(-settings.held_out // EACH)  # whole people
     learned = StoredEyePictures(files, held_out)
-    model = fit_eye_rows(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
+    model = EyeNetwork.fit(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
     save(model, settings, evaluate(model, StoredEyePictures(files, 0, held_out)))
     return model
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from torchface.files.shards import Shards
-from torchface.landmarks.images.eyes.eye_augmentation import EyeLabels
+from torchface.landmarks.images.networks.eye_augmentation import EyeLabels
 from torchface.progress import Progress
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
 
@@ -54,7 +55,7 @@ class EyePictures:
         return EyeLabels(self.landmarks, self.visible, self.iris, self.openness, self.bare)
 
 
-class StoredEyePictures:
+class StoredEyePictures(Dataset[tuple[Tensor, ...]]):
     """Pictures of files, of which none is in memory but those that are asked for.
 
     Args:
@@ -76,10 +77,10 @@ class StoredEyePictures:
         """The pictures of these numbers (B,), from 0."""
         return EyePictures(**self._shards.rows(numbers + self._begin))
 
-    def rows(self, numbers: Tensor) -> tuple[Tensor, EyeLabels]:
-        """Pictures and what is known of them; see ``eye_training.LabelledEyes``."""
-        found = self.some(numbers)
-        return found.rgba, found.labels
+    def __getitem__(self, numbers: Tensor) -> tuple[Tensor, ...]:
+        """Pictures uint8 (B,4,H,W) and their ``EyeLabels``, of numbers (B,)."""
+        some = self.some(numbers)
+        return some.rgba, *vars(some.labels).values()
 
 
 def eye_picture_files(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from torchface.errors import FileFormatError
 from torchface.files.shards import Shards
@@ -28,7 +29,7 @@ _TENSORS = ("rgba", "landmarks", "visible")
 _PEOPLE = 0.8  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
-class StoredPictures:
+class StoredPictures(Dataset[tuple[Tensor, ...]]):
     """Pictures of files, of which none is in memory but those that are asked for.
 
     Args:
@@ -52,10 +53,10 @@ class StoredPictures:
     def __len__(self) -> int:
         return self._count
 
-    def rows(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Pictures, landmarks and which are visible; see ``network_training.LabelledPictures``."""
-        found = self._shards.rows(numbers)
-        return found["rgba"], found["landmarks"], found["visible"]
+    def __getitem__(self, numbers: Tensor) -> tuple[Tensor, ...]:
+        """Pictures uint8 (B,4,H,W), landmarks (B,68,2) and which are visible (B,68), of numbers (B,)."""
+        rows = self._shards.rows(numbers)
+        return rows["rgba"], rows["landmarks"], rows["visible"]
 
 
 class StoredCutOuts:
@@ -80,7 +81,7 @@ class StoredCutOuts:
 
     def person(self, number: int) -> np.ndarray:
         """One picture, (S,S,4), black where nobody is."""
-        return cut_out(self._pictures.rows(torch.tensor([self._begin + number]))[0][0])
+        return cut_out(self._pictures[torch.tensor([self._begin + number])][0][0])
 
 
 def picture_files(

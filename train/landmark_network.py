@@ -18,8 +18,7 @@ from torchface import zoo
 from torchface.errors import ValueRangeError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.ibug_68 import INNER
-from torchface.landmarks.images.network_training import LabelledPictures, fit_network_rows
-from torchface.landmarks.images.picture_augmentation import AugmentationSettings, augmented
+from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, augmented
 
 from .face_pictures import EACH, PART, StoredPictures, picture_files
 from .model_cards import model_card
@@ -71,20 +70,21 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
     pictures = StoredPictures(files)
     count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
     learned = StoredPictures(files, count)
-    model = fit_network_rows(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
+    model = LandmarkNetwork.fit(learned, None, settings.network, progress, run.checkpoint, run.device, run.log)
     save(model, settings, evaluate(model, pictures, count))
     return model
 
 
 @torch.no_grad()
-def evaluate(model: LandmarkNetwork, pictures: LabelledPictures, first: int) -> dict[str, float]:
+def evaluate(model: LandmarkNetwork, pictures: StoredPictures, first: int) -> dict[str, float]:
     """What the model does on pictures from a number on, augmented as in training, but none hidden or absent."""
     plain = AugmentationSettings(turn=8.0, hidden=0.0, absent=0.0)
     generator = torch.Generator().manual_seed(0)
     found, truth, visible = [], [], []
     for start in range(first, len(pictures), _TEST_BATCH):
         numbers = torch.arange(start, min(start + _TEST_BATCH, len(pictures)))
-        crops = augmented(*pictures.rows(numbers), model.size, model.margin, generator, plain)
+        rgba, landmarks, seen = pictures[numbers]
+        crops = augmented(rgba, landmarks, seen, model.size, model.margin, generator, plain)
         found.append(model(crops.images).landmarks)
         truth.append(crops.landmarks)
         visible.append(crops.visible)

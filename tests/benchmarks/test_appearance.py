@@ -30,10 +30,10 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
-from torchface.landmarks.images.appearance_refinement import appearance_landmarks
-from torchface.landmarks.images.face_box import grey_pixels
+from torchface.landmarks.images.appearance.appearance_refinement import appearance_landmarks
+from torchface.landmarks.images.appearance.shape_modes import planar_pose
+from torchface.landmarks.images.boxes.face_box import grey_pixels
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.landmarks.images.shape_modes import planar_pose
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.portrait_video import (
     EXPRESSIONS,

@@ -18,11 +18,11 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import LandmarkTracker, LandmarkTrees, find_faces, find_landmarks, landmark_jitter
-from torchface.landmarks.images.face_box import overlaps
-from torchface.landmarks.images.finders.tree_finder import TreeFinder
+from torchface.landmarks.images.boxes.face_box import overlaps
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.landmarks.images.landmark_consensus import ConsensusSettings
-from torchface.landmarks.images.video_landmarks import track_landmarks
+from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
+from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
+from torchface.landmarks.images.trees.tree_finder import TreeFinder
 
 
 @pytest.fixture(scope="module")

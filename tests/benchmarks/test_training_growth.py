@@ -81,23 +81,23 @@ tell(begin, start)
 """
 NETWORK = """
 from pathlib import Path
-from torchface.landmarks import NetworkSettings
-from torchface.landmarks.images.network_training import fit_network_rows
+from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from train.face_pictures import StoredPictures
 pictures = StoredPictures(sorted(Path(sys.argv[2]).glob("*.safetensors")), int(sys.argv[1]))
 begin, start = peak(), time.process_time()
-fit_network_rows(pictures, None, NetworkSettings(steps=int(sys.argv[3]), batch=int(sys.argv[4]), workers=0))
+LandmarkNetwork.fit(pictures, None, NetworkSettings(steps=int(sys.argv[3]), batch=int(sys.argv[4]), workers=0))
 tell(begin, start)
 """
 
 
 EYES = """
 from pathlib import Path
-from torchface.landmarks.images.eyes.eye_training import EyeSettings, fit_eye_rows
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.eye_training import EyeSettings
 from train.eye_pictures import StoredEyePictures
 pictures = StoredEyePictures(sorted(Path(sys.argv[2]).glob("*.safetensors")), 0, int(sys.argv[1]))
 begin, start = peak(), time.process_time()
-fit_eye_rows(pictures, None, EyeSettings(steps=int(sys.argv[3]), batch=int(sys.argv[4])))
+EyeNetwork.fit(pictures, None, EyeSettings(steps=int(sys.argv[3]), batch=int(sys.argv[4])))
 tell(begin, start)
 """
 SCENES = """

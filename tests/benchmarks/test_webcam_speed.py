@@ -22,7 +22,7 @@ import pytest
 import torch
 from onnx import ModelProto, TensorProto
 
-from torchface.landmarks.images.finders.mediapipe_finder import PYTHON
+from torchface.landmarks.images.networks.mediapipe_finder import PYTHON
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.landmark_network_graph import landmark_network_model
 from torchface.onnx.webcam.eye_reader import read_eyes

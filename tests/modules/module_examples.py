@@ -30,10 +30,10 @@ from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.network import LandmarkNetwork
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from torchface.landmarks.images.eyes import EyeNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx.eye_network_graph import export_eye_network
 
 

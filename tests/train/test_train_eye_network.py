@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from torchface import TorchfaceError, zoo
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.eyes.eye_training import EyeSettings
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.eye_training import EyeSettings
 from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from train import eye_network as recipe

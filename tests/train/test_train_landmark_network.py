@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch.utils.data import TensorDataset
 
 from torchface import zoo
 from torchface.errors import FileFormatError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
-from torchface.landmarks.images.network_training import fit_network, fit_network_rows
 from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
 from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from train import landmark_network as recipe
@@ -43,8 +43,8 @@ def test_files_give_what_memory_gives(files: list[Path], workers: int) -> None:
     settings = NetworkSettings(steps=3, batch=4, workers=workers)
     parts = [load_file(path) for path in files]
     held = (torch.cat([part[name] for part in parts])[:5] for name in ("rgba", "landmarks", "visible"))
-    expected = fit_network(*held, small(), settings).state_dict()
-    found = fit_network_rows(StoredPictures(files, 5), small(), settings).state_dict()
+    expected = LandmarkNetwork.fit(TensorDataset(*held), small(), settings).state_dict()
+    found = LandmarkNetwork.fit(StoredPictures(files, 5), small(), settings).state_dict()
     for name, value in expected.items():
         torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
 

@@ -9,7 +9,7 @@ from torch import nn
 
 from torchface import zoo
 from torchface.capture import MarkerSolver
-from torchface.landmarks.images.network import LandmarkNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 from torchface.modeling import HeadModel
 
 assert_type(zoo.get_model("marker_solver"), MarkerSolver)

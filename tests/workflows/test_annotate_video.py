@@ -15,8 +15,8 @@ from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueR
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import VideoFile, write_video
 from torchface.landmarks import AppearanceModel
-from torchface.landmarks.images.annotated_frames import load_annotated_frames
-from torchface.landmarks.images.frame_choice import choose_frames
+from torchface.landmarks.images.appearance.annotated_frames import load_annotated_frames
+from torchface.landmarks.images.appearance.frame_choice import choose_frames
 from torchface.synthetic import performer
 from torchface.synthetic.stages.portrait_video import (
     EXPRESSIONS,

@@ -60,8 +60,8 @@ def annotate(
         with progress_bars(quiet) as progress:
 
             def track(video: VideoFile) -> tuple[Tensor, Tensor | None]:
-                from torchface.landmarks.images.landmark_tracker import LandmarkTracker
-                from torchface.landmarks.images.video_landmarks import track_landmarks
+                from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+                from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
 
                 if finder is None:
                     given = given_frames(Path(landmarks), video)

@@ -1,9 +1,9 @@
 """Landmarks on faces: in images, and on scans unwrapped into UV space."""
 
-from torchface.landmarks.images.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.box_training import BoxTrainingSettings, LabelledPicture
-from torchface.landmarks.images.face_box import (
+from torchface.landmarks.images.appearance.appearance_model import AppearanceFit, AppearanceModel, AppearanceSettings
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.boxes.box_training import BoxTrainingSettings, LabelledPicture
+from torchface.landmarks.images.boxes.face_box import (
     FaceBoxes,
     HaarDetector,
     NoFaceError,
@@ -11,7 +11,7 @@ from torchface.landmarks.images.face_box import (
     find_face,
     find_faces,
 )
-from torchface.landmarks.images.finders.tree_finder import TreeFinder
+from torchface.landmarks.images.boxes.network_detector import NetworkDetector
 from torchface.landmarks.images.landmark_finder import FoundLandmarks, LandmarkFinder
 from torchface.landmarks.images.landmark_measures import (
     Agreement,
@@ -21,15 +21,16 @@ from torchface.landmarks.images.landmark_measures import (
     lid_openings,
     mouth_gap,
 )
-from torchface.landmarks.images.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.network import LandmarkNetwork, NetworkLandmarks
-from torchface.landmarks.images.network_detector import NetworkDetector
-from torchface.landmarks.images.network_training import NetworkSettings
+from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.networks.landmark_training import NetworkSettings
 from torchface.landmarks.images.photograph_landmarks import find_landmarks
-from torchface.landmarks.images.tracked_face import TrackedFace
-from torchface.landmarks.images.tree_training import TreeSettings
-from torchface.landmarks.images.video_landmarks import track_landmarks
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.tracked_face import TrackedFace
+from torchface.landmarks.images.tracking.video_landmarks import track_landmarks
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.trees.tree_finder import TreeFinder
+from torchface.landmarks.images.trees.tree_training import TreeSettings
 from torchface.landmarks.scans.contours import Contour, TraceSettings, trace_contour
 from torchface.landmarks.scans.curvature_image import curvature_image
 from torchface.landmarks.scans.cylinder import CylinderLayout, UnwrappedHead, unwrap
@@ -54,6 +55,8 @@ __all__ = [
     "Contour",
     "CylinderLayout",
     "DetectorSettings",
+    "EyeFindings",
+    "EyeNetwork",
     "FaceBoxes",
     "FaceFrame",
     "FoundLandmarks",

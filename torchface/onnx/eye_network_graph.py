@@ -10,7 +10,8 @@ import torch
 from torch import nn
 
 from torchface import __version__
-from torchface.landmarks.images.eyes.eye_network import DEVIATION_RANGE, LEAST_SPREAD, POINTS, STRIDE, EyeNetwork
+from torchface.landmarks.images.networks.eye_network import DEVIATION_RANGE, LEAST_SPREAD, POINTS, STRIDE, EyeNetwork
+from torchface.landmarks.images.networks.heat_maps import cell_places
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.network_nodes import convolution, crop_cases, doubled, folded, heat_points, layers, with_context
@@ -90,7 +91,7 @@ def eye_nodes(build: GraphBuilder, model: EyeNetwork, eyes: str, outputs: Mappin
         build, net.mix_quarter, op("Add", doubled(build, convolution(build, net.up_quarter, deep)), quarter)
     )
     features = layers(build, net.mix_half, op("Add", doubled(build, convolution(build, net.up_half, quarter)), half))
-    places = net.places(torch.zeros(1, 1, model.height // STRIDE, model.width // STRIDE))
+    places = cell_places(torch.zeros(1, 1, model.height // STRIDE, model.width // STRIDE), STRIDE)
     points, spread, under = heat_points(build, net.heat, features, places, "eye_")
     last = constant("last", (-1,))
     spread = op("Log", op("Add", spread, constant("unit", 1.0)))

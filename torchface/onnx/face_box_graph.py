@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from torchface import __version__
-from torchface.landmarks.images.box_network import (
+from torchface.landmarks.images.boxes.box_network import (
     BESIDE_A_PEAK,
     LOG_SIDES,
     STRIDE,
@@ -18,7 +18,7 @@ from torchface.landmarks.images.box_network import (
     BoxNetwork,
     SeparableConvolution,
 )
-from torchface.landmarks.images.network_detector import without_normalisation
+from torchface.landmarks.images.boxes.network_detector import without_normalisation
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 

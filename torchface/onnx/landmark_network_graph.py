@@ -9,7 +9,8 @@ import onnx
 import torch
 
 from torchface import __version__
-from torchface.landmarks.images.network import DEVIATION_RANGE, LandmarkNetwork
+from torchface.landmarks.images.networks.heat_maps import cell_places
+from torchface.landmarks.images.networks.landmark_network import DEVIATION_RANGE, LandmarkNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 from torchface.onnx.network_nodes import convolution, crop_cases, doubled, folded, heat_points, layers, with_context
@@ -95,7 +96,7 @@ def landmark_network_nodes(
     eighth = layers(build, net.mix_eighth, eighth)
     below = doubled(build, convolution(build, net.up_quarter, eighth))
     features = layers(build, net.mix_quarter, op("Add", below, convolution(build, net.skip_quarter, quarter)))
-    places = net.places(torch.zeros(1, 1, model.size // 4, model.size // 4))
+    places = cell_places(torch.zeros(1, 1, model.size // 4, model.size // 4), 4)
     _, spread, under = heat_points(build, net.heat, features, places, output=f"{prefix}landmarks")
     spread = op("Add", spread, "one")
     told = [

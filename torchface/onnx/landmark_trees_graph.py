@@ -13,7 +13,7 @@ from onnx import TensorProto, numpy_helper
 from torch import Tensor
 
 from torchface import __version__
-from torchface.landmarks.images.landmark_trees import FAINTEST, LandmarkTrees
+from torchface.landmarks.images.trees.landmark_trees import FAINTEST, LandmarkTrees
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_builder import GraphBuilder
 

@@ -12,7 +12,7 @@ from torchface.capture.own_rig import VideoSolver
 from torchface.capture.priors import DynamicsPrior
 from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
-from torchface.landmarks.images.eyes import EyeNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.checked_export import ExportReport
 from torchface.onnx.dynamics_prior_graph import export_dynamics_prior

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from torchface.landmarks.images.network import ResidualBlock
+from torchface.landmarks.images.networks.heat_maps import ResidualBlock
 from torchface.onnx.graph_builder import GraphBuilder
 
 Network = TypeVar("Network", bound=nn.Module)

@@ -9,15 +9,15 @@ from pathlib import Path
 from torchface import zoo
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks import LandmarkNetwork, LandmarkTrees
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.eyes.eye_finder import EyeFinder, graph_eye_finder
-from torchface.landmarks.images.finders.crop_finder import BothSides
-from torchface.landmarks.images.finders.eyed_finder import EyedFinder
-from torchface.landmarks.images.finders.mediapipe_finder import MediaPipeFinder
-from torchface.landmarks.images.finders.onnx_finder import graph_finder, onnx_finder
-from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
-from torchface.landmarks.images.landmark_consensus import ConsensusSettings
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
+from torchface.landmarks.images.networks.crop_finder import BothSides
+from torchface.landmarks.images.networks.eye_finder import EyeFinder, graph_eye_finder
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.eyed_finder import EyedFinder
+from torchface.landmarks.images.networks.mediapipe_finder import MediaPipeFinder
+from torchface.landmarks.images.networks.onnx_finder import graph_finder, onnx_finder
+from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings
+from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
 from torchface.onnx.eye_network_graph import eye_network_model
 from torchface.onnx.landmark_network_graph import landmark_network_model
 
@@ -48,7 +48,7 @@ def load_finder(
 
     Args:
         name_or_path: a model of the zoo by name or folder, see ``zoo.get_model``; an ``.onnx`` file, see
-            :func:`~torchface.landmarks.images.finders.onnx_finder.onnx_finder`; or ``mediapipe``.
+            :func:`~torchface.landmarks.images.networks.onnx_finder.onnx_finder`; or ``mediapipe``.
         photographs: take the time that a single picture is worth.
         option: of the command that gives the name, for messages.
 

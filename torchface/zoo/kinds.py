@@ -10,11 +10,11 @@ from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
 from torchface.enhancement.enhancement_model import EnhancementModel
-from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.network import LandmarkNetwork
+from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel

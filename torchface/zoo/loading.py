@@ -12,10 +12,10 @@ from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.priors import DynamicsPrior, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.models import CARD, read_model
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.eyes import EyeNetwork
-from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.network import LandmarkNetwork
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.rigging.expression_regression import ExpressionRegression

@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from torchface.errors import FileFormatError
 from torchface.io import load_image
 from torchface.io.images.transparent_images import load_paint
-from torchface.landmarks.images.annotated_frames import load_annotated_frames
+from torchface.landmarks.images.appearance.annotated_frames import load_annotated_frames
 
 HEIGHT, WIDTH = 6, 9
 ROWS_AND_COLUMNS = {  # where a photograph's first stored row and column belong, EXIF 2.3, tag 0x0112

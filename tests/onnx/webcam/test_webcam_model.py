@@ -14,11 +14,11 @@ from torch import Tensor
 from torchface import zoo
 from torchface.capture.anybody.webcam_state import CONTROLS
 from torchface.landmarks import LandmarkTracker
-from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
-from torchface.landmarks.images.finders.crop_finder import CropFinder
 from torchface.landmarks.images.ibug_68 import turned_box
-from torchface.landmarks.images.network_detector import shipped_detector
+from torchface.landmarks.images.networks.crop_finder import CropFinder
+from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.webcam import face_place, picture_pieces
 from torchface.onnx.webcam.eye_reader import read_eyes

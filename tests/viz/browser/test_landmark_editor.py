@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.landmarks.images.annotated_frames import AnnotatedFrame
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.viz.browser.landmark_editor import LandmarkEditor
 

@@ -14,7 +14,7 @@ import torch
 
 from torchface.errors import ValueRangeError
 from torchface.io import load_take
-from torchface.landmarks.images.annotated_frames import AnnotatedFrame
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.viz.browser.browser_page import BrowserPage

@@ -24,8 +24,8 @@ from torchface.io.camera_files import save_calibration
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video, write_video
 from torchface.io.weights.live_link_stream import decode_frame
-from torchface.landmarks.images.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.tracked_face import TrackedFace
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.images.face_box import check_image
+from torchface.landmarks.images.boxes.face_box import check_image
 
 CROP_MARGIN = 1.25
 """A crop's side in sides of the face's box, where nothing else is said."""

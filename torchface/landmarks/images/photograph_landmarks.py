@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.face_box import FaceDetector, NoFaceError, find_some_faces
-from torchface.landmarks.images.finders.tree_finder import PHOTOGRAPH, TreeFinder
+from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
+from torchface.landmarks.images.boxes.face_box import FaceDetector, NoFaceError, find_some_faces
+from torchface.landmarks.images.boxes.turned_search import find_faces_of_any_turn
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
-from torchface.landmarks.images.landmark_trees import LandmarkTrees
-from torchface.landmarks.images.tracked_face import TrackedFace, refined_face, settled_face
-from torchface.landmarks.images.turned_search import find_faces_of_any_turn
+from torchface.landmarks.images.tracking.tracked_face import TrackedFace, refined_face, settled_face
+from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
+from torchface.landmarks.images.trees.tree_finder import PHOTOGRAPH, TreeFinder
 
 # Presence under which a photograph shows no face: boxes in pictures without one had 0.27 to 0.57.
 _PHOTOGRAPHED = 0.6
@@ -43,7 +43,7 @@ def find_landmarks(
         >>> find_landmarks(blank, zoo.get_model("face_landmarks"))
         Traceback (most recent call last):
             ...
-        torchface.landmarks.images.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
+        torchface.landmarks.images.boxes.face_box.NoFaceError: image of 160 x 120: found no face, expected one at least
     """
     finder = TreeFinder(finder, PHOTOGRAPH) if isinstance(finder, LandmarkTrees) else finder
     faces = find_some_faces(image, face, detector or find_faces_of_any_turn)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-from torchface.landmarks.images.box_network import BoxNetwork
-from torchface.landmarks.images.eyes.eye_network import EyeNetwork
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.landmark_finder import HALF_CONFIDENCE
-from torchface.landmarks.images.network import COUNT, LandmarkNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks.images.networks.landmark_network import COUNT, LandmarkNetwork
 from torchface.onnx.graph_values import Value, ValueGraph
 from torchface.onnx.landmark_network_graph import landmark_network_nodes
 from torchface.onnx.webcam.eye_reader import read_eyes

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchface.landmarks.images.box_network import BoxNetwork
+from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.onnx.face_box_graph import box_network_nodes
 from torchface.onnx.graph_values import Value
 from torchface.onnx.webcam.face_place import middle, overlap, side

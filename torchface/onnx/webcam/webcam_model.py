@@ -12,7 +12,7 @@ from torchface import __version__
 from torchface.capture.anybody import WebcamControls
 from torchface.capture.anybody.webcam_state import CONTROLS, POSES
 from torchface.errors import ShapeError
-from torchface.landmarks.images.network import COUNT
+from torchface.landmarks.images.networks.landmark_network import COUNT
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, WebcamNetworks, read_face
 from torchface.onnx.webcam.picture_pieces import picture_size

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.images.box_training import LabelledPicture
+from torchface.landmarks.images.boxes.box_training import LabelledPicture
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.synthetic.stages.scene_clutter import clutter, draw_hand, random_color
 

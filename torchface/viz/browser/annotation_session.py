@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks.images.annotated_frames import AnnotatedFrame, save_annotated_frame
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame, save_annotated_frame
 
 
 class AnnotationSession:

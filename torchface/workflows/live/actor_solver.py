@@ -13,7 +13,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.landmarks.images.landmark_finder import trust_of
-from torchface.landmarks.images.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.rig import BlendshapeRig
 from torchface.workflows.live.live_frames import planes
 from torchface.workflows.live.solved_frames import LiveFrame

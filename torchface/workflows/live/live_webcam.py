@@ -10,7 +10,7 @@ from pathlib import Path
 from torchface.errors import ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.io.weights.udp_sending import find_receiver
-from torchface.landmarks.images.network_detector import shipped_detector
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
 from torchface.number_checks import checked_number
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT

@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import chain, islice
 
 from torchface.io.video import VideoFile
-from torchface.landmarks.images.appearance_model import AppearanceModel
-from torchface.landmarks.images.face_box import find_faces
+from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
+from torchface.landmarks.images.boxes.face_box import find_faces
 from torchface.landmarks.images.landmark_finder import LandmarkFinder
-from torchface.landmarks.images.landmark_tracker import LandmarkTracker
-from torchface.landmarks.images.video_landmarks import naming_the_frame
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
 from torchface.progress import Progress
 from torchface.workflows.track.track_state import TrackedFrames, TrackState
 

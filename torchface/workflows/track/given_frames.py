@@ -15,7 +15,7 @@ from torchface.io.landmarks.landmark_tables import LandmarkTable, load_landmark_
 from torchface.io.video import VideoFile
 from torchface.io.video.blank_video import BlankVideo
 from torchface.landmarks import find_faces
-from torchface.landmarks.images.face_box import overlaps
+from torchface.landmarks.images.boxes.face_box import overlaps
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.landmarks.images.landmark_finder import COUNT

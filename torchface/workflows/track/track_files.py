@@ -14,7 +14,7 @@ from torchface.io import save_animation
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import save_weights_csv
-from torchface.landmarks.images.video_landmarks import LANDMARK_NAMES
+from torchface.landmarks.images.tracking.video_landmarks import LANDMARK_NAMES
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track

@@ -15,7 +15,7 @@ from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key, file_digest
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import make_folder
-from torchface.landmarks.images.tracked_face import TrackedFace
+from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 
 FOLDER = "state"
 """Where it lies in the folder of results."""

@@ -15,9 +15,9 @@ from torch import Tensor
 from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import check_writable, write_file
-from torchface.landmarks.images.eyes.eye_finder import EyeFinder, face_without_eyes
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
 from torchface.onnx.webcam.face_reader import STATE
 from torchface.onnx.webcam.webcam_session import WebcamFrame, WebcamSession
 from torchface.onnx.webcam.webcam_solver_graph import READING

@@ -13,7 +13,7 @@ from torchface.files.cache_folder import cache_folder
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, read_file, write_file
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
-from torchface.landmarks.images.eyes import EyeNetwork
+from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx.webcam.webcam_model import WebcamNetworks, webcam_model
 from torchface.onnx.webcam.webcam_solver_graph import webcam_solver_model
 from torchface.progress import Progress, silent

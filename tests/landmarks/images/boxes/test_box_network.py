@@ -1,0 +1,195 @@
+"""The network of face boxes says what it was taught, at every angle and size; its detector gives the image's pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import zoo
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
+from torchface.landmarks.images.boxes.box_network import FaceMaps, face_geometry
+from torchface.landmarks.images.boxes.box_training import box_loss
+from torchface.landmarks.images.boxes.face_box import FaceBoxes
+from torchface.landmarks.images.boxes.network_detector import shipped_detector
+from torchface.landmarks.images.boxes.turned_search import find_in_quarter_turns
+
+FEW = BoxTrainingSettings(pictures=1440, batch=8, rate=2e-2, averaged=10, channels=(8, 12, 16, 16), blocks=(1, 1, 1, 1))
+
+
+class Planted(BoxNetwork):
+    """Says of every image that it shows these faces (F,4), whatever it shows."""
+
+    def __init__(self, faces: Tensor) -> None:
+        super().__init__(FEW.channels, FEW.blocks)
+        self.faces_said = faces
+
+    def maps(self, images: Tensor) -> FaceMaps:
+        height, width = images.shape[2] // 8, images.shape[3] // 8
+        centre, geometry = torch.full((1, 1, height, width), -9.0), torch.zeros(1, 5, height, width)
+        for face in self.faces_said:
+            cell = ((face[:2] + 0.5) / 8 - 0.5).round()
+            column, row = cell.long().tolist()
+            centre[0, 0, row, column] = 3.0
+            geometry[0, :, row, column] = 3.0 * face_geometry(face, cell)  # the angle's length does not count
+            geometry[0, :3, row, column] /= 3.0
+        return FaceMaps(centre, geometry)
+
+
+FACES = torch.tensor([[100.3, 60.9, 40.0, 2.5], [30.0, 200.0, 90.0, -0.4]])
+
+
+def mark(number: int) -> LabelledPicture:
+    """A disc, its upper half light and its lower half dark, somewhere at some angle on grey."""
+    generator = torch.Generator().manual_seed(number)
+    drawn = torch.rand(4, generator=generator)
+    side = 20 + 20 * drawn[2]
+    face = torch.stack([side / 2 + (95 - side) * drawn[0], side / 2 + (95 - side) * drawn[1], side, 6.28 * drawn[3]])
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="ij")
+    x, y = columns - face[0], rows - face[1]
+    below = y * face[3].cos() - x * face[3].sin()
+    grey = torch.where(x.square() + y.square() < (side / 2) ** 2, torch.where(below < 0, 230.0, 30.0), 128.0)
+    noise = 10 * torch.randn(3, 96, 96, generator=generator)
+    return LabelledPicture((grey + noise).clamp(0, 255).to(torch.uint8), face[None], torch.zeros(1, dtype=torch.bool))
+
+
+@pytest.fixture(scope="module")
+def taught() -> NetworkDetector:
+    return NetworkDetector(BoxNetwork.fit(mark, FEW), 0.3)
+
+
+def test_what_the_maps_say_is_what_is_found() -> None:
+    found = Planted(FACES)(torch.zeros(1, 3, 256, 192))[0]
+    likely = found[found[:, 3] > 0.5]
+    assert likely.shape == (2, 6)
+    order = likely[:, 0].argsort(descending=True)
+    torch.testing.assert_close(likely[order, :3], FACES[:, :3], atol=1e-3, rtol=0)
+    torch.testing.assert_close(torch.atan2(likely[order, 5], likely[order, 4]), FACES[:, 3], atol=1e-4, rtol=0)
+
+
+def test_the_detector_gives_boxes_in_the_pixels_of_the_image() -> None:
+    faces = NetworkDetector(Planted(FACES), longest=256)(torch.zeros(3, 512, 300, dtype=torch.uint8))  # half the size
+    x, y, side, tilt = FACES[[1, 0]].unbind(1)
+    middle = (torch.stack([x, y], 1) + 0.5) * 2 - 0.5
+    torch.testing.assert_close(faces.boxes[:, :2] + faces.boxes[:, 2:] / 2, middle, atol=1e-3, rtol=0)
+    torch.testing.assert_close(faces.boxes[:, 2], 2 * side, atol=1e-3, rtol=0)
+    torch.testing.assert_close(faces.tilts, tilt, atol=1e-4, rtol=0)
+
+
+def test_marks_it_was_taught_are_found_where_they_are(taught: NetworkDetector) -> None:
+    for number in range(5000, 5012):
+        picture = mark(number)
+        found = taught(picture.image)
+        assert len(found) == 1
+        middle = found.boxes[0, :2] + found.boxes[0, 2:] / 2
+        assert float((middle - picture.faces[0, :2]).norm()) < 0.25 * float(picture.faces[0, 2])
+        assert float(found.boxes[0, 2] / picture.faces[0, 2]) == pytest.approx(1.0, abs=0.2)
+        off = math.remainder(float(found.tilts[0] - picture.faces[0, 3]), 2 * math.pi)
+        assert abs(off) < 0.35
+
+
+def test_a_turned_picture_turns_the_box(taught: NetworkDetector) -> None:
+    image = mark(6001).image
+    upright, turned = taught(image), taught(image.rot90(-1, (1, 2)))  # clockwise
+    x, y = (upright.boxes[0, :2] + upright.boxes[0, 2:] / 2).tolist()
+    middle = turned.boxes[0, :2] + turned.boxes[0, 2:] / 2
+    assert float((middle - torch.tensor([95 - y, x])).abs().max()) < 3
+    off = math.remainder(float(turned.tilts[0] - upright.tilts[0]) - math.pi / 2, 2 * math.pi)
+    assert abs(off) < 0.25
+
+
+def test_quarter_turns_give_boxes_and_tilts_of_the_picture_itself() -> None:
+    image = torch.zeros(3, 90, 140, dtype=torch.uint8)
+    image[0, 20:31, 95:106] = 200  # what is white shows where up is
+    image[:, 20:23, 95:106] = 255
+
+    def upright_alone(shown: Tensor) -> FaceBoxes:
+        rows, columns = (shown[0] > 0).nonzero().unbind(1)
+        up = int((shown[1] > 0).nonzero()[:, 0].max()) - int(rows.min())
+        flat = int((shown[1] > 0).sum(1).amax()) == 11
+        middle = torch.stack([columns.float().mean(), rows.float().mean()])
+        box = torch.cat([middle - 5, torch.tensor([10.0, 10.0])])
+        return FaceBoxes(box[None], torch.tensor([0.9 if flat and up < 5 else 0.1]), torch.tensor([0.1]))
+
+    for quarters, tilt in ((0, 0.0), (1, -math.pi / 2), (2, math.pi), (3, math.pi / 2)):  # counter-clockwise
+        turned = image.rot90(quarters, (1, 2))
+        found = find_in_quarter_turns(turned, upright_alone)
+        rows, columns = (turned[0] > 0).nonzero().unbind(1)
+        middle = torch.stack([columns.float().mean(), rows.float().mean()])
+        assert len(found) == 1
+        torch.testing.assert_close(found.boxes[0, :2] + 5, middle)
+        assert math.remainder(float(found.tilts[0]) - tilt - 0.1, 2 * math.pi) == pytest.approx(0, abs=1e-5)
+
+
+def test_the_shipped_network_is_small_and_finds_nobody_on_a_wall() -> None:
+    assert zoo.describe("face_boxes").size < 500_000
+    assert len(shipped_detector()(torch.full((3, 240, 320), 128, dtype=torch.uint8))) == 0
+
+
+def test_a_plain_picture_shows_nobody(taught: NetworkDetector) -> None:
+    assert len(taught(torch.full((3, 96, 128), 128, dtype=torch.uint8))) == 0
+    assert len(taught(torch.full((20, 9), 128, dtype=torch.uint8))) == 0  # smaller than the network takes
+
+
+def test_folded_normalisation_changes_nothing() -> None:
+    network = BoxNetwork.fit(mark, BoxTrainingSettings(16, 8, channels=FEW.channels, blocks=FEW.blocks))
+    image = mark(1).image
+    found = NetworkDetector(network, 1e-6)(image)
+    expected = network(image[None].float() / 255)[0]
+    likeliest = found.scores.argmax()
+    torch.testing.assert_close(found.scores[likeliest], expected[0, 3], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(found.boxes[likeliest, 2], expected[0, 2], atol=1e-3, rtol=1e-4)
+
+
+def test_the_loss_is_least_at_the_truth_and_leaves_doubtful_faces_out() -> None:
+    faces = torch.tensor([[[52.0, 44.0, 30.0, 0.3], [20.0, 80.0, 16.0, 0.0]]])
+    doubtful = torch.tensor([[False, True]])
+    planted = Planted(faces[0, :1]).maps(torch.zeros(1, 3, 96, 96))
+    geometry = torch.zeros(1, 5, 12, 12)
+    for row in range(12):
+        for column in range(12):
+            geometry[0, :, row, column] = face_geometry(faces[0, 0], torch.tensor([float(column), float(row)]))
+    best = float(box_loss(FaceMaps(planted.centre * 3, geometry), faces, doubtful))
+    assert best < 0.05
+    larger = geometry.clone()
+    larger[:, 2] += 0.3
+    assert float(box_loss(FaceMaps(planted.centre * 3, larger), faces, doubtful)) > best + 0.3
+    there = planted.centre * 3
+    there[0, 0, 10, 2] = 9.0  # the doubtful one is said to be there
+    assert float(box_loss(FaceMaps(there, geometry), faces, doubtful)) == pytest.approx(best, abs=1e-6)
+    there[0, 0, 1, 10] = 9.0  # where nobody is
+    assert float(box_loss(FaceMaps(there, geometry), faces, doubtful)) > best + 1
+
+
+def test_a_killed_run_ends_where_it_would_have_ended(tmp_path: Path) -> None:
+    settings = BoxTrainingSettings(48, 8, channels=FEW.channels, blocks=FEW.blocks, checkpoint_every=0)
+    whole = BoxNetwork.fit(mark, settings)
+    checkpoint = tmp_path / "checkpoint.safetensors"
+
+    def killed(message: str, done: int = 0, total: int = 0) -> None:
+        if done == 5:  # after the checkpoint of step 4
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        BoxNetwork.fit(mark, settings, killed, checkpoint)
+    again = BoxNetwork.fit(mark, settings, None, checkpoint)
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=0, msg=name)
+    with pytest.raises(FileFormatError, match="other data or settings"):
+        BoxNetwork.fit(mark, replace(settings, seed=3), None, checkpoint)
+
+
+def test_what_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueRangeError, match="found channels"):
+        BoxNetwork((8, 8, 8), (1, 1, 1, 1))
+    with pytest.raises(ShapeError, match="64 pixels a side"):
+        BoxNetwork(FEW.channels, FEW.blocks)(torch.zeros(1, 3, 32, 96))
+    with pytest.raises(ValueRangeError, match="found score 0"):
+        NetworkDetector(Planted(FACES), 0)
+    with pytest.raises(ValueRangeError, match="expected positive numbers"):
+        BoxTrainingSettings(pictures=0)

@@ -1,0 +1,111 @@
+"""A graph of the agreed signature finds landmarks in turned crops; one of another signature is told what it has."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from torchface.errors import FileFormatError, ShapeError, ValueRangeError
+from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
+from torchface.landmarks.images.networks.onnx_finder import onnx_finder
+from torchface.workflows.named_finders import load_finder
+
+S = 16
+POINTS = np.stack([np.linspace(0, 15, 68), np.linspace(3, 12, 68)], 1).astype(np.float32)
+
+
+def graph(path: Path, crop: str | None = None, landmarks: int = 68, inputs: str = "image", size: int | str = S) -> Path:
+    """Landmarks where POINTS are, deviation 0.256 pixels, and the mean of red as visibility and presence."""
+    constants = {"points": POINTS[None, :landmarks], "deviations": np.full((1, landmarks), 0.256, np.float32)}
+    nodes = [
+        helper.make_node("Gather", [inputs, "zero"], ["red"], axis=1),
+        helper.make_node("ReduceMean", ["red"], ["presence"], axes=[1, 2], keepdims=0),
+        helper.make_node("Reshape", ["presence", "column"], ["level"]),
+        helper.make_node("Mul", ["level", "nothing"], ["silent"]),
+        helper.make_node("Add", ["silent", "deviations"], ["deviation"]),
+        helper.make_node("Sub", ["level", "silent"], ["one"]),
+        helper.make_node("Add", ["one", "nothing_each"], ["visibility"]),
+        helper.make_node("Reshape", ["silent", "cube"], ["shift"]),
+        helper.make_node("Add", ["shift", "points"], ["landmarks"]),
+    ]
+    constants |= {"nothing": np.zeros(1, np.float32), "nothing_each": np.zeros((1, landmarks), np.float32)}
+    whole = {"zero": np.array(0), "column": np.array([-1, 1]), "cube": np.array([-1, 1, 1])}
+    made = helper.make_graph(
+        nodes,
+        "stand-in",
+        [helper.make_tensor_value_info(inputs, TensorProto.FLOAT, ["B", 3, size, size])],
+        [
+            helper.make_tensor_value_info("landmarks", TensorProto.FLOAT, ["B", landmarks, 2]),
+            *(
+                helper.make_tensor_value_info(n, TensorProto.FLOAT, ["B", landmarks])
+                for n in ("deviation", "visibility")
+            ),
+            helper.make_tensor_value_info("presence", TensorProto.FLOAT, ["B"]),
+        ],
+        [numpy_helper.from_array(value, name) for name, value in (constants | whole).items()],
+    )
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    if crop is not None:
+        helper.set_model_props(model, {"crop": crop})
+    onnx.save(model, path)
+    return path
+
+
+def test_landmarks_come_back_from_the_turned_crop(tmp_path: Path) -> None:
+    finder = load_finder(graph(tmp_path / "net.onnx", "2.0")).finder
+    image = torch.zeros(3, 60, 80, dtype=torch.uint8)
+    image[0] = 51
+    for tilt in (0.0, 0.6, -2.5):
+        found = finder(image, torch.tensor([30.0, 20.0, 8.0, 8.0]), tilt)
+        cos, sin = math.cos(tilt), math.sin(tilt)
+        ahead = torch.from_numpy(POINTS) - 7.5  # a crop of twice eight pixels: one to one
+        expected = torch.tensor([34.0, 24.0]) + ahead @ torch.tensor([[cos, sin], [-sin, cos]])
+        torch.testing.assert_close(found.landmarks, expected, atol=1e-4, rtol=0)
+        assert found.presence == pytest.approx(0.2, abs=1e-6)
+        torch.testing.assert_close(found.visibility, torch.full((68,), 0.2))
+        torch.testing.assert_close(found.confidence, torch.full((68,), 1 / (1 + (0.032 / 0.02) ** 2)))
+    usual = onnx_finder(graph(tmp_path / "usual.onnx"))
+    assert (usual.size, usual.margin, usual.name) == (16, 1.25, "usual.onnx")
+
+
+def test_a_crop_shows_what_lies_there() -> None:
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    image = (x / 2 + y).round().to(torch.uint8)
+    for side, tilt in ((60.0, 0.0), (60.0, 0.5), (9.0, -1.0), (30.0, 2.5)):
+        transform = crop_transform(torch.tensor([60.0, 40.0, side, side]), tilt, 24)
+        row, column = torch.meshgrid(torch.arange(24.0), torch.arange(24.0), indexing="ij")
+        at = from_crop(torch.stack([column, row], -1), transform)
+        crop = cut_crop(image, transform, 24).float()
+        inside = ((at >= 2) & (at <= at.new_tensor([157.0, 117.0]))).all(-1)
+        assert (crop - (at[..., 0] / 2 + at[..., 1]))[:, inside].abs().max() < 1.6
+        assert (crop[0] == crop[2]).all()
+    noise = torch.randint(0, 256, (3, 120, 160), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    coarse = cut_crop(noise, crop_transform(torch.tensor([20.0, 0.0, 96.0, 96.0]), 0.0, 12), 12).float()
+    assert coarse.std() < 12  # the mean over 100 pixels each, not one of them
+    with pytest.raises(ValueRangeError, match="box"):
+        crop_transform(torch.full((4,), torch.nan), 0.0, 16)
+    with pytest.raises(ShapeError, match="box"):
+        crop_transform(torch.zeros(3), 0.0, 16)
+
+
+def test_other_graphs_are_told_what_they_have(tmp_path: Path) -> None:
+    path = tmp_path / "net.onnx"
+    cases = [
+        (lambda: graph(path, landmarks=5), r"outputs landmarks \(B,5,2\).*expected an input image .*\(B,68,2\)"),
+        (lambda: graph(path, inputs="pixels"), r"found inputs pixels \(B,3,16,16\) tensor\(float\)"),
+        (lambda: graph(path, size="S"), "crops of 'S' pixels, expected a fixed 16 to 1024"),
+        (lambda: graph(path, "40"), "the metadata crop '40', expected a number from 0.5 to 4"),
+        (lambda: graph(path, "wide"), "the metadata crop 'wide'"),
+        (lambda: path.write_bytes(b"no graph at all"), "cannot be used as an ONNX graph"),
+        (lambda: path.write_bytes(b""), "found an empty file"),
+    ]
+    for make, message in cases:
+        make()
+        with pytest.raises(FileFormatError, match=message):
+            onnx_finder(path)

@@ -1,0 +1,1 @@
+"""Boxes of faces in images: detectors, and searches of turned faces."""

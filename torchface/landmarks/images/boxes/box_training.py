@@ -1,0 +1,201 @@
+"""Training of a :class:`BoxNetwork`: heat maps round the centres of faces in whole pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import l1_loss, logsigmoid
+
+from torchface.errors import ValueRangeError
+from torchface.files.content_keys import content_key
+from torchface.landmarks.images.boxes.box_network import STRIDE, BoxNetwork, FaceMaps, face_geometry
+from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
+from torchface.progress import Progress, ValueLog, silent
+
+_SPREAD, _LEAST_SPREAD = 0.09, 0.6  # of the heat round a centre: of the face's side, and in cells
+_DESCRIBED = 0.3  # cells of so much heat describe the face
+_GEOMETRY = torch.tensor([1.0, 1.0, 1.5, 0.7, 0.7])  # what an error of centre (in sides), size and angle costs
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPicture:
+    """A picture and the faces in it.
+
+    Args:
+        image: uint8 (3,H,W), red first.
+        faces: x and y of the centre, side, pixels, roll angle, radians, (F,4); see ``ibug_68.turned_box``.
+        doubtful: whether a face may be found or not, (F,): hidden, cut by the border, small.
+
+    Example:
+        >>> face = torch.tensor([[60.0, 50.0, 40.0, 0.0]])  # x, y, side, roll
+        >>> picture = LabelledPicture(torch.zeros(3, 100, 120, dtype=torch.uint8), face, torch.tensor([False]))
+        >>> len(picture.faces)
+        1
+    """
+
+    image: Tensor
+    faces: Tensor
+    doubtful: Tensor
+
+
+class Pictures(Protocol):
+    """Pictures of one size by number; the same number gives the same picture."""
+
+    def __call__(self, number: int) -> LabelledPicture: ...
+
+
+@dataclass(frozen=True)
+class BoxTrainingSettings:
+    """How a network of face boxes learns.
+
+    Args:
+        pictures: that it sees, none of them twice.
+        batch: pictures a step.
+        rate: the highest learning rate; it rises over the first steps and falls to none.
+        decay: of the weights.
+        averaged: steps over which the weights that are kept are averaged.
+        channels, blocks: see :class:`BoxNetwork`.
+        seed: of the first weights.
+        workers: processes that make pictures; they do not change the result.
+        checkpoint_every: seconds from one checkpoint to the next.
+
+    Example:
+        >>> BoxTrainingSettings(pictures=1600, batch=16).steps
+        100
+    """
+
+    pictures: int = 80_000
+    batch: int = 16
+    rate: float = 3e-3
+    decay: float = 1e-4
+    averaged: int = 200
+    channels: tuple[int, ...] = (24, 32, 64, 96)
+    blocks: tuple[int, ...] = (1, 3, 4, 4)
+    seed: int = 0
+    workers: int = 0
+    checkpoint_every: float = 120.0
+
+    def __post_init__(self) -> None:
+        if min(self.pictures, self.batch, self.averaged) < 1 or not self.rate > 0:
+            raise ValueRangeError(
+                f"training of boxes: found {self.pictures} pictures, {self.batch} a step, rate {self.rate}, averaged "
+                f"over {self.averaged}; expected positive numbers"
+            )
+
+    @property
+    def steps(self) -> int:
+        """How many."""
+        return -(-self.pictures // self.batch)
+
+    @property
+    def descent(self) -> DescentSettings:
+        """The same, as every network's training has it."""
+        return DescentSettings(
+            self.steps,
+            self.batch,
+            self.rate,
+            self.decay,
+            1 - 1 / self.averaged,
+            self.workers,
+            self.seed,
+            self.checkpoint_every,
+        )
+
+
+class _Batch(NamedTuple):
+    """Images uint8 (B,3,H,W), faces (B,F,4), NaN where a picture has fewer, and which are doubtful (B,F)."""
+
+    images: Tensor
+    faces: Tensor
+    doubtful: Tensor
+
+
+def fit_boxes(
+    pictures: Pictures,
+    settings: BoxTrainingSettings | None,
+    progress: Progress | None,
+    checkpoint: Path | None,
+    source: Mapping[str, object] | None,
+    device: str | torch.device,
+    log: ValueLog | None,
+) -> BoxNetwork:
+    """See :meth:`BoxNetwork.fit`."""
+    settings, progress = settings or BoxTrainingSettings(), progress or silent
+    with torch.random.fork_rng([]):
+        torch.manual_seed(settings.seed)
+        model = BoxNetwork(settings.channels, settings.blocks)
+
+    def loss(batch: _Batch, _: float) -> tuple[Tensor, float]:
+        images = (batch.images.to(device).float() / 255).to(memory_format=torch.channels_last)
+        found = box_loss(model.maps(images), batch.faces.to(device), batch.doubtful.to(device))
+        return found, float(found.detach())
+
+    key = content_key("box_training/2", config=model.config, source=source or {})
+    task = DescentTask(partial(_drawn, pictures, settings.batch), loss, key)
+    return descend(model, task, settings.descent, DescentRun(progress, log, checkpoint, device))
+
+
+def _drawn(pictures: Pictures, size: int, step: int) -> _Batch:
+    return _collate([pictures(number) for number in range(step * size, (step + 1) * size)])
+
+
+def box_loss(maps: FaceMaps, faces: Tensor, doubtful: Tensor) -> Tensor:
+    """Focal loss of the centres, L1 distance of the geometry; one number.
+
+    Cells of doubtful faces count neither way.
+
+    Args:
+        maps: of B images.
+        faces: centre, side, roll angle, (B,F,4), NaN for none.
+        doubtful: (B,F).
+
+    Source: Law and Deng 2018; Zhou, Wang, Krähenbühl 2019.
+    """
+    height, width = maps.centre.shape[-2:]
+    there = torch.isfinite(faces).all(-1)
+    sure = there & ~doubtful
+    middle = (faces[..., :2].nan_to_num(-1e4) + 0.5) / STRIDE - 0.5
+    side = faces[..., 2].nan_to_num(1.0) / STRIDE
+    x, y = torch.arange(width).to(side), torch.arange(height).to(side)
+    cell = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (h,w,2)
+    at = middle.round()  # the cell that is the face's own
+    squared = (cell - at[:, :, None, None]).square().sum(-1)  # (B,F,h,w)
+    spread = (_SPREAD * side).clamp(min=_LEAST_SPREAD)[..., None, None]
+    heat = torch.exp(-squared / (2 * spread.square())) * sure[..., None, None]
+    best, owner = heat.amax(1), heat.argmax(1)  # (B,h,w)
+    own = (squared < 0.25).logical_and(sure[..., None, None]).any(1)
+    reach = (cell - middle[:, :, None, None]).abs().amax(-1) < 0.6 * side[..., None, None]
+    unknown = (reach & (there & doubtful)[..., None, None]).any(1)
+    counted = own | (~unknown)
+    logit = maps.centre[:, 0]
+    likely = logit.sigmoid()
+    positive = -(1 - likely).square() * logsigmoid(logit)
+    negative = -((1 - best) ** 4) * likely.square() * logsigmoid(-logit)
+    count = own.sum().clamp(min=1)
+    centre = torch.where(own, positive, negative)[counted].sum() / count
+    described = (best > _DESCRIBED) & ~(unknown & ~own)
+    image, row, column = described.nonzero(as_tuple=True)
+    chosen = faces[image, owner[image, row, column]]
+    wanted = face_geometry(chosen, cell[row, column])
+    said = maps.geometry.permute(0, 2, 3, 1)[image, row, column]
+    unit = torch.ones_like(said)
+    unit[:, :2] = (STRIDE / chosen[:, 2:3]).expand(-1, 2)  # cells to sides
+    unit = unit * _GEOMETRY.to(said) * best[image, row, column, None]
+    weight = best[image, row, column].sum().clamp(min=1)
+    return centre + 2.0 * l1_loss(said * unit, wanted * unit, reduction="sum") / weight
+
+
+def _collate(pictures: Sequence[LabelledPicture]) -> _Batch:
+    most = max(1, *(len(one.faces) for one in pictures))
+    faces = torch.full((len(pictures), most, 4), torch.nan)
+    doubtful = torch.zeros(len(pictures), most, dtype=torch.bool)
+    for row, one in enumerate(pictures):  # each has as many faces as it has
+        faces[row, : len(one.faces)] = one.faces
+        doubtful[row, : len(one.faces)] = one.doubtful
+    return _Batch(torch.stack([one.image for one in pictures]), faces, doubtful)

@@ -1,1 +1,0 @@
-"""Who finds landmarks in a box: regression trees, networks, other packages."""

@@ -1,0 +1,73 @@
+"""Landmarks of one face in all frames of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.io.video import VideoFile, open_video
+from torchface.landmarks.images.landmark_finder import COUNT
+from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks.images.tracking.tracked_face import TrackedFace
+from torchface.progress import Progress, silent
+from torchface.take import Track
+
+LANDMARK_NAMES = tuple(str(number) for number in range(COUNT))
+"""The channels of a track of landmarks: iBUG's numbers from 0."""
+
+
+@contextmanager
+def naming_the_frame(number: int) -> Iterator[None]:
+    """Has errors of a step say which frame they are of, counted from 0."""
+    try:
+        yield
+    except (ShapeError, ValueRangeError) as error:
+        raise type(error)(f"frame {number}: {error}") from error
+
+
+def track_landmarks(
+    video: VideoFile | str | Path | Iterable[Tensor],
+    tracker: LandmarkTracker,
+    progress: Progress | None = None,
+) -> Track:
+    """Landmarks of one face in all frames.
+
+    Args:
+        video: a file, or frames, uint8 (H,W) or (3,H,W) each.
+        tracker: what finds them; it goes on from its last frame.
+        progress: called with each step and how far it is.
+
+    Returns:
+        Names ``"0"`` to ``"67"``, values (T,68,2) in pixels, NaN where the face is lost, confidence (T,68).
+
+    Raises:
+        FileFormatError: the video cannot be decoded, changes size, or has a variable frame rate.
+        ShapeError: frames of another kind.
+
+    Example:
+        >>> from torchface import zoo
+        >>> blank = torch.full((120, 160), 128, dtype=torch.uint8)
+        >>> track = track_landmarks([blank, blank], LandmarkTracker(zoo.get_model("face_landmarks")))
+        >>> len(track.names), bool(track.values.isnan().all())
+        (68, True)
+    """
+    progress = progress or silent
+    if isinstance(video, str | Path):
+        video = open_video(video)
+    frames = video.color_frames() if isinstance(video, VideoFile) else video
+    total = video.count if isinstance(video, VideoFile) else len(video) if isinstance(video, Sized) else 0
+    found: list[TrackedFace] = []
+    for frame in frames:  # a frame's box is the one before's
+        with naming_the_frame(len(found)):
+            found.append(tracker.step(frame))
+        progress("tracking landmarks", len(found), max(total, len(found)) if total else 0)
+    if not found:
+        return Track(LANDMARK_NAMES, torch.zeros(0, COUNT, 2), torch.zeros(0, COUNT))
+    return Track(
+        LANDMARK_NAMES, torch.stack([one.landmarks for one in found]), torch.stack([one.confidence for one in found])
+    )

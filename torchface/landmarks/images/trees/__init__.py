@@ -1,0 +1,1 @@
+"""Regression trees that find landmarks in a face box."""
