@@ -1,11 +1,13 @@
 PYTHON ?= python3
 VENV := .venv
-RUN := $(VENV)/bin/python
+# Where an environment's programs are: on Windows make needs Git's sh in the path.
+BIN := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+RUN := $(VENV)/$(BIN)/python
 # Threads that spin while they wait slow each other down where other work is running.
 export OMP_WAIT_POLICY ?= PASSIVE
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-blender test-cluster bench fuzz lint docs app clean
+.PHONY: demo test test-blender test-cluster bench fuzz lint style types imports licences docs app clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), a few minutes"
@@ -28,11 +30,11 @@ BLENDER := .venv-blender
 $(BLENDER)/.installed: constraints.txt
 	@echo "installing Blender into $(BLENDER), 400 MB"
 	$(BLENDER_PYTHON) -m venv $(BLENDER)
-	$(BLENDER)/bin/python -m pip install --quiet --constraint constraints.txt bpy
+	$(BLENDER)/$(BIN)/python -m pip install --quiet --constraint constraints.txt bpy
 	touch $@
 
 test-blender: $(VENV)/.installed-test $(BLENDER)/.installed
-	TORCHFACE_BLENDER=$(BLENDER)/bin/python $(RUN) -m pytest -m blender tests/io/blender
+	TORCHFACE_BLENDER=$(BLENDER)/$(BIN)/python $(RUN) -m pytest -m blender tests/io/blender
 
 # Ray starts a cluster of two nodes on this machine; should it hang, the time limit ends it, and all its processes.
 test-cluster: $(VENV)/.installed-cluster
@@ -47,12 +49,21 @@ bench: $(VENV)/.installed-bench
 fuzz: $(VENV)/.installed-test
 	TORCHFACE_FUZZ_CASES=10000 $(RUN) -m pytest tests/io -k 'mutated or built'
 
-lint: $(VENV)/.installed-lint
-	$(VENV)/bin/ruff check .
-	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/mypy
-	$(VENV)/bin/lint-imports
-	$(VENV)/bin/pip-licenses --output-file $(VENV)/licences.txt
+# Each check is a target of its own; .pre-commit-config.yaml runs the same.
+lint: style types imports licences
+
+style: $(VENV)/.installed-lint
+	$(VENV)/$(BIN)/ruff check .
+	$(VENV)/$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-lint
+	$(VENV)/$(BIN)/mypy
+
+imports: $(VENV)/.installed-lint
+	$(VENV)/$(BIN)/lint-imports
+
+licences: $(VENV)/.installed-lint
+	$(VENV)/$(BIN)/pip-licenses --output-file $(VENV)/licences.txt
 	$(RUN) -m pytest -q tests/test_licences.py
 
 # Tutorials run on the first build and when they change; a warning is an error.
@@ -61,7 +72,7 @@ docs: $(VENV)/.installed-docs
 	@echo "open out/docs/index.html"
 
 demo: $(STAMP)
-	$(VENV)/bin/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")
+	$(VENV)/$(BIN)/torchface demo $(if $(TEMPLATE),--template "$(TEMPLATE)") $(if $(TAKE),--take "$(TAKE)") $(if $(TARGET),--target "$(TARGET)")
 
 # The browser app's page, for a wheel whose users need no Node; `torchface export app` builds it by itself elsewhere.
 app:

@@ -1,4 +1,4 @@
-"""What README, CONTRIBUTING and docs/ point to is there, and the README's figures are those that were kept."""
+"""Links, figures, versions and checks that README, CONTRIBUTING and docs/ name are there and agree."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+import torchface
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DOCS = REPOSITORY / "docs"
@@ -51,3 +53,17 @@ def test_a_figure_is_quoted_between_its_marks(quote_figures: ModuleType) -> None
     assert told == "takes <!-- bench time -->2 s<!-- / --> and <!-- bench size -->3 MB<!-- / -->"
     with pytest.raises(KeyError):
         quote_figures.quoted(text, {"bench": {"time": "2 s"}})
+
+
+def test_every_page_names_the_same_version() -> None:
+    version = torchface.__version__
+    assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"torchface-{version}-py3-none-any.whl" in (DOCS / "install.md").read_text(encoding="utf-8")
+    (newest, *_) = re.findall(r"^## \[(.+?)\]", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert newest == version
+
+
+def test_pre_commit_runs_the_checks_of_make_lint() -> None:
+    (checks,) = re.findall(r"^lint: (.+)$", (REPOSITORY / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    hooks = (REPOSITORY / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    assert re.findall(r"^ +entry: make (\w+)$", hooks, re.MULTILINE) == checks.split()

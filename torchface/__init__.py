@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 # it once: a program that imports torch first sets it for itself.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _HOMES = {
     "Mesh": "torchface.mesh",

@@ -569,10 +569,10 @@ def limit_growth(start: int, size: int) -> None:
         start: bytes of addresses before the first was opened.
         size: bytes.
     """
-    try:
-        import resource
-    except ImportError:  # Windows knows no such limits
+    if sys.platform == "win32":  # no such limits there
         return
+    import resource
+
     limits = {
         resource.RLIMIT_AS: start + max(_MEMORY_ALWAYS, _MEMORY_A_BYTE * size),
         resource.RLIMIT_FSIZE: max(_OUTPUT_ALWAYS, _OUTPUT_A_BYTE * size),
@@ -586,7 +586,9 @@ def limit_growth(start: int, size: int) -> None:
 def _addresses() -> int:
     """Bytes of addresses in use; those that the imports take are no file's fault."""
     status = Path("/proc/self/statm")
-    return int(status.read_text().split()[0]) * os.sysconf("SC_PAGESIZE") if status.exists() else 2**40
+    if sys.platform == "win32" or not status.exists():
+        return 2**40
+    return int(status.read_text().split()[0]) * os.sysconf("SC_PAGESIZE")
 
 
 def main(path: Path, folder: Path, what: Callable[..., tuple[dict[str, Any], dict[str, Any]]]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -12,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -23,6 +24,12 @@ from torchface.errors import ValueRangeError
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.batch_job import BatchJob, attempt
 from torchface.workflows.batch.outcomes import Outcome
+
+if TYPE_CHECKING:
+    if sys.platform == "win32":
+        from multiprocessing.connection import PipeConnection as Connection
+    else:
+        from multiprocessing.connection import Connection
 
 _MAX_STARTS = 3  # of each process, where all end while they load
 _SECONDS_TO_END = 3.0

@@ -147,14 +147,20 @@ def _run(job: BatchJob, item: BatchItem, out: Path, time_limit: float | None) ->
         return attempt(job, item, out)
     watch = threading.Timer(time_limit, _give_up, (item, out, time_limit))
     watch.daemon = True
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends a process that does not let the other thread run
-    signal.setitimer(signal.ITIMER_REAL, time_limit + _GRACE)
+    _set_alarm(time_limit + _GRACE)
     watch.start()
     try:
         return attempt(job, item, out)
     finally:
         watch.cancel()
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        _set_alarm(0)
+
+
+def _set_alarm(seconds: float) -> None:
+    """Ends this process after so many seconds, even where it lets no other thread run; 0 stops the alarm."""
+    if sys.platform != "win32":  # no such signal there
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _give_up(item: BatchItem, out: Path, time_limit: float) -> None:
