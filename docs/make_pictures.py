@@ -1,4 +1,5 @@
-"""Makes the README's pictures of the embedded performer: ``python docs/make_pictures.py`` after ``make demo``."""
+"""Makes the README's pictures of the embedded performer: ``PYTHONPATH=.:tests python docs/make_pictures.py``
+after ``make demo``."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ from pathlib import Path
 
 import torch
 
+from planted.face_paint import face_paint
+from planted.light_stage import LightStageSettings, render_lit_video
 from torchface.capture.own_rig.lighting import estimate_light
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_image, load_rig, save_image
@@ -18,8 +21,6 @@ from torchface.rendering.point_light import PointLight, vertex_albedo
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.face_paint import face_paint
-from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, clay_colors, face_views
 from torchface.viz.figures.registration_views import registration_sheet

@@ -81,6 +81,7 @@ def test_the_command_runs(python: Path, tmp_path: Path) -> None:
 def test_a_recipe_of_the_wheel_learns(python: Path, tmp_path: Path) -> None:
     words = ["train", "marker_solver", "--markers", "20", "--frames", "30", "--out", "models/own"]
     code = f"import sys, torchface.cli; torchface.cli.main({words}); print('train' in sys.modules)"
+    code += "\nimport torchface._train.landmark_network  # with the people that it learns from"
     told = run(python, code, tmp_path)
     assert "mean error of a weight" in told
     assert told.endswith("False\n")

@@ -19,7 +19,8 @@ from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
+
+from .rendered_people.portraits import FaceImage, FaceImageSettings, face_images
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _MAX_BOX = 240.0  # pixels a side; larger faces are made smaller, as pairs of pixels say no more than this anyway

@@ -13,10 +13,10 @@ from torch.utils.data import Dataset
 from torchface.files.shards import Shards
 from torchface.landmarks.images.networks.eye_augmentation import EyeLabels
 from torchface.progress import Progress
-from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
 
 from .face_pictures import head_kinds
 from .rendered_files import Rendering, rendered_files
+from .rendered_people.eye_picture import draw_eye_pictures
 
 PART = 200
 """Pictures in a file: what a killed run loses at most."""
@@ -26,7 +26,7 @@ EACH = 5
 
 @dataclass(frozen=True, eq=False)
 class EyePictures:
-    """Pictures in memory, see :class:`~torchface.synthetic.stages.face_pictures.eye_picture.EyePicture`.
+    """Pictures in memory, see :class:`~train.rendered_people.eye_picture.EyePicture`.
 
     Args:
         rgba: uint8 (M,4,H,W).

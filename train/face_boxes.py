@@ -18,11 +18,11 @@ from torchface.errors import ValueRangeError
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings, LabelledPicture, NetworkDetector
 from torchface.landmarks.images.boxes.face_box import overlaps
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.face_scenes import ScenePeople, SceneSettings, face_scene
 
 from .face_pictures import EACH, StoredCutOuts, StoredPictures, picture_files
 from .model_cards import model_card
 from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .rendered_people.face_scenes import ScenePeople, SceneSettings, face_scene
 from .runner import Recipe, Run, metric_lines, recipe
 
 _SAME, _NOTHING = 0.4, 0.3  # overlaps from which a box is the face's, and under which it is none's

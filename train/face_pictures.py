@@ -15,11 +15,11 @@ from torchface.errors import FileFormatError
 from torchface.files.shards import Shards
 from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.progress import Progress
-from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
-from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind
-from torchface.synthetic.stages.face_scenes import cut_out, upright_faces
 
 from .rendered_files import Rendering, rendered_files
+from .rendered_people.face_picture import draw_pictures
+from .rendered_people.face_scenes import cut_out, upright_faces
+from .rendered_people.head_kind import HeadKind, people_kind, performer_kind
 
 PART = 240
 """Pictures in a file: what a killed run loses at most."""

@@ -21,9 +21,10 @@ from torchface.io.meshes.named_files import named_files
 from torchface.progress import Progress
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
-from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 from torchface.workflows.batch.batch_items import find_items
 from torchface.workflows.register.register_scans import SCANS
+
+from .rendered_people.complexion import complexion_colors, draw_complexions
 
 _METHOD = "gathered heads/3"
 _LEAST_EXTENT, _MOST_EXTENT = 0.4, 2.5  # of a head beside the template, of one topology

@@ -16,12 +16,12 @@ from torchface import TorchfaceError, zoo
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import relative_errors
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.portraits import FaceImageSettings
 
 from .annotated_faces import NO_FACES, Faces, load_faces, rendered_faces
 from .held_out import held_out_people
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings
+from .rendered_people.portraits import FaceImageSettings
 from .runner import Recipe, Run, metric_lines, recipe
 
 

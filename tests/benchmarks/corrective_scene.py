@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig, Mesh
 from torchface.capture import MarkerSolver
 from torchface.mesh import fan_triangulation
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.head.planted_correctives import planted_correctives
 from torchface.synthetic.stages.subdivision import subdivision_operator
 from torchface.synthetic.stages.weight_curves import perform
 

@@ -14,10 +14,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from planted.expression_sequences import expression_sequences
 from torchface.io import load_rig, load_take
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.synthetic.stages.wrinkles import WrinkledPerformer, expression_sequences
+from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 
 FPS = 30.0
 DATABASE_TAKES, TEST_TAKES = 4, 2

@@ -16,6 +16,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from planted.action_performance import ACTION_UNITS
+from planted.camera_stage import record_session
 from torchface.capture.action_units import (
     GROUPS,
     ActionUnitClassifier,
@@ -35,8 +37,6 @@ from torchface.io.video import open_video
 from torchface.landmarks.scans.hog import HogLayout, cell_map
 from torchface.onnx import export_action_units
 from torchface.synthetic import draw_identities
-from torchface.synthetic.stages.action_performance import ACTION_UNITS
-from torchface.synthetic.stages.camera_stage import record_session
 
 FILMS = Path(__file__).resolve().parents[2] / "out" / "action_unit_films"
 NAMES = group_regions(GROUPS)

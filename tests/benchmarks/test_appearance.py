@@ -28,6 +28,12 @@ import torch
 from real_faces import clips
 from torch import Tensor
 
+from planted.portrait_video import (
+    EXPRESSIONS,
+    expression_weights,
+    mixed_expressions,
+    render_portrait_video,
+)
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.appearance.appearance_refinement import appearance_landmarks
@@ -35,12 +41,6 @@ from torchface.landmarks.images.appearance.shape_modes import planar_pose
 from torchface.landmarks.images.boxes.face_box import grey_pixels
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.portrait_video import (
-    EXPRESSIONS,
-    expression_weights,
-    mixed_expressions,
-    render_portrait_video,
-)
 
 LEARNED, TESTED, ACTORS = len(EXPRESSIONS), 45, (3, 4, 5)
 BOUND = 0.6

@@ -14,6 +14,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from planted.action_performance import MOVES, PerformanceSettings
+from planted.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
+from planted.head_camera_images import MARKER_RADIUS
 from torchface import Attachment, BlendshapeRig, Take, load_take
 from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver, align_take
 from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
@@ -25,9 +28,6 @@ from torchface.io.video import open_video
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.action_performance import MOVES, PerformanceSettings
-from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, StageSettings, record_session, stage_markers
-from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
 from torchface.synthetic.stages.marker_stage import StageFlaws
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "hybrid"

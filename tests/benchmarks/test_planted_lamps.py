@@ -17,6 +17,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from planted.light_stage import LightStageSettings, lit_image, turning_cameras
 from torchface.capture.own_rig.lighting import estimate_light
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
@@ -25,7 +26,6 @@ from torchface.mesh import Mesh
 from torchface.rendering.point_light import PointLight, in_camera_frame, vertex_albedo
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, turning_cameras
 from torchface.synthetic.stages.weight_curves import perform
 
 LAMPS = 50

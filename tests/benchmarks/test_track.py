@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from planted.light_stage import LightStageSettings, render_lit_video
 from torchface import Take, Track, save_rig
 from torchface.evaluation import weight_jitter
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -13,7 +14,6 @@ from torchface.io.camera_files import save_calibration
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.rendering.point_light import PointLight
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.synthetic.stages.weight_curves import perform
 from torchface.workflows.evaluate.compare_with_truth import EvaluationSettings, evaluate
 from torchface.workflows.track.track_settings import TrackSettings

@@ -104,7 +104,7 @@ SCENES = """
 from functools import partial
 from pathlib import Path
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings
-from torchface.synthetic.stages.face_scenes import face_scene
+from train.rendered_people.face_scenes import face_scene
 from train.face_pictures import StoredCutOuts
 people = StoredCutOuts(sorted(Path(sys.argv[2]).glob("*.safetensors")), 0, int(sys.argv[1]))
 begin, start = peak(), time.process_time()

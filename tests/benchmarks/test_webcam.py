@@ -31,8 +31,8 @@ from webcam_measures import (
 )
 from webcam_solvers import PAPER, SOLVERS, Solved, read_faces
 
+from planted.webcam_performance import gaze_of
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
 
 pytestmark = pytest.mark.real
 SIZE = (CAMERA.width, CAMERA.height)

@@ -14,6 +14,14 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from planted.webcam_performance import (
+    SittingSettings,
+    WebcamPerformance,
+    sitting,
+    with_blinks,
+    with_speech,
+)
+from planted.webcam_video import WebcamFrame, WebcamSettings, stacked, webcam_frames
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder, write_file
 from torchface.io import load_take
@@ -21,17 +29,9 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.io.video import open_video, write_video
 from torchface.progress import Progress
 from torchface.shape_names import ARKIT, mapping
-from torchface.synthetic.stages.face_pictures.head_kind import HeadKind, people_kind, performer_kind
-from torchface.synthetic.stages.face_pictures.looks import draw_looks
-from torchface.synthetic.stages.face_pictures.people import Person
-from torchface.synthetic.stages.webcam.webcam_performance import (
-    SittingSettings,
-    WebcamPerformance,
-    sitting,
-    with_blinks,
-    with_speech,
-)
-from torchface.synthetic.stages.webcam.webcam_video import WebcamFrame, WebcamSettings, stacked, webcam_frames
+from train.rendered_people.head_kind import HeadKind, people_kind, performer_kind
+from train.rendered_people.looks import draw_looks
+from train.rendered_people.people import Person
 
 FPS = 30.0
 CAMERA = WebcamSettings()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.landmarks import Agreement, agreement
 from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.face_pictures.people import Person, closed_lids
+from train.rendered_people.people import Person, closed_lids
 
 LIDS = [ARKIT.index("eyeBlinkRight"), ARKIT.index("eyeBlinkLeft")]
 SIGNALS = {

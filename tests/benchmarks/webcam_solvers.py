@@ -16,6 +16,7 @@ from onnx import ModelProto, TensorProto
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from planted.webcam_performance import gaze_of
 from torchface.capture.anybody import (
     AllAtOnce,
     ExampleShapes,
@@ -40,7 +41,6 @@ from torchface.onnx.webcam.face_reader import STATE, ReaderSettings, read_face
 from torchface.onnx.webcam.webcam_solver_graph import READING, webcam_solver_model
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
-from torchface.synthetic.stages.webcam.webcam_performance import gaze_of
 from torchface.workflows.track.track_inputs import solver_for
 from torchface.workflows.track.track_models import load_track_models
 from torchface.workflows.webcam.default_solver import default_webcam_solver

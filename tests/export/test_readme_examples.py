@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.webcam_video import talking_subject
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.own_rig import VideoSolver
@@ -25,7 +26,6 @@ from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.onnx import export_model, export_video_solver, export_wrinkle_weights
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.synthetic import performer
-from torchface.workflows.webcam.webcam_export import rendered_frames
 from torchface.workflows.webcam.webcam_graph import webcam_graph
 
 EXPORT = Path(__file__).resolve().parents[2] / "export"
@@ -93,7 +93,7 @@ def folder(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) ->
 
 def film(path: Path) -> None:
     """A face before a webcam, as a file without loss and as the pixels of a canvas."""
-    frames = rendered_frames(6)
+    frames = talking_subject(6)
     height, width = frames[0].shape[:2]
     writer = cv2.VideoWriter(str(path / "webcam.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 30.0, (width, height))
     assert writer.isOpened()

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
@@ -41,7 +42,6 @@ from torchface.modeling.rigging.expression_training import ExpressionSettings, f
 from torchface.onnx import HybridGraph, SolverGraph
 from torchface.optim import BoxQP
 from torchface.synthetic import performer
-from torchface.synthetic.head.planted_correctives import planted_correctives
 
 SOLVER = {"vmap": "batches", "jacrev": "jacobian", "torch.compile": "gap"}
 NAMES = ("jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft")

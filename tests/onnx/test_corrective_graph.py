@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
@@ -23,7 +24,6 @@ from torchface.onnx.solver_graph_export import (
     random_frames,
 )
 from torchface.synthetic import performer
-from torchface.synthetic.head.planted_correctives import planted_correctives
 
 
 @pytest.fixture(scope="module")

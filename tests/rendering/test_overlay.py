@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.light_stage import LightStageSettings, lit_image, turning_cameras
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -23,7 +24,6 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, overlay, relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, turning_cameras
 
 STAGE = LightStageSettings(width=240, height=240, samples=2, gloss=0.0, noise=0.0)
 LIGHT = PointLight(torch.tensor([0.3, 0.32, 0.35]), torch.tensor([0.65, 0.6, 0.55]), torch.tensor([-500.0, -250, 100]))

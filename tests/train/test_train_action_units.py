@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.action_performance import ACTION_UNITS, PerformanceSettings
+from planted.camera_stage import RecordedSession, StageSettings, record_session
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.errors import NameMismatchError, TorchfaceError
 from torchface.io.action_labels import Performed, save_action_labels
-from torchface.synthetic.stages.action_performance import ACTION_UNITS, PerformanceSettings
-from torchface.synthetic.stages.camera_stage import RecordedSession, StageSettings, record_session
 from train import action_units as recipe
 from train.action_units import Settings, performed_groups, train
 

@@ -12,11 +12,11 @@ from safetensors.torch import save_file
 from torchface import TorchfaceError, zoo
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
-from torchface.synthetic.stages.face_pictures.eye_picture import draw_eye_pictures
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from train import eye_network as recipe
 from train.eye_network import Settings, train
 from train.eye_pictures import EyePictures
+from train.rendered_people.eye_picture import draw_eye_pictures
+from train.rendered_people.head_kind import performer_kind
 
 
 def drawn(folder: Path, *_: object) -> list[Path]:

@@ -10,9 +10,9 @@ from safetensors.torch import save_file
 
 from torchface import TorchfaceError, zoo
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings
-from torchface.synthetic.stages.face_scenes import SceneSettings
 from train import face_boxes as recipe
 from train.face_boxes import Settings, train
+from train.rendered_people.face_scenes import SceneSettings
 
 
 def planted(folder: Path, *_: object) -> list[Path]:

@@ -12,10 +12,10 @@ from torch.utils.data import TensorDataset
 from torchface import zoo
 from torchface.errors import FileFormatError
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
-from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from train import landmark_network as recipe
 from train.face_pictures import StoredPictures
+from train.rendered_people.face_picture import draw_pictures
+from train.rendered_people.head_kind import performer_kind
 from train.run_log import read_log
 
 SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}

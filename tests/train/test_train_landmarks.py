@@ -14,11 +14,11 @@ from torchface.errors import FileFormatError, TorchfaceError
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.compositing import save_rendered_image
-from torchface.synthetic.stages.portraits import FaceImage, FaceImageSettings, face_images
 from train import landmarks as recipe
 from train.annotated_faces import Faces, load_faces, rendered_faces
 from train.held_out import held_out_people
 from train.landmarks import Settings, evaluate, train
+from train.rendered_people.portraits import FaceImage, FaceImageSettings, face_images
 
 FEW = TreeSettings(cascades=3, trees=15, depth=3, features=80, test_splits=10, oversampling=6, components=10)
 

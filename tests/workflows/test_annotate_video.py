@@ -9,6 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.portrait_video import (
+    EXPRESSIONS,
+    PortraitVideo,
+    expression_weights,
+    render_portrait_video,
+)
 from torchface import zoo
 from torchface.cli import main
 from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueRangeError
@@ -18,12 +24,6 @@ from torchface.landmarks import AppearanceModel
 from torchface.landmarks.images.appearance.annotated_frames import load_annotated_frames
 from torchface.landmarks.images.appearance.frame_choice import choose_frames
 from torchface.synthetic import performer
-from torchface.synthetic.stages.portrait_video import (
-    EXPRESSIONS,
-    PortraitVideo,
-    expression_weights,
-    render_portrait_video,
-)
 from torchface.viz.browser.annotation_session import AnnotationSession
 from torchface.workflows import annotate_video
 from torchface.workflows.annotate_video import PROPOSALS, prepare_annotation, write_proposals

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.action_performance import PerformanceSettings
+from planted.camera_stage import RecordedSession, StageSettings, record_session
+from planted.helmet_camera import CameraFlaws
 from torchface.capture.action_units import GROUPS, ActionUnitClassifier, RegionVideo, read_regions
 from torchface.capture.action_units.classifier import group_regions
 from torchface.synthetic import draw_identities
-from torchface.synthetic.stages.action_performance import PerformanceSettings
-from torchface.synthetic.stages.camera_stage import RecordedSession, StageSettings, record_session
-from torchface.synthetic.stages.helmet_camera import CameraFlaws
 
 SIZE = 40
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from planted.action_performance import MOVES
+from planted.camera_stage import RecordedSession
 from torchface import zoo
 from torchface.capture import CurveSettings
 from torchface.capture.action_units import (
@@ -29,8 +31,6 @@ from torchface.capture.action_units.intensity_smoothing import smooth_intensitie
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
-from torchface.synthetic.stages.action_performance import MOVES
-from torchface.synthetic.stages.camera_stage import RecordedSession
 
 
 def planted(session: RecordedSession, units: tuple[str, ...]) -> torch.Tensor:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from planted.action_performance import MOVES
+from planted.camera_stage import RecordedSession, stage_markers
 from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver
 from torchface.capture.action_units import RegionVideo, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
-from torchface.synthetic.stages.action_performance import MOVES
-from torchface.synthetic.stages.camera_stage import RecordedSession, stage_markers
 from torchface.synthetic.stages.marker_stage import record
 
 LED = ("4", "9", "6+43", "18L")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from planted.camera_stage import RecordedSession
 from torchface.capture.action_units import RegionVideo, read_regions
 from torchface.capture.action_units.local_warps import local_warps
 from torchface.capture.action_units.painted_pattern import otsu_threshold, pattern_levels
@@ -14,7 +15,6 @@ from torchface.capture.action_units.pattern_flow import aligned_grid, neutral_fl
 from torchface.capture.action_units.regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
-from torchface.synthetic.stages.camera_stage import RecordedSession
 
 
 def test_a_region_of_its_own_size_is_a_cut() -> None:

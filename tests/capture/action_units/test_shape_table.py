@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.action_performance import MOVES
 from torchface.capture.action_units.regions import GROUPS
 from torchface.capture.action_units.shape_table import ShapeTable, built_in_tables, load_shape_table
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_rig
 from torchface.synthetic.head.performer import SHAPES
-from torchface.synthetic.stages.action_performance import MOVES
 
 UNITS = tuple(unit for group in GROUPS for unit in group.units)
 

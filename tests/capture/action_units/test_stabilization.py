@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from planted.camera_stage import SIDE_MARKERS, RecordedSession
+from planted.head_camera_images import MARKER_RADIUS
+from planted.helmet_camera import HELMET_POINT, helmet_camera
 from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import AlignmentError, ShapeError
-from torchface.synthetic.stages.camera_stage import SIDE_MARKERS, RecordedSession
-from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS
-from torchface.synthetic.stages.helmet_camera import HELMET_POINT, helmet_camera
 
 
 def test_points_are_followed_through_the_shake(session: RecordedSession) -> None:

@@ -11,6 +11,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig, load_rig, load_take
 from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.corrective_energy import CorrectiveEnergy
@@ -18,7 +19,6 @@ from torchface.correctives import Corrective, Correctives
 from torchface.errors import NameMismatchError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.head.planted_correctives import planted_correctives
 from torchface.temporal import interpolated
 
 SHAPES = 16

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 from torchface.capture.own_rig.lighting import LightFit, estimate_light
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
@@ -27,7 +28,6 @@ from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 from torchface.synthetic.stages.weight_curves import perform
 
 STAGE = LightStageSettings(width=200, height=200, samples=1)

@@ -15,9 +15,9 @@ from headless_chromium import headless_chromium, until
 from PIL import Image
 from recorded_take import allow_camera, assert_same_weights, record, watch
 
+from planted.webcam_video import talking_subject
 from torchface.errors import MissingExtraError
 from torchface.workflows.browser_app import export_app
-from torchface.workflows.webcam.webcam_export import rendered_frames
 
 pytestmark = [pytest.mark.browser, pytest.mark.bench]
 TOLERANCE = 0.02
@@ -35,7 +35,7 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def faces() -> np.ndarray:
-    return np.stack(rendered_frames(24))
+    return np.stack(talking_subject(24))
 
 
 @contextmanager

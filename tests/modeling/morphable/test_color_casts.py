@@ -12,7 +12,7 @@ from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.modeling import MorphableModel
 from torchface.modeling.morphable.color_casts import color_casts, texture_areas, without_cast
 from torchface.synthetic import neutral_head
-from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
+from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from torchface.modeling.photographs.texture_fit import fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head
-from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
+from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 EVEN = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
 LAMP = Lighting(lights=(((0.5, 0.3, 0.8), 0.6),), ambient=0.5, occlusion_rays=0, gloss=0.0)

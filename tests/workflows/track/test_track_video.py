@@ -14,6 +14,7 @@ import torch
 from forked_runs import held, killed
 from safetensors.torch import load_file
 
+from planted.light_stage import LightStageSettings, render_lit_video
 from torchface import BlendshapeRig, load_rig, load_take, save_rig, zoo
 from torchface.capture.priors import ShapePrior
 from torchface.cli import main
@@ -29,7 +30,6 @@ from torchface.landmarks.images.tracking.tracked_face import TrackedFace
 from torchface.rendering.point_light import PointLight
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.light_stage import LightStageSettings, render_lit_video
 from torchface.workflows.live.live_track import track_live
 from torchface.workflows.named_finders import load_finder
 from torchface.workflows.track import frame_landmarks

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchface.capture.anybody import WebcamControls, WebcamSolver
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import check_writable, write_file
+from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
@@ -22,17 +23,16 @@ from torchface.onnx.webcam.face_reader import STATE
 from torchface.onnx.webcam.webcam_session import WebcamFrame, WebcamSession
 from torchface.onnx.webcam.webcam_solver_graph import READING
 from torchface.progress import Progress, silent
-from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.webcam.sitter import draw_sitter
-from torchface.synthetic.stages.webcam.webcam_performance import SittingSettings, sitting
-from torchface.synthetic.stages.webcam.webcam_video import WebcamSettings, webcam_frames
+from torchface.rendering.clay_shading import render
+from torchface.synthetic import performer
 from torchface.workflows.webcam.default_solver import default_webcam_solver
 from torchface.workflows.webcam.webcam_graph import WebcamNetworks, webcam_graph, webcam_networks
 
-_FPS, _SEED = 30.0, 7
-_CAMERA = WebcamSettings(320, 240, focal=300)
-_STILL = SittingSettings(distance=450)
-_MOVED = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft", "eyeBlinkRight")
+_FPS = 30.0
+_SIZE = (240, 320)  # rows, columns
+_SPAN = 320.0  # millimetres that the picture shows from top to bottom
+_BACKGROUND = (0.35, 0.4, 0.45)
+_MOVED = (("jawOpen", "mouthSmileLeft"), ("mouthSmileRight", "browInnerUp"), ("eyeBlinkLeft", "eyeBlinkRight"))
 _FRAMES = 12
 _LARGEST_GAP = {"landmarks": 0.01, "weights": 0.02}  # of the eyes' distance; of 1
 _TIMED = (480, 640)  # rows, columns
@@ -88,7 +88,7 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
     content = webcam_graph(progress)
     session = WebcamSession(content)
     progress("rendering a video to check it with")
-    frames = rendered_frames(_FRAMES)
+    frames = _rendered_frames(_FRAMES)
     progress("comparing ONNX Runtime with PyTorch")
     landmarks, weights = webcam_parity(session, webcam_networks(), default_webcam_solver(), frames)
     for name, gap in {"landmarks": landmarks, "weights": weights}.items():
@@ -106,17 +106,20 @@ def export_webcam(out: str | Path, progress: Progress | None = None) -> WebcamRe
     return WebcamReport(out, len(content), len(frames), landmarks, weights, len(session.state), took)
 
 
-def rendered_frames(count: int) -> list[np.ndarray]:
-    """An embedded performer before a webcam who talks, smiles and blinks, uint8 (240,320,3) each."""
-    generator = torch.Generator().manual_seed(_SEED)
-    person = draw_sitter(generator)
-    weights = torch.zeros(count, len(ARKIT))
+def _rendered_frames(count: int) -> list[np.ndarray]:
+    """The embedded performer before a camera, who talks, smiles, blinks and turns the head, uint8 (240,320,3) each."""
+    rig = performer()
     phase = torch.arange(count) / max(count - 1, 1) * torch.pi
-    for row, name in enumerate(_MOVED):
-        weights[:, ARKIT.index(name)] = 0.6 * torch.sin((1 + row // 2) * phase).clamp(min=0)
-    acted = sitting(weights, _FPS, generator, _STILL)
-    pictures = (frame.picture for frame in webcam_frames(person, acted, _SEED, _CAMERA))
-    return [picture.permute(1, 2, 0).contiguous().numpy() for picture in pictures]
+    weights = torch.zeros(count, len(rig.names))
+    for number, names in enumerate(_MOVED):
+        weights[:, rig.index(names)] = 0.6 * torch.sin((1 + number) * phase).clamp(min=0)[:, None]
+    middle = rig.neutral.vertices[rig.neutral.landmarks].mean(0)
+    frames = []
+    for vertices, yaw in zip(rig(weights), 10 * phase.sin(), strict=True):
+        camera = look_at(middle, float(yaw), span=_SPAN, width=_SIZE[1], height=_SIZE[0])
+        image = render(rig.neutral.with_vertices(vertices), camera, background=_BACKGROUND)
+        frames.append((image * 255).round().byte().permute(1, 2, 0).contiguous().numpy())
+    return frames
 
 
 def webcam_parity(

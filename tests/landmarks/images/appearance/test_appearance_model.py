@@ -11,6 +11,13 @@ import torch
 from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
+from planted.portrait_video import (
+    EXPRESSIONS,
+    PortraitVideo,
+    expression_weights,
+    mixed_expressions,
+    render_portrait_video,
+)
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.images.image_files import load_image
@@ -26,13 +33,6 @@ from torchface.landmarks.images.appearance.shape_modes import (
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.portrait_video import (
-    EXPRESSIONS,
-    PortraitVideo,
-    expression_weights,
-    mixed_expressions,
-    render_portrait_video,
-)
 
 TRAINED, TESTED = len(EXPRESSIONS), 10
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.portrait_video import EXPRESSIONS, expression_weights
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.appearance.annotated_frames import (
@@ -17,7 +18,6 @@ from torchface.landmarks.images.appearance.annotated_frames import (
 )
 from torchface.landmarks.images.appearance.frame_choice import choose_frames
 from torchface.synthetic import performer
-from torchface.synthetic.stages.portrait_video import EXPRESSIONS, expression_weights
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from torchface.landmarks.images.networks.eye_crop import (
     moved,
     picture_transforms,
 )
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
+from train.rendered_people.head_kind import performer_kind
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_tran
 from torchface.landmarks.images.networks.eye_finder import EyeFinder, face_without_eyes
 from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
-from torchface.synthetic.stages.face_pictures.eye_picture import EyePicture, draw_eye_pictures
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
+from train.rendered_people.eye_picture import EyePicture, draw_eye_pictures
+from train.rendered_people.head_kind import performer_kind
 
 PLAIN = EyeAugmentation(turn=0, scale=0, shift=0, hidden=0, absent=0, far=0)
 ASIDE = EyeAugmentation(turn=0, scale=0, shift=0.3, hidden=0, absent=0, far=0)

@@ -13,8 +13,8 @@ from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_tran
 from torchface.landmarks.images.networks.eye_finder import EyeFinder
 from torchface.landmarks.images.networks.eye_network import EyeFindings
 from torchface.landmarks.images.networks.eyed_finder import EyedFinder
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from torchface.workflows.named_finders import load_finder
+from train.rendered_people.head_kind import performer_kind
 
 BOX = torch.tensor([40.0, 40.0, 220.0, 220.0])
 

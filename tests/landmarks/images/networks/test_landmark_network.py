@@ -18,9 +18,9 @@ from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around
 from torchface.landmarks.images.networks.crop_finder import BothSides
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, augmented
 from torchface.onnx import export_model
-from torchface.synthetic.stages.face_pictures.face_picture import draw_pictures
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
 from torchface.workflows.named_finders import load_finder
+from train.rendered_people.face_picture import draw_pictures
+from train.rendered_people.head_kind import performer_kind
 
 SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}
 CALM = AugmentationSettings(turn=0.0, scale=0.0, shift=0.0, hidden=0.0, absent=0.0, grey=0.0)

@@ -26,7 +26,7 @@ from torchface.onnx import export_model
 from torchface.onnx.landmark_trees_graph import export_landmark_trees
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.topology import topology
-from torchface.synthetic.stages.portraits import face_images
+from train.rendered_people.portraits import face_images
 
 FEW = TreeSettings(cascades=4, trees=40, depth=4, features=120, test_splits=20, oversampling=10, components=10, noise=0)
 

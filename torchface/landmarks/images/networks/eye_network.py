@@ -125,7 +125,7 @@ class EyeNetwork(nn.Module):
 
         Args:
             pictures: indexed by numbers (B,), such as a ``TensorDataset``. Gives cut-out pictures of both eyes, uint8
-                (B,4,H,W), see ``synthetic.stages.face_pictures.eye_picture``; then what is known of them, in the order
+                (B,4,H,W), see ``train/rendered_people/eye_picture.py``; then what is known of them, in the order
                 of ``EyeLabels``.
             network: goes on from its weights; a new one if absent.
             settings: how.

@@ -125,8 +125,8 @@ class LandmarkNetwork(nn.Module):
         Args:
             pictures: indexed by numbers (B,), such as ``TensorDataset(rgba, landmarks, visible)``; each batch is asked
                 for by a ``DataLoader``'s workers. Gives cut-out faces, uint8 (B,4,H,W), see
-                ``synthetic.stages.face_pictures``; iBUG's 68, (B,68,2) pixels; and which of them nothing hides, (B,68)
-                bool.
+                ``train/rendered_people/face_picture.py``; iBUG's 68, (B,68,2) pixels; and which of them nothing hides,
+                (B,68) bool.
             network: goes on from its weights; a new one if absent.
             settings: how.
             progress: called with each step and how far it is.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.synthetic.stages.backdrops import uniform
-from torchface.synthetic.stages.portrait_geometry import Hairdo
+from .backdrops import uniform
+from .portrait_geometry import Hairdo
 
 _TONES = torch.tensor([[0.93, 0.77, 0.69], [0.87, 0.67, 0.56], [0.76, 0.55, 0.42], [0.58, 0.39, 0.28],
                        [0.40, 0.26, 0.19], [0.24, 0.155, 0.115]])  # fmt: skip

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.face_pictures.head_kind import DrawnHead, HeadKind
-from torchface.synthetic.stages.face_pictures.looks import Looks, draw_looks
+
+from .head_kind import DrawnHead, HeadKind
+from .looks import Looks, draw_looks
 
 _CLOSED = 0.3  # millimetres between lids that are closed
 _LID_PAIRS = ((37, 41), (38, 40), (43, 47), (44, 46))

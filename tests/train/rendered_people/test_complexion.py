@@ -8,7 +8,7 @@ import torch
 from torchface.errors import ShapeError
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import neutral_head
-from torchface.synthetic.head.complexion import COMPLEXION, complexion_colors, draw_complexions
+from train.rendered_people.complexion import COMPLEXION, complexion_colors, draw_complexions
 
 
 def test_the_mean_is_the_painted_skin() -> None:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.synthetic.stages.backdrops import uniform
+
+from .backdrops import uniform
 
 
 def with_glasses(

@@ -5,10 +5,7 @@ import math
 import pytest
 import torch
 
-from torchface.errors import ShapeError, ValueRangeError
-from torchface.rig import BlendshapeRig
-from torchface.synthetic import performer
-from torchface.synthetic.stages.portrait_video import (
+from planted.portrait_video import (
     EXPRESSIONS,
     PortraitSettings,
     PortraitVideo,
@@ -16,6 +13,9 @@ from torchface.synthetic.stages.portrait_video import (
     mixed_expressions,
     render_portrait_video,
 )
+from torchface.errors import ShapeError, ValueRangeError
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 
 SETTINGS = PortraitSettings(width=144, height=180)
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.ibug_68 import MIRROR_68
-from torchface.synthetic.stages.face_pictures.head_kind import GUMS, SOCKET, TEETH, DrawnHead, HeadKind
-from torchface.synthetic.stages.face_pictures.looks import Looks
-from torchface.synthetic.stages.face_pictures.skin_paint import brow_edge_height
-from torchface.synthetic.stages.portrait_geometry import (
+
+from .head_kind import GUMS, SOCKET, TEETH, DrawnHead, HeadKind
+from .looks import Looks
+from .portrait_geometry import (
     contour_lines,
     curtain,
     hair_share_at,
@@ -22,6 +22,7 @@ from torchface.synthetic.stages.portrait_geometry import (
     teeth,
     with_visible_jaw,
 )
+from .skin_paint import brow_edge_height
 
 CURTAIN, CLOTHES = 10, 11
 """Materials beside those of the head."""

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.landmarks.images.boxes.box_training import LabelledPicture
 from torchface.landmarks.images.ibug_68 import turned_box
-from torchface.synthetic.stages.scene_clutter import clutter, draw_hand, random_color
+
+from .scene_clutter import clutter, draw_hand, random_color
 
 _HULL = [*range(17), *range(26, 16, -1)]  # the jaw's contour, and back along the brows
 _FOUND, _DOUBTFUL = (

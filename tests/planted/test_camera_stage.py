@@ -7,13 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.io import load_take
-from torchface.io.action_labels import load_action_labels
-from torchface.io.video import open_video
-from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.action_performance import ACTION_UNITS, MOVES, PerformanceSettings, perform_action_units
-from torchface.synthetic.stages.camera_stage import (
+from planted.action_performance import ACTION_UNITS, MOVES, PerformanceSettings, perform_action_units
+from planted.camera_stage import (
     SIDE_MARKERS,
     RecordedSession,
     StageSettings,
@@ -21,9 +16,14 @@ from torchface.synthetic.stages.camera_stage import (
     render_video,
     stage_markers,
 )
-from torchface.synthetic.stages.head_camera_images import HeadCameraRenderer
-from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
-from torchface.synthetic.stages.reflective_paint import reflective_paint
+from planted.head_camera_images import HeadCameraRenderer
+from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
+from planted.reflective_paint import reflective_paint
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.io import load_take
+from torchface.io.action_labels import load_action_labels
+from torchface.io.video import open_video
+from torchface.synthetic import draw_identities, performer
 
 QUICK = PerformanceSettings(repetitions=1, combination_repetitions=1, combinations=(("4", "9"),), fps=8.0, pace=1.5)
 STILL = CameraFlaws(noise=0.0, blur=0.0, shake_rotation=0.0, shake_translation=0.0)
@@ -50,8 +50,8 @@ def test_video_markers_and_labels_lie_beside_each_other(session: RecordedSession
 def test_labels_say_where_things_are(session: RecordedSession) -> None:
     """The helmet's bolt has a dark middle in a bright rim; markers are the brightest; regions hold paint."""
     frame = session.video.frame(session.labels.neutral).float() / 255
-    x, y = (round(v) for v in session.labels.helmet)
-    assert frame[y, x] < 0.6 * frame[y - 3 : y + 4, x - 3 : x + 4].max()
+    column, row = (round(v) for v in session.labels.helmet)
+    assert frame[row, column] < 0.6 * frame[row - 3 : row + 4, column - 3 : column + 4].max()
     for x, y in session.labels.markers:
         around = frame[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
         assert around.max() > 0.7

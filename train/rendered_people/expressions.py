@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.backdrops import uniform
 from torchface.synthetic.stages.weight_curves import GESTURES
+
+from .backdrops import uniform
 
 Between = Callable[[float, float], float]
 """A number drawn between two others."""

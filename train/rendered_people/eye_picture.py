@@ -14,22 +14,23 @@ from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
-from torchface.synthetic.stages.backdrops import uniform
-from torchface.synthetic.stages.face_pictures.expressions import draw_expression
-from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, SKIN, DrawnHead, HeadKind
-from torchface.synthetic.stages.face_pictures.lashes import with_lashes
-from torchface.synthetic.stages.face_pictures.looks import Looks
-from torchface.synthetic.stages.face_pictures.people import Person, closed_lids, draw_person
-from torchface.synthetic.stages.face_pictures.picture_geometry import CURTAIN, Surface, as_annotated
-from torchface.synthetic.stages.face_pictures.rendered_person import render_person, visible_points
-from torchface.synthetic.stages.face_pictures.spectacles import with_glasses
-from torchface.synthetic.stages.face_pictures.turned_eyes import (
+
+from .backdrops import uniform
+from .expressions import draw_expression
+from .head_kind import EYEBALL, SKIN, DrawnHead, HeadKind
+from .lashes import with_lashes
+from .looks import Looks
+from .people import Person, closed_lids, draw_person
+from .picture_geometry import CURTAIN, Surface, as_annotated
+from .portrait_geometry import curtain, hair_share_at, lumps
+from .rendered_person import render_person, visible_points
+from .spectacles import with_glasses
+from .turned_eyes import (
     gaze_toward,
     gaze_weights,
     iris_centres,
     with_turned_eyes,
 )
-from torchface.synthetic.stages.portrait_geometry import curtain, hair_share_at, lumps
 
 EYES_WIDTH, EYES_HEIGHT = 160, 64
 """Pixels of a picture of both eyes."""

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
-from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, HeadKind
+
+from .head_kind import EYEBALL, HeadKind
 
 FULL_GAZE = (30.0, 25.0)
 """Degrees aside and up or down that a weight of 1 of the shapes of glances stands for."""

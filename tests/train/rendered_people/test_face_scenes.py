@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.synthetic.stages.face_scenes import CutOuts, SceneSettings, face_scene
-from torchface.synthetic.stages.scene_clutter import clutter
+from train.rendered_people.face_scenes import CutOuts, SceneSettings, face_scene
+from train.rendered_people.scene_clutter import clutter
 
 
 @pytest.fixture(scope="module")

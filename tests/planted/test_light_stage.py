@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from planted.face_paint import face_paint
+from planted.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 from torchface.color_space import to_linear
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
@@ -17,8 +19,6 @@ from torchface.mesh import Mesh
 from torchface.rendering.point_light import PointLight, in_camera_frame
 from torchface.synthetic import performer
 from torchface.synthetic.head.neutral_head import neutral_head
-from torchface.synthetic.stages.face_paint import face_paint
-from torchface.synthetic.stages.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
 
 PLAIN = LightStageSettings(width=120, height=120, samples=1, gloss=0.0, noise=0.0)
 AMBIENT, INTENSITY = torch.tensor([0.2, 0.3, 0.4]), torch.tensor([0.5, 0.6, 0.7])
@@ -72,7 +72,7 @@ def test_a_film_is_a_file_with_its_truth(tmp_path: Path) -> None:
     settings = replace(PLAIN, noise=0.01, width=64, height=48)
     film = render_lit_video(
         tmp_path / "film.avi", rig, torch.zeros(3, len(rig.names)), light, 10.0, torch.Generator().manual_seed(0),
-        settings, progress=lambda _, done, of: told.append((done, of)),
+        settings, progress=lambda _, done=None, of=None: told.append((done, of)),
     )  # fmt: skip
     video = open_video(film.video.path)
     assert (video.width, video.height, video.fps, video.count) == (64, 48, 10.0, 3)

@@ -17,13 +17,14 @@ from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster, openness
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.complexion import complexion_colors, draw_complexions
 from torchface.synthetic.head.head_annotations import head_annotations
 from torchface.synthetic.head.identity import IDENTITY, draw_identities, mean_vertices, ramp
 from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.backdrops import backdrop, photographed, uniform
-from torchface.synthetic.stages.portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait, widened
 from torchface.synthetic.stages.weight_curves import GESTURES
+
+from .backdrops import backdrop, photographed, uniform
+from .complexion import complexion_colors, draw_complexions
+from .portrait_geometry import Hairdo, annotated_landmarks, hair_share, portrait, widened
 
 _SENSITIVITY = torch.tensor([0.35, 0.5, 0.15])
 # What people in photographs have more or less of than the mean head, standard deviations: width, most of all.

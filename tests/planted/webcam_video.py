@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from planted.webcam_performance import SittingSettings, WebcamPerformance, gaze_of, sitting
 from torchface.errors import ValueRangeError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.progress import Progress, silent
-from torchface.synthetic.stages.face_pictures.lashes import with_lashes
-from torchface.synthetic.stages.face_pictures.people import Person, closed_lids
-from torchface.synthetic.stages.face_pictures.picture_geometry import annotated, surface
-from torchface.synthetic.stages.face_pictures.rendered_person import render_person, visible_points
-from torchface.synthetic.stages.face_pictures.spectacles import with_glasses
-from torchface.synthetic.stages.face_pictures.turned_eyes import iris_centres, with_turned_eyes
-from torchface.synthetic.stages.scene_clutter import clutter, draw_hand
-from torchface.synthetic.stages.webcam.webcam_performance import WebcamPerformance, gaze_of
+from torchface.shape_names import ARKIT
+from train.rendered_people.head_kind import performer_kind
+from train.rendered_people.lashes import with_lashes
+from train.rendered_people.looks import draw_looks
+from train.rendered_people.people import Person, closed_lids
+from train.rendered_people.picture_geometry import annotated, surface
+from train.rendered_people.rendered_person import render_person, visible_points
+from train.rendered_people.scene_clutter import clutter, draw_hand
+from train.rendered_people.spectacles import with_glasses
+from train.rendered_people.turned_eyes import iris_centres, with_turned_eyes
 
 # Millimetres that a landmark may lie behind what is seen, on a curved edge, and still be visible; contour landmarks
 # count where they are drawn.
 _BEHIND = torch.tensor([45.0] * 17 + [7.0] * 51)
 _SEEN = 20  # of the inner landmarks that must be visible for a face to be there
+_MOVED = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft", "eyeBlinkRight")
 _FINGERS_UP = 1.5 * np.pi  # radians, as pictures turn
 _FAR = 1.1  # of a face's height that a hand which is not raised lies under the mouth
 
@@ -204,3 +208,23 @@ def _taken(picture: np.ndarray, settings: WebcamSettings, noise: np.random.Gener
 
 def _drawn(seed: int, number: int) -> torch.Generator:
     return torch.Generator().manual_seed(1_000_003 * seed + number)
+
+
+def draw_subject(generator: torch.Generator) -> Person:
+    """An embedded performer with hair, skin and clothes drawn at random, without glasses or hair over the eyes."""
+    kind, looks = performer_kind(), draw_looks(generator)
+    bare = replace(looks, glasses=None, hairdo=replace(looks.hairdo, curtain=0.0))
+    return Person(kind, kind.draw(generator), bare)
+
+
+def talking_subject(count: int) -> list[np.ndarray]:
+    """Pictures of somebody who talks, smiles and blinks at 30 frames a second, uint8 (240,320,3) each."""
+    generator = torch.Generator().manual_seed(7)
+    person = draw_subject(generator)
+    weights = torch.zeros(count, len(ARKIT))
+    phase = torch.arange(count) / max(count - 1, 1) * torch.pi
+    for row, name in enumerate(_MOVED):
+        weights[:, ARKIT.index(name)] = 0.6 * torch.sin((1 + row // 2) * phase).clamp(min=0)
+    acted = sitting(weights, 30.0, generator, SittingSettings(distance=450))
+    frames = webcam_frames(person, acted, 7, WebcamSettings(320, 240, focal=300))
+    return [frame.picture.permute(1, 2, 0).contiguous().numpy() for frame in frames]

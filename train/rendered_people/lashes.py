@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.synthetic.stages.backdrops import uniform
+
+from .backdrops import uniform
 
 _FINE = 4  # parts of a pixel that lashes are drawn on
 _RIMS = (((36, 37, 38, 39), 1.0), ((36, 41, 40, 39), -1.0), ((45, 44, 43, 42), 1.0), ((45, 46, 47, 42), -1.0))

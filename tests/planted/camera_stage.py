@@ -12,6 +12,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from planted.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
+from planted.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
+from planted.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
+from planted.reflective_paint import reflective_paint
 from torchface.attachment import Attachment
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import Camera
@@ -25,11 +29,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.identity import both_sides, mean_vertices
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.head.topology import EYE_RIM, topology
-from torchface.synthetic.stages.action_performance import ActionPerformance, PerformanceSettings, perform_action_units
-from torchface.synthetic.stages.head_camera_images import MARKER_RADIUS, HeadCameraRenderer
-from torchface.synthetic.stages.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from torchface.synthetic.stages.marker_stage import Recording, StageFlaws, place_markers, record
-from torchface.synthetic.stages.reflective_paint import reflective_paint
 
 SIDE_MARKERS = ("SIDE_L", "SIDE_R")
 """Labels of the two markers by which images are stabilised."""

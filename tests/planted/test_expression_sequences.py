@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.expression_sequences import expression_sequences, from_neutral_to_neutral
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.io import load_take
-from torchface.synthetic.stages.wrinkles import expression_sequences, from_neutral_to_neutral
 
 FPS = 60.0
 NAMES = ("browInnerUp", "mouthSmileLeft", "eyeBlinkLeft")

@@ -8,13 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.landmarks import lid_openings, mouth_gap
-from torchface.shape_names import ARKIT
-from torchface.synthetic.stages.face_pictures.head_kind import performer_kind
-from torchface.synthetic.stages.face_pictures.looks import draw_looks
-from torchface.synthetic.stages.face_pictures.people import Person
-from torchface.synthetic.stages.face_pictures.turned_eyes import iris_centres
-from torchface.synthetic.stages.webcam.webcam_performance import (
+from planted.webcam_performance import (
     SittingSettings,
     WebcamPerformance,
     gaze_of,
@@ -22,7 +16,13 @@ from torchface.synthetic.stages.webcam.webcam_performance import (
     with_blinks,
     with_speech,
 )
-from torchface.synthetic.stages.webcam.webcam_video import WebcamFrame, WebcamSettings, posed_head, webcam_frames
+from planted.webcam_video import WebcamFrame, WebcamSettings, posed_head, webcam_frames
+from torchface.landmarks import lid_openings, mouth_gap
+from torchface.shape_names import ARKIT
+from train.rendered_people.head_kind import performer_kind
+from train.rendered_people.looks import draw_looks
+from train.rendered_people.people import Person
+from train.rendered_people.turned_eyes import iris_centres
 
 FPS = 10.0
 STILL = SittingSettings(distance=500, yaw=0, pitch=0, tilt=0, drift=0)

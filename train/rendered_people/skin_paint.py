@@ -8,8 +8,9 @@ from torch import Tensor
 from torchface.synthetic.head.identity import ramp
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
 from torchface.synthetic.head.skin_texture import blob, brow_line, mix, noise
-from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, GUMS, TEETH
-from torchface.synthetic.stages.face_pictures.looks import Looks
+
+from .head_kind import EYEBALL, GUMS, TEETH
+from .looks import Looks
 
 _GUMS = (0.62, 0.33, 0.32)
 _LOWER_ENDS = 3.5  # millimetres

@@ -12,11 +12,12 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rendering.raycast import RayCaster, openness
-from torchface.synthetic.stages.backdrops import uniform
-from torchface.synthetic.stages.face_pictures.head_kind import EYEBALL, GUMS, SKIN, TEETH
-from torchface.synthetic.stages.face_pictures.people import Person
-from torchface.synthetic.stages.face_pictures.picture_geometry import CURTAIN, Surface
-from torchface.synthetic.stages.face_pictures.skin_paint import hair_color, surface_color
+
+from .backdrops import uniform
+from .head_kind import EYEBALL, GUMS, SKIN, TEETH
+from .people import Person
+from .picture_geometry import CURTAIN, Surface
+from .skin_paint import hair_color, surface_color
 
 _WHITE = 0.75  # of the brightest light that an eye's white may have
 _FEW = 8  # pixels of eyeballs

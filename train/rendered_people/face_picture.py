@@ -11,13 +11,14 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.synthetic.stages.backdrops import uniform
-from torchface.synthetic.stages.face_pictures.expressions import draw_expression
-from torchface.synthetic.stages.face_pictures.head_kind import HeadKind
-from torchface.synthetic.stages.face_pictures.people import Person, closed_lids, draw_person
-from torchface.synthetic.stages.face_pictures.picture_geometry import annotated, surface
-from torchface.synthetic.stages.face_pictures.rendered_person import render_person, visible_points
-from torchface.synthetic.stages.face_pictures.spectacles import with_glasses
+
+from .backdrops import uniform
+from .expressions import draw_expression
+from .head_kind import HeadKind
+from .people import Person, closed_lids, draw_person
+from .picture_geometry import annotated, surface
+from .rendered_person import render_person, visible_points
+from .spectacles import with_glasses
 
 SIZE = 192
 """Pixels a side of a picture."""
