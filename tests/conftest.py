@@ -1,4 +1,4 @@
-"""Where tests find real data, and how hypothesis behaves."""
+"""Real data, the order of tests and hypothesis, for all tests."""
 
 from __future__ import annotations
 
@@ -51,6 +51,16 @@ TOGETHER = {
     "action units": ("capture/action_units",),
 }
 """Files for one process: two browsers take the time from one another, and a filmed session is costly to make twice."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Ends the run where a list above names no test any more: it would quietly do nothing."""
+    names = (*LONGEST, *(name for files in TOGETHER.values() for name in files))
+    lost = [name for name in names if not any((REPOSITORY / "tests").glob(f"{name}*"))]
+    if lost:
+        raise pytest.UsageError(
+            f"tests/conftest.py: found no tests at {', '.join(lost)}; expected LONGEST and TOGETHER true"
+        )
 
 
 @pytest.hookimpl(optionalhook=True)
