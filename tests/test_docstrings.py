@@ -21,7 +21,7 @@ MODULES = sorted(
 )
 # What holds float32 whatever numbers become: files, pictures and their figures, graphs, the sculpted performer.
 FLOAT32 = (
-    "torchface.capture.action_units.classifier_training",
+    "torchface.capture.action_units.classifier",
     "torchface.io.",
     "torchface.onnx.",
     "torchface.rendering.clay_shading",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface import TorchfaceError, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
-from torchface.enhancement.low_pass import WAVELENGTH
+from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
@@ -144,7 +144,7 @@ def save(model: EnhancementModel, settings: Settings, metrics: dict[str, float],
         text=(
             f"Gives coarse animations on {len(model.neutral)} vertices the wrinkles, creases and timing of one actor: "
             "`torchface enhance INPUT --model THIS --out DIR`. Detail is what lies beyond a smooth part "
-            f"({model.wavelength:.0f} mm keep half); it is looked up by region ({named}). The figures compare "
+            f"({model.settings.wavelength:.0f} mm keep half); it is looked up by region ({named}). The figures compare "
             "restored frames with captured ones, in shares of what the model is shown lacks: of sequences that it has "
             "learned from, and of others. It knows no expression that the actor did not show: regions outside the "
             "database get the nearest detail."

@@ -13,7 +13,7 @@ import torch
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
-from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_expression_samples
+from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import Progress
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
@@ -89,11 +89,11 @@ def train(settings: Settings, run: Run) -> Trained:
 
 def fit(people: People, settings: Settings, progress: Progress | None = None) -> ExpressionRegression:
     """The regression of these people."""
-    return fit_expression_samples(
+    return ExpressionRegression.fit(
         people.neutrals,
         people.expressions,
-        people.names,
         ExpressionSettings(settings.neutral_components, settings.offset_components, settings.ridge),
+        people.names,
         people.template.fingerprint(),
         progress=progress,
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface import Mesh
 from torchface.errors import ValueRangeError
 from torchface.geometry.sample_batches import SampleRange, Samples, blocks
-from torchface.modeling import MorphableModel, color_casts, fit_sequence, texture_areas, without_cast
+from torchface.modeling import MorphableModel, color_casts, texture_areas, without_cast
 from torchface.progress import Progress
 
 from .head_samples import Gathered
@@ -30,7 +30,7 @@ def fitted_colors(
     count, total = len(gathered.shapes) - gathered.held_out, len(gathered.shapes)
     balanced = balanced_colors(gathered.colors, gathered.template, white_balance, progress)
     try:
-        color = fit_sequence(SampleRange(balanced, 0, count), components, checkpoint, progress)
+        color = MorphableModel.fit(SampleRange(balanced, 0, count), components, checkpoint, progress)
     except ValueRangeError as error:
         progress(f"no model of colours: {error}")
         return None, None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchface import TorchfaceError, zoo
-from torchface.modeling import HeadModel, ModelQuality, fit_sequence
+from torchface.modeling import HeadModel, ModelQuality, MorphableModel
 from torchface.progress import Progress
 
 from .head_colors import fitted_colors
@@ -107,7 +107,7 @@ def train(settings: Settings, run: Run) -> Trained:
     progress("laying the heads on each other")
     learn, test = laid(gathered, settings.scale)
     progress("fitting the shape")
-    shape = fit_sequence(learn, settings.components, work / "shape", progress)
+    shape = MorphableModel.fit(learn, settings.components, work / "shape", progress)
     if settings.variance is not None:
         shape = shape.truncate(variance=settings.variance)
     balance = settings.white_balance and not settings.performers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -106,7 +106,7 @@ def ours(model: EnhancementModel) -> dict[str, Method]:
     """Both ways of the model to match."""
 
     def matched(matching: Matching, coarse: Tensor) -> Tensor:
-        model.matching = matching
+        model.settings = replace(model.settings, matching=matching)
         return model.enhance(coarse).vertices
 
     return {OURS: partial(matched, "projection"), LEARNED: partial(matched, "learned")}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.enhancement.low_pass import LowPass, vertex_areas
+from torchface.enhancement.detail.low_pass import LowPass, vertex_areas
 from torchface.geometry.meshes.operators import components, vertex_normals
 
 _FRAMES = 20  # at once

@@ -7,11 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchface.enhancement.displacement_detail import DisplacementDetail
-from torchface.enhancement.gradient_detail import GradientDetail
-from torchface.enhancement.low_pass import LowPass
-from torchface.enhancement.patches import grow_patches
-from torchface.enhancement.surface_frames import SurfaceFrames
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail, GradientDetail
+from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.detail.surface_frames import SurfaceFrames
+from torchface.enhancement.matching.patches import grow_patches
 from torchface.geometry.meshes.operators import edges, triangle_areas
 from torchface.optim import simplex_qp
 

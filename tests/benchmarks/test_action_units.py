@@ -30,7 +30,7 @@ from torchface.capture.action_units import (
 from torchface.capture.action_units.classifier import GroupClassifier, group_regions
 from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
 from torchface.capture.action_units.classifier_training import label_group
-from torchface.capture.action_units.pattern_flow import Method
+from torchface.capture.action_units.painted_pattern import Method
 from torchface.capture.action_units.weight_targets import action_unit_curves
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video

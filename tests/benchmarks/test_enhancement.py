@@ -33,7 +33,7 @@ from enhancement_comparison import (
 from enhancement_pictures import compared
 from enhancement_scenes import FPS
 
-from torchface.enhancement.projection import RegionProjection
+from torchface.enhancement.matching.region_projection import RegionProjection
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 
@@ -119,7 +119,7 @@ def test_outside_is_told(bench: Bench) -> None:
     numbers = model.sequences.unique()[1:]
     for turn in range(4):
         out = torch.isin(model.sequences, numbers[turn::4])
-        projection = RegionProjection(model.database_features[~out], model.patch_weights)
+        projection = RegionProjection(model.database_features[~out], model.prepared.patch_weights)
         limits = projection.limits(model.sequences[~out])
         told.append(projection.project(model.database_features[out]).distances > limits)
     frames = torch.cat(told)

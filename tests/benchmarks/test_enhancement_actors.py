@@ -13,7 +13,7 @@ from enhancement_scenes import FPS, Scene, scene_of
 from torch import Tensor
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
-from torchface.enhancement.low_pass import LowPass
+from torchface.enhancement.detail.low_pass import LowPass
 from torchface.synthetic.head.identity import IDENTITY
 from torchface.synthetic.head.performer import performer
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer

@@ -21,12 +21,12 @@ from enhancement_scenes import Scene, make_scene
 from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
-from torchface.enhancement.displacement_detail import DisplacementDetail
-from torchface.enhancement.low_pass import LowPass, vertex_areas
-from torchface.enhancement.wrinkle_basis import WrinkleBasis, learn_wrinkle_basis
-from torchface.enhancement.wrinkle_teaching import captured_poses, taught_details, teaching_poses
-from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
+from torchface.enhancement.detail.detail_basis import LearnedBasis, StreamingBasis
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail
+from torchface.enhancement.detail.low_pass import LowPass, vertex_areas
+from torchface.enhancement.wrinkle_maps.wrinkle_basis import WrinkleBasis, learn_wrinkle_basis
+from torchface.enhancement.wrinkle_maps.wrinkle_teaching import captured_poses, taught_details, teaching_poses
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.onnx import export_wrinkle_weights
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, VideoSolver
-from torchface.enhancement.propagation import ThinShell
+from torchface.enhancement.thin_shell import ThinShell
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.rig import BlendshapeRig

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel
-from torchface.enhancement.propagation import ThinShell
+from torchface.enhancement.thin_shell import ThinShell
 from torchface.rendering.compositing import from_figure
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 
@@ -70,7 +70,7 @@ def test_parts(size: int) -> None:
     began = time.perf_counter()
     model.enhance(coarse)
     first = time.perf_counter() - began
-    encoder, matching = model._prepared(), model.matching_projection()
+    encoder, matching = model.prepared.encoder, model.prepared.projection
     points = torch.linspace(0, len(model.neutral) - 1, 250).long()
     shell = ThinShell(model.neutral, model.faces, points)
     with torch.no_grad():

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface.attachment import Attachment
-from torchface.enhancement.propagation import ThinShell
+from torchface.enhancement.thin_shell import ThinShell
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.synthetic.stages.marker_stage import place_markers

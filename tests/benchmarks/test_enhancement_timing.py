@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 from torch import Tensor
 
-from torchface.enhancement.actor_timing import ActorTiming
-from torchface.enhancement.retiming import captured_sequences, nearest_timing
+from torchface.enhancement.timing.actor_timing import ActorTiming
+from torchface.enhancement.timing.nearest_timing import captured_sequences, nearest_timing
 from torchface.io import load_take
 from torchface.shape_names import mapping
 from torchface.synthetic.head.performer import performer

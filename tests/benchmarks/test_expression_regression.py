@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.modeling import ExpressionRegression, ExpressionSettings, fit_expression_samples
+from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
@@ -49,7 +49,7 @@ def offsets(people: People) -> Tensor:
 
 
 def fit(people: People, form: str = "offsets") -> ExpressionRegression:
-    return fit_expression_samples(people.neutrals, people.expressions, people.names, ExpressionSettings(form=form))  # type: ignore[arg-type]
+    return ExpressionRegression.fit(people.neutrals, people.expressions, ExpressionSettings(form=form), people.names)  # type: ignore[arg-type]
 
 
 def test_table_1_for_the_smile(smile: People) -> None:

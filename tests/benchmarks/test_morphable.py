@@ -32,7 +32,7 @@ VERTICES, COMPONENTS = 9409, 200
 FIT = """
 import json, resource, sys, time
 from torchface.io.meshes.mesh_sequence import MeshSequence
-from torchface.modeling.morphable.streamed_training import fit_sequence
+from torchface.modeling import MorphableModel
 from safetensors.torch import save_file
 
 path, checkpoint, out = sys.argv[1:4]
@@ -43,7 +43,7 @@ def progress(step, done, total):
     seen.append(done)
     print(json.dumps({"done": done, "total": total}), flush=True)
 
-model = fit_sequence(MeshSequence(path), limit, checkpoint, progress)
+model = MorphableModel.fit(MeshSequence(path), limit, checkpoint, progress)
 save_file({"deviations": model.standard_deviations, "components": model.components[:5]}, out)
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 print(json.dumps({"gib": peak, "wall": time.perf_counter() - begin, "cpu": time.process_time() - clock}), flush=True)

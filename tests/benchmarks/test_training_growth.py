@@ -39,9 +39,9 @@ def tell(begin, start, passes=1):
 HEADS = """
 from torchface.geometry.sample_batches import SampleRange
 from torchface.io import MeshSequence
-from torchface.modeling import fit_sequence
+from torchface.modeling import MorphableModel
 begin, start, passes = peak(), time.process_time(), []
-fit_sequence(SampleRange(MeshSequence(sys.argv[2]), 0, int(sys.argv[1])), int(sys.argv[3]),
+MorphableModel.fit(SampleRange(MeshSequence(sys.argv[2]), 0, int(sys.argv[1])), int(sys.argv[3]),
              progress=lambda step, done, total: passes.append(done / total))
 tell(begin, start, round(30 * passes[-1]))
 """

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchface.enhancement.detail_basis import StreamingBasis, blended
+from torchface.enhancement.detail.detail_basis import StreamingBasis, blended
 
 
 def _streamed(rows, rank, block):

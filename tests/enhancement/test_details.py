@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from torchface.enhancement.displacement_detail import DisplacementDetail
-from torchface.enhancement.gradient_detail import GradientDetail
-from torchface.enhancement.low_pass import LowPass
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail, GradientDetail
+from torchface.enhancement.detail.low_pass import LowPass
 from torchface.geometry.meshes.operators import border_vertices, vertex_normals
 from torchface.geometry.rotations import rotation_matrix
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import errno
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -132,7 +133,7 @@ def test_derivatives_are_those_of_finite_differences(model, database):
 def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
     given = database.frames, database.faces, database.sequences, database.neutral
     projected = copy.deepcopy(model)
-    projected.matching = "projection"
+    projected.settings = replace(projected.settings, matching="projection")
     other = EnhancementModel.fit(
         CapturedPerformance(*given),
         EnhancementSettings(detail="gradients", matching="projection"),
@@ -145,8 +146,8 @@ def test_gradients_of_triangles_as_detail_find_nearly_the_same(model, database):
 
 
 def test_a_run_that_is_killed_continues_to_the_same_model(database, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchface.enhancement.model_training._SECONDS", 0.0)
-    monkeypatch.setattr("torchface.enhancement.model_training._LARGEST_BLOCK", 5)
+    monkeypatch.setattr("torchface.enhancement.enhancement_training._SECONDS", 0.0)
+    monkeypatch.setattr("torchface.enhancement.enhancement_training._LARGEST_BLOCK", 5)
     given = database.frames, database.faces, database.sequences, database.neutral
     whole = EnhancementModel.fit(CapturedPerformance(*given), rank=6, patch_size=20)
     steps = []
@@ -184,7 +185,7 @@ def test_frames_on_disk_give_the_same_model(model, database, tmp_path):
 
 
 def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchface.enhancement.model_training._SECONDS", 0.0)
+    monkeypatch.setattr("torchface.enhancement.enhancement_training._SECONDS", 0.0)
 
     def full(handle, data):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -273,7 +274,7 @@ def test_flicker_of_weights_found_frame_by_frame_is_damped(model, database):
     shaken = 0.06 * torch.randn(16, 3, generator=generator)
     noise = torch.einsum("tn,nvc->tvc", shaken, database.smooth[[13, 22, 31]] - database.neutral)
     held = copy.deepcopy(model)
-    held.temporal = 0.3
+    held.settings = replace(held.settings, temporal=0.3)
     clean = model.enhance(truth)
     flicker, lag = [], []
     for some in (model, held):

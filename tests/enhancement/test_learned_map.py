@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from torchface.enhancement.detail_basis import region_products
-from torchface.enhancement.learned_map import LearnedMap, map_shares
-from torchface.enhancement.projection import RegionProjection
+from torchface.enhancement.detail.detail_basis import region_products
+from torchface.enhancement.matching.learned_map import LearnedMap, map_shares
+from torchface.enhancement.matching.region_projection import RegionProjection
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def planted():
     places = torch.rand(60, 3)
     features = torch.einsum("kd,dpc->kpc", places, axes)
     projection = RegionProjection(features, torch.tensor([[1.0, 1, 1, 1], [1, 1, 0.2, 0]]), ridge=1e-8)
-    return axes, law, places, projection, LearnedMap(projection, places @ law, torch.ones(2), torch.ones(2))
+    return axes, law, places, projection, LearnedMap(projection, places @ law)
 
 
 def test_frames_beyond_the_hull_follow_the_law(planted):
@@ -24,7 +24,7 @@ def test_frames_beyond_the_hull_follow_the_law(planted):
     places = torch.tensor([[1.2, 0.5, 0.5], [0.5, -0.2, 1.1], [0.4, 0.5, 0.6]])
     features = torch.einsum("kd,dpc->kpc", places, axes)
     matched = projection.project(features)
-    added = learned.corrections(features, matched)
+    added = learned.corrections(features, matched, torch.ones(2), torch.ones(2))
     assert float(added[:2].norm(dim=2).min()) > 0.1
     assert float(added[2].norm(dim=1).max()) < 0.02
     blends = (matched.weights @ drawn) @ law
@@ -36,7 +36,8 @@ def test_far_away_it_fades(planted):
     sizes = []
     for far in (5.0, 50.0, 500.0):
         features = torch.einsum("kd,dpc->kpc", torch.tensor([[far, 0.5, 0.5]]), axes)
-        sizes.append(learned.corrections(features, projection.project(features)).norm(dim=2))
+        matched = projection.project(features)
+        sizes.append(learned.corrections(features, matched, torch.ones(2), torch.ones(2)).norm(dim=2))
     assert torch.allclose(sizes[1], 10 * sizes[2], rtol=0.2)
     assert float((sizes[1] / sizes[0]).max()) < 0.2
 

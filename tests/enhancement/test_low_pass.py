@@ -7,7 +7,7 @@ import torch
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from torchface.enhancement.low_pass import LowPass, vertex_areas
+from torchface.enhancement.detail.low_pass import LowPass, vertex_areas
 from torchface.errors import ShapeError, ValueRangeError
 
 

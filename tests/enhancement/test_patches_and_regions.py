@@ -8,9 +8,8 @@ import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from torchface.enhancement.patches import grow_patches, neighbouring_triangles, patch_means
-from torchface.enhancement.regions import find_regions
-from torchface.enhancement.soft_borders import soft_weights, surface_distances
+from torchface.enhancement.matching.face_regions import regions_of_motion, soft_weights, surface_distances
+from torchface.enhancement.matching.patches import grow_patches, neighbouring_triangles, patch_means
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import triangle_areas
 
@@ -23,6 +22,13 @@ def _sheet(count: int, edge: float) -> tuple[torch.Tensor, torch.Tensor]:
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
     faces = torch.cat([torch.stack([a, b, d], -1).view(-1, 3), torch.stack([a, d, c], -1).view(-1, 3)])
     return torch.stack([x, y, torch.zeros_like(x)], -1).view(-1, 3), faces
+
+
+def _motion_of_patches(displacements: torch.Tensor, database) -> tuple[torch.Tensor, torch.Tensor]:
+    """The patch of each triangle (F,), and the mean displacements of each patch, (K,P,3)."""
+    patches = grow_patches(database.faces, len(database.neutral), 4)
+    areas = triangle_areas(database.neutral, database.faces)
+    return patches, patch_means(displacements[:, database.faces].mean(2), patches, areas)
 
 
 def test_patches_are_connected_even_and_follow_their_seed(database):
@@ -71,7 +77,8 @@ def test_distances_along_a_flat_sheet_are_straight_along_its_edges():
 def test_regions_have_names_and_sides_and_are_a_partition(database):
     displacements = database.smooth - database.neutral
     moved = torch.cat([displacements, displacements.flip(0) * 0.5])
-    regions = find_regions(moved, database.neutral, database.faces, 9, database.landmarks)
+    patches, motion = _motion_of_patches(moved, database)
+    regions = regions_of_motion(motion, patches, database.neutral, database.faces, 9, database.landmarks)
     assert {"eye_left", "eye_right"} < set(regions.names)
     assert len(set(regions.names)) == 9
     assert any(name.startswith("mouth") for name in regions.names)
@@ -88,5 +95,6 @@ def test_regions_have_names_and_sides_and_are_a_partition(database):
 
 
 def test_a_face_that_does_not_move_has_no_regions(database):
+    patches, motion = _motion_of_patches(database.smooth[:3], database)
     with pytest.raises(ValueRangeError, match=r"0 of \d+ patches that move"):
-        find_regions(torch.zeros(3, *database.neutral.shape), database.neutral, database.faces, 4)
+        regions_of_motion(torch.zeros_like(motion), patches, database.neutral, database.faces, 4)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.linalg import polar
 
-from torchface.enhancement.polar_parts import decode_gradients, encode_gradients, polar_parts
+from torchface.enhancement.detail.polar_parts import decode_gradients, encode_gradients, polar_parts
 from torchface.geometry.rotations import rotation_matrix
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from torchface.enhancement.projection import RegionProjection
+from torchface.enhancement.matching.region_projection import RegionProjection
 from torchface.errors import ShapeError
 
 UNITS = np.sqrt([2, 2, 2, 1, 2, 2, 1, 2, 1])

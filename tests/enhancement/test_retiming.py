@@ -12,11 +12,10 @@ from torch import Tensor
 
 from tests.enhancement.conftest import Database
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.actor_timing import ActorTiming
-from torchface.enhancement.animation_retiming import at_moments, retime_animation, retimed_moments
-from torchface.enhancement.learned_timing import LearnedTiming
-from torchface.enhancement.motion_keyframes import find_keyframes
-from torchface.enhancement.retiming import interpolate, motion_progress, project_sequence
+from torchface.enhancement.animation_retiming import at_moments, retimed_moments
+from torchface.enhancement.timing.actor_timing import ActorTiming, LearnedTiming
+from torchface.enhancement.timing.motion_keyframes import find_keyframes
+from torchface.enhancement.timing.nearest_timing import interpolate, motion_progress, project_sequence
 from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
 
 
@@ -176,10 +175,10 @@ def test_an_animation_keeps_its_keyframes(model: EnhancementModel, database: Dat
     there = torch.linspace(0, 1, 13)[:, None, None]
     neutral, extreme = database.neutral, database.smooth[4]
     linear = neutral + torch.cat([there, torch.ones(4, 1, 1), there.flip(0)]) * (extreme - neutral)
-    retimed = retime_animation(model, linear, model.fps)
+    moments = retimed_moments(model, model.features(linear), model.fps)
+    retimed = at_moments(linear, moments, model.vertex_weights)
     for frame in (0, 13, 14, 29):
         torch.testing.assert_close(retimed[frame], linear[frame], atol=1e-3, rtol=0)
-    moments = retimed_moments(model, model.features(linear), model.fps)
     assert bool((moments[:, 1:] >= moments[:, :-1]).all())
     assert float((moments - torch.arange(30.0)).abs().max()) > 0.5  # of a sine, not linear
 

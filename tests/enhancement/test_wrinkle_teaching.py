@@ -8,8 +8,8 @@ from torch import Tensor
 
 from tests.enhancement.conftest import Database
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.displacement_detail import DisplacementDetail
-from torchface.enhancement.wrinkle_teaching import captured_poses, taught_details, teaching_poses
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail
+from torchface.enhancement.wrinkle_maps.wrinkle_teaching import captured_poses, taught_details, teaching_poses
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.performer import performer
 

@@ -9,10 +9,10 @@ from torch import Tensor
 from tests.enhancement.conftest import Database
 from torchface.correctives import Corrective, Correctives
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
-from torchface.enhancement.low_pass import vertex_areas
-from torchface.enhancement.wrinkle_basis import WrinkleBasis, learn_wrinkle_basis
-from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights, nearest_rotation
+from torchface.enhancement.detail.detail_basis import LearnedBasis, StreamingBasis
+from torchface.enhancement.detail.low_pass import vertex_areas
+from torchface.enhancement.wrinkle_maps.wrinkle_basis import WrinkleBasis, learn_wrinkle_basis
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights, nearest_rotation
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig

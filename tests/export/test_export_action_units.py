@@ -12,7 +12,7 @@ import torch
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
 from torchface.capture.action_units.classifier import GroupSize
-from torchface.capture.action_units.regions import GROUPS, RegionGroup
+from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
 from torchface.cli.export import action_units as command
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.modeling import MorphableModel

@@ -18,7 +18,7 @@ from planted.webcam_video import talking_subject
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.own_rig import VideoSolver
-from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector
 from torchface.landmarks.scans.hog import HogLayout

@@ -14,7 +14,7 @@ from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig
 from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
 from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
-from torchface.capture.action_units.regions import RegionGroup
+from torchface.capture.action_units.painted_regions import RegionGroup
 from torchface.capture.anybody import ExampleSolver, WebcamSolver
 from torchface.capture.anybody.examples.example_shapes import ExampleShapes
 from torchface.capture.anybody.examples.landmark_model import LandmarkModel
@@ -28,17 +28,16 @@ from torchface.capture.priors import (
     ShapePrior,
 )
 from torchface.enhancement import CapturedPerformance, EnhancementModel
-from torchface.enhancement.wrinkle_weights import WrinkleWeights
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.landmarks.images.boxes.box_network import BoxNetwork
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
+from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.rigging.expression_regression import ExpressionRegression
-from torchface.modeling.rigging.expression_training import ExpressionSettings, fit_expressions
 from torchface.onnx import HybridGraph, SolverGraph
 from torchface.optim import BoxQP
 from torchface.synthetic import performer
@@ -197,7 +196,9 @@ def expression_regression(number: int) -> ExpressionRegression:
     whole = rig(number)
     neutrals = whole(0.3 * random(6, len(NAMES), seed=number).float())
     sizes = 1 + 0.2 * random(6, 1, 1, 1, seed=number).float()
-    return fit_expressions(neutrals, neutrals[:, None] + sizes * whole.deltas[:2], ExpressionSettings(3, 3), NAMES[:2])
+    return ExpressionRegression.fit(
+        neutrals, neutrals[:, None] + sizes * whole.deltas[:2], ExpressionSettings(3, 3), NAMES[:2]
+    )
 
 
 @cache

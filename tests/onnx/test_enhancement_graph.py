@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.correctives import Corrective, Correctives
-from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.rotations import rotation_matrix
 from torchface.mesh import Mesh
 from torchface.onnx import export_wrinkle_weights

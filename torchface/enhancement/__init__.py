@@ -3,9 +3,5 @@
 from torchface.enhancement.captured_performance import CapturedPerformance
 from torchface.enhancement.enhancement_model import Enhancement, EnhancementModel
 from torchface.enhancement.enhancement_settings import EnhancementSettings, EnhancementSizes
-from torchface.enhancement.enhancement_training import fit_enhancement
-
-# The training imports the model; the model gets its `fit` here.
-EnhancementModel.fit = staticmethod(fit_enhancement)
 
 __all__ = ["CapturedPerformance", "Enhancement", "EnhancementModel", "EnhancementSettings", "EnhancementSizes"]

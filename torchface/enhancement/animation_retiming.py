@@ -1,39 +1,19 @@
-"""A whole animation in the actor's timing: its keyframes are found, and the motions between them are timed anew."""
+"""The actor's timing of a whole animation: its keyframes are found, and the motions between them are timed anew."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.enhancement.enhancement_model import EnhancementModel
-from torchface.enhancement.motion_keyframes import find_keyframes, travelled, without_holds
+from torchface.enhancement.timing.motion_keyframes import find_keyframes, travelled, without_holds
 from torchface.errors import ShapeError
-from torchface.number_checks import MAX_FPS, MIN_FPS, checked_number
 
 _TOLERANCE = 0.08  # of the animation's range: how far its path may leave the straight way between two keyframes
 _FEWEST = 4  # frames of a motion that has a timing
-
-
-def retime_animation(model: EnhancementModel, coarse: Tensor, fps: float) -> Tensor:
-    """An animation with the actor's timing between its keyframes, which stay where and what they are.
-
-    Args:
-        model: of the actor.
-        coarse: (T,V,3), millimetres, in the model's mesh.
-        fps: of its frames.
-
-    Returns:
-        (T,V,3).
-
-    Raises:
-        TopologyError: another number of vertices, or another order.
-        ValueRangeError: ``fps`` is none.
-    """
-    checked_number("fps", fps, MIN_FPS, MAX_FPS)
-    moments = retimed_moments(model, model.features(coarse), fps)
-    return at_moments(coarse, moments, model.vertex_weights)
 
 
 def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Tensor:
@@ -44,7 +24,8 @@ def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Te
         features: of the animation's frames, (T,P,9).
         fps: of the animation.
     """
-    weights = model.patch_weights
+    prepared = model.prepared
+    weights = prepared.patch_weights
     moments = torch.arange(len(features), dtype=torch.float64).expand(len(weights), -1).clone()
     whole = (features.double() * weights.mean(0).sqrt()[:, None]).flatten(1)
     # Motions are of different length, and few.
@@ -54,7 +35,7 @@ def retimed_moments(model: EnhancementModel, features: Tensor, fps: float) -> Te
         if end - begin + 1 < _FEWEST or torch.equal(pair[0], pair[1]):
             continue
         length = (end - begin) * model.fps / fps
-        times = model.timing.times(pair, end - begin + 1, length)
+        times = prepared.timing.times(pair, end - begin + 1, length)
         moments[:, begin : end + 1] = begin + _inverse(travelled(whole[begin : end + 1]), times.double())
     return moments
 
@@ -81,21 +62,19 @@ def at_moments(frames: Tensor, moments: Tensor, vertex_weights: Tensor) -> Tenso
     # From the first region's on, so that where all agree no rounding of the shares' sum moves the moment.
     base = moments[0]
     spread = (moments - base).T @ vertex_weights.to(moments)
-    place = (base[:, None] + spread).clamp(0, len(frames) - 1)
-    before = place.floor().long()
+    moment = (base[:, None] + spread).clamp(0, len(frames) - 1)
+    before = moment.floor().long()
     after = (before + 1).clamp(max=len(frames) - 1)
     vertices = torch.arange(frames.shape[1])
-    share = (place - before).to(frames)[..., None]
+    share = (moment - before).to(frames)[..., None]
     return torch.lerp(frames[before, vertices], frames[after, vertices], share)
 
 
 def _inverse(travelled: Tensor, asked: Tensor) -> Tensor:
     """When (n,) values that rise from 0 to 1 reach what is asked, (R,m), in steps from 0 to n-1."""
     steps = torch.arange(len(travelled), dtype=torch.float64)
-    # Where nothing moves, the least of slopes tells moments apart.
+    # Where nothing moves, the least of slopes keeps moments apart.
     rising = (travelled + 1e-9 * steps) / (1 + 1e-9 * steps[-1])
-    right = torch.searchsorted(rising, asked.contiguous()).clamp(1, len(rising) - 1)
-    span = (rising[right] - rising[right - 1]).clamp(min=1e-15)
-    found = steps[right - 1] + ((asked - rising[right - 1]) / span).clamp(0, 1)
-    found[:, 0], found[:, -1] = 0, steps[-1]
-    return found
+    moments = torch.from_numpy(np.interp(asked.numpy(), rising.numpy(), steps.numpy()))
+    moments[:, 0], moments[:, -1] = 0, steps[-1]
+    return moments

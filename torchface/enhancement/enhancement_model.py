@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchface.enhancement.actor_timing import ActorTiming
-from torchface.enhancement.detail_basis import blended
-from torchface.enhancement.enhancement_settings import (
-    DEFAULT_SETTINGS,
-    DetailKind,
-    EnhancementSettings,
-    EnhancementSizes,
-    Matching,
-)
-from torchface.enhancement.learned_map import LearnedMap
-from torchface.enhancement.low_pass import vertex_areas
-from torchface.enhancement.model_training import (
-    Encoder,
-    make_encoder,
-)
-from torchface.enhancement.own_lids import OwnLids
-from torchface.enhancement.projection import RegionProjection
-from torchface.enhancement.regions import Regions
+from torchface.enhancement.captured_performance import CapturedPerformance
+from torchface.enhancement.detail.detail_basis import blended
+from torchface.enhancement.detail.low_pass import vertex_areas
+from torchface.enhancement.enhancement_settings import DEFAULT_SETTINGS, EnhancementSettings, EnhancementSizes
+from torchface.enhancement.matching.face_regions import Regions
+from torchface.enhancement.prepared_database import PreparedDatabase
 from torchface.errors import TopologyError, ValueRangeError
-from torchface.geometry.meshes.operators import triangle_areas
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
+from torchface.progress import Progress
 
 _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
 # Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
@@ -66,7 +55,7 @@ class EnhancementModel(nn.Module):
     A frame a is laid on the neutral and split, :math:`\ell = d_0 + \mathrm{LowPass}(a - d_0)`. The deformation
     gradients of :math:`\ell`, in the mean over patches, are projected by region onto convex combinations of the
     database's; the same combinations of the database's details, blended over the regions' soft borders, go onto
-    :math:`\ell` in the place of what a itself had beyond it; lids that a shows itself stay, see ``OwnLids``.
+    :math:`\ell` in the place of what a itself had beyond it; lids that a shows itself stay, see ``InputLids``.
 
     Made by :meth:`fit`. The constructor makes an empty model for a state to be loaded into.
 
@@ -110,8 +99,6 @@ class EnhancementModel(nn.Module):
     color_coefficients: Tensor
     limits: Tensor
     map_shares: Tensor
-    fit: ClassVar[Callable[..., EnhancementModel]]
-    """:func:`torchface.enhancement.enhancement_training.fit_enhancement`, bound where this package begins."""
 
     def __init__(
         self,
@@ -124,16 +111,13 @@ class EnhancementModel(nn.Module):
         scale: float = 1.0,
     ) -> None:
         super().__init__()
-        vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
+        self.sizes, self.settings = sizes, settings
         self.region_names = tuple(region_names)
         self.voluntary = tuple(bool(value) for value in voluntary)
-        self.fps, self.wavelength = settings.fps, settings.wavelength
-        self.detail: DetailKind = settings.detail
-        self.matching: Matching = settings.matching
-        self.temporal = settings.temporal
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
         self.scale = checked_number("scale", scale)
+        vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
         regions = len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
@@ -144,7 +128,7 @@ class EnhancementModel(nn.Module):
         self.register_buffer("limits", torch.ones(regions, dtype=torch.float64))
         self.register_buffer("map_shares", torch.ones(regions, dtype=torch.float64))
         self.register_buffer("database_features", torch.zeros(frames, sizes.patches, 9))
-        size = 3 * vertices if self.detail == "displacements" else 9 * triangles
+        size = 3 * vertices if settings.detail == "displacements" else 9 * triangles
         self.register_buffer("components", torch.zeros(sizes.rank, size, dtype=torch.float16))
         self.register_buffer("coefficients", torch.zeros(frames, sizes.rank))
         color_rank = sizes.color_rank
@@ -152,32 +136,56 @@ class EnhancementModel(nn.Module):
         self.register_buffer("mean_color", torch.zeros(colored, 3))
         self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
         self.register_buffer("color_coefficients", torch.zeros(frames if color_rank else 0, color_rank))
-        self._encoder: Prepared[Encoder] = Prepared()
-        self._vertex_weights: Prepared[Tensor] = Prepared()
-        self._projection: Prepared[RegionProjection] = Prepared()
-        self._learned: Prepared[LearnedMap] = Prepared()
-        self._timing: Prepared[ActorTiming] = Prepared()
-        self._own_lids: Prepared[OwnLids] = Prepared()
+        self._prepared: Prepared[PreparedDatabase] = Prepared()
+
+    @classmethod
+    def fit(
+        cls,
+        performance: CapturedPerformance,
+        settings: EnhancementSettings = DEFAULT_SETTINGS,
+        *,
+        patch_size: int = 100,
+        region_count: int = 13,
+        rank: int = 64,
+        seed: int = 0,
+        folder: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> EnhancementModel:
+        """Learns from a captured performance.
+
+        Args:
+            performance: K frames of the actor.
+            settings: how frames are split and detail is found.
+            patch_size: vertices a patch.
+            region_count: how many regions are looked for.
+            rank: components of the detail.
+            seed: of patches and regions.
+            folder: where a run that is killed finds what it has learned; of this run alone.
+            progress: called with each step and the frames that are done.
+
+        Returns:
+            The model. ``lost_share`` says what part of the details' energy its components do not hold.
+
+        Raises:
+            TopologyError: vertices of frames are in another order.
+            ValueRangeError: NaN.
+            AlignmentError: frames of another unit.
+            FileFormatError: the disk is full.
+        """
+        from torchface.enhancement.enhancement_training import fit_enhancement
+
+        return fit_enhancement(performance, settings, patch_size, region_count, rank, seed, folder, progress)
 
     @property
     def config(self) -> dict[str, Any]:
         """What :meth:`from_config` needs: plain values only."""
         return {
-            "vertices": len(self.neutral),
-            "triangles": len(self.faces),
-            "patches": self.database_features.shape[1],
-            "frames": len(self.sequences),
-            "rank": len(self.components),
+            **asdict(self.sizes),
+            **asdict(self.settings),
             "region_names": list(self.region_names),
             "voluntary": list(self.voluntary),
-            "fps": self.fps,
-            "wavelength": self.wavelength,
-            "color_rank": len(self.color_components),
-            "detail": self.detail,
             "lost_share": self.lost_share,
             "keeps_input": self.keeps_input,
-            "matching": self.matching,
-            "temporal": self.temporal,
             "scale": self.scale,
         }
 
@@ -193,8 +201,10 @@ class EnhancementModel(nn.Module):
                 "found a model of an earlier version, which had no limits in its state: learn it again"
             )
         given = dict(config)
-        sizes = EnhancementSizes(**{one.name: given.pop(one.name) for one in fields(EnhancementSizes)})
-        settings = EnhancementSettings(**{one.name: given.pop(one.name) for one in fields(EnhancementSettings)})
+        sizes = EnhancementSizes(**{size.name: given.pop(size.name) for size in fields(EnhancementSizes)})
+        settings = EnhancementSettings(
+            **{setting.name: given.pop(setting.name) for setting in fields(EnhancementSettings)}
+        )
         return cls(sizes, settings=settings, **given)
 
     @property
@@ -238,11 +248,11 @@ class EnhancementModel(nn.Module):
     def features(self, coarse: Tensor) -> Tensor:
         """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
         self._check_frames(coarse)
-        smooth, encoder = self._smooth(coarse)[0], self._prepared()
+        smooth, encoder = self._smooth(coarse)[0], self.prepared.encoder
         return encoder.gradients.features(smooth, encoder.frames.turned(smooth))
 
     def low(self, coarse: Tensor) -> Tensor:
-        """The smooth part of frames (T,V,3), laid on the neutral."""
+        """The smooth part of frames (T,V,3), aligned with the neutral."""
         self._check_frames(coarse)
         return self.neutral.to(coarse) + self._smooth(coarse)[0]
 
@@ -267,7 +277,7 @@ class EnhancementModel(nn.Module):
 
         Returns:
             How far each region has come in each frame, (R,frames), 0 first and 1 last, never falling; see
-            ``torchface.enhancement.retiming.interpolate``.
+            ``torchface.enhancement.timing.nearest_timing.interpolate``.
 
         Raises:
             TopologyError: another number of vertices, or another order.
@@ -278,15 +288,7 @@ class EnhancementModel(nn.Module):
         """
         checked_count("frames", frames, 2)
         fps = self.fps if fps is None else checked_number("fps", fps, MIN_FPS, MAX_FPS)
-        return self.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps)
-
-    @property
-    def timing(self) -> ActorTiming:
-        """How the actor moves between two poses, by region."""
-        return self._timing.get(
-            (*self._matched_with(), self.sequences),
-            lambda: ActorTiming(self.database_features, self.sequences, self.patch_weights, self.fps),
-        )
+        return self.prepared.timing.times(self.features(keyframes), frames, (frames - 1) * self.fps / fps)
 
     def on_actor(self, neutral: Tensor, scale: float = 1.0) -> EnhancementModel:
         """This actor's detail for another head of the same mesh, as much larger as that head is.
@@ -309,23 +311,41 @@ class EnhancementModel(nn.Module):
         neutral = pose.apply(neutral.detach().to(self.neutral)[None])[0]
         other = copy.deepcopy(self)
         sizes = [float(vertex_areas(head, self.faces).sum()) ** 0.5 for head in (neutral, self.neutral)]
-        other.wavelength = self.wavelength * sizes[0] / sizes[1]
+        other.settings = replace(self.settings, wavelength=self.settings.wavelength * sizes[0] / sizes[1])
         other.coefficients = self.coefficients * (sizes[0] / sizes[1])
         other.neutral = neutral.to(self.neutral)
         other.scale = scale
         return other
 
     @property
-    def vertex_weights(self) -> Tensor:
-        """The share of each region in each vertex, (R,V)."""
-        return self._vertex_weights.get(
-            (self.region_weights, self.faces), lambda: self.regions.vertex_weights(self.faces, len(self.neutral))
-        )
+    def fps(self) -> float:
+        """Of the database."""
+        return self.settings.fps
 
     @property
-    def patch_weights(self) -> Tensor:
-        """The share of each patch in each region, (R,P)."""
-        return self.regions.patch_weights(self.patches, triangle_areas(self.neutral, self.faces))
+    def vertex_weights(self) -> Tensor:
+        """The share of each region in each vertex, (R,V)."""
+        return self.prepared.vertex_weights
+
+    @property
+    def map_reach(self) -> Tensor:
+        """Of each region, up to what distance the learned map is trusted, (R,)."""
+        return self.limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
+
+    @property
+    def prepared(self) -> PreparedDatabase:
+        """What is computed once of the state and kept until the state changes."""
+        database = PreparedDatabase(
+            self.neutral,
+            self.faces,
+            self.patches,
+            self.sequences,
+            self.database_features,
+            self.coefficients,
+            self.regions,
+            self.settings,
+        )
+        return self._prepared.get(database.inputs, lambda: database)
 
     def check_state(self) -> None:
         """Refuses a state whose numbers do not make a model.
@@ -345,64 +365,32 @@ class EnhancementModel(nn.Module):
 
     def _enhanced(self, coarse: Tensor, previous: Tensor | None) -> Enhancement:
         smooth, displacements, pose = self._smooth(coarse)
-        encoder = self._prepared()
+        prepared = self.prepared
+        encoder = prepared.encoder
         turned = encoder.frames.turned(smooth)
         features = encoder.gradients.features(smooth, turned)
-        projection = self.matching_projection()
-        matched = projection.project(features, previous)
+        matched = prepared.projection.project(features, previous)
         coefficients = matched.weights @ self.coefficients.to(matched.weights)
-        if self.matching == "learned":
-            reach, shares = self.map_reach(), self.map_shares
-            learned = self._learned.get(
-                (*self._matched_with(), self.coefficients, reach, shares),
-                lambda: LearnedMap(projection, self.coefficients, reach, shares),
-            )
-            coefficients = coefficients + learned.corrections(features, matched)
-        weights = encoder.detail.site_weights(self.vertex_weights)
+        if self.settings.matching == "learned":
+            shares = self.map_shares.to(features)
+            coefficients = coefficients + prepared.learned_map.corrections(features, matched, self.map_reach, shares)
+        weights = encoder.detail.site_weights(prepared.vertex_weights)
         details = blended(self.components, coefficients, weights)
         low, own = (self.neutral.to(smooth) + moved for moved in (smooth, displacements))
         if self.keeps_input:
             vertices = encoder.detail.compose(own, details, turned)
         else:
-            vertices = self._lids()(encoder.detail.compose(low, details, turned), low, own)
+            vertices = prepared.lids(encoder.detail.compose(low, details, turned), low, own)
         if self.scale != 1.0:
             vertices = own + self.scale * (vertices - own)
         outside = matched.distances > self.limits.to(matched.distances)
         return Enhancement(pose.inverse().apply(vertices), matched.weights, matched.distances, outside)
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:
-        """The smooth part of displacements from the neutral, all of them, and how the frames were laid on it."""
-        encoder = self._prepared()
-        displacements, pose = encoder.alignment.laid_on_neutral(coarse, "coarse")
+        """The smooth part of displacements from the neutral, all of them, and how the frames were aligned with it."""
+        encoder = self.prepared.encoder
+        displacements, pose = encoder.alignment.aligned(coarse, "coarse")
         return encoder.low_pass(displacements), displacements, pose
-
-    def _prepared(self) -> Encoder:
-        return self._encoder.get(
-            (self.neutral, self.faces, self.patches, self.wavelength),
-            lambda: make_encoder(self.neutral, self.faces, self.patches, self.wavelength, self.detail),
-        )
-
-    def matching_projection(self) -> RegionProjection:
-        """What finds each region's blend of the database for a coarse frame."""
-
-        def made() -> RegionProjection:
-            return RegionProjection(self.database_features, self.patch_weights, temporal=self.temporal)
-
-        return self._projection.get((*self._matched_with(), self.temporal), made)
-
-    def _matched_with(self) -> tuple[Tensor, ...]:
-        return self.database_features, self.region_weights, self.neutral, self.faces, self.patches
-
-    def map_reach(self) -> Tensor:
-        """Of each region, up to what distance the learned map is trusted, (R,)."""
-        return self.limits * (_REACH_OF_WRINKLES if self.keeps_input else _REACH)
-
-    def _lids(self) -> OwnLids:
-        def made() -> OwnLids:
-            eyes = [number for number, name in enumerate(self.region_names) if name.startswith("eye")]
-            return OwnLids(self.neutral, self.faces, self.region_weights[eyes] == 1)
-
-        return self._own_lids.get((self.neutral, self.faces, self.region_weights), made)
 
     def _check_frames(self, coarse: Tensor) -> None:
         if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:

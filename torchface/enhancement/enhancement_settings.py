@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from torchface.enhancement.low_pass import WAVELENGTH
+from torchface.enhancement.detail.detail_encodings import DetailKind
+from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, MAX_FPS, MIN_FPS, checked_number
 
-DetailKind = Literal["displacements", "gradients"]
 Matching = Literal["projection", "learned"]
 _MATCHINGS: tuple[Matching, ...] = ("projection", "learned")
 _DETAILS: tuple[DetailKind, ...] = ("displacements", "gradients")

@@ -12,7 +12,6 @@ from torchface.modeling.morphable.color_casts import color_casts, texture_areas,
 from torchface.modeling.morphable.head_model import HeadModel, Heads
 from torchface.modeling.morphable.model_quality import ModelQuality, model_quality
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.morphable.streamed_training import fit_sequence
 from torchface.modeling.photographs.image_fit import ImageFit, fit_images
 from torchface.modeling.photographs.image_solve import FitSettings
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
@@ -24,15 +23,15 @@ from torchface.modeling.rigging.deformation_transfer import (
     transfer_with_report,
 )
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
-from torchface.modeling.rigging.expression_regression import ExpressionRegression, rig_from_neutral
-from torchface.modeling.rigging.expression_training import ExpressionSettings, fit_expression_samples, fit_expressions
+from torchface.modeling.rigging.expression_regression import (
+    ExpressionRegression,
+    ExpressionSettings,
+    rig_from_neutral,
+)
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts, shape_depths
-
-# Training knows its model; a model knows of its training only here.
-ExpressionRegression.fit = staticmethod(fit_expressions)
 
 __all__ = [
     "BakeSettings",
@@ -60,10 +59,7 @@ __all__ = [
     "color_casts",
     "detail_maps",
     "fit_colors",
-    "fit_expression_samples",
-    "fit_expressions",
     "fit_images",
-    "fit_sequence",
     "inner_parts",
     "model_quality",
     "open_eyes",

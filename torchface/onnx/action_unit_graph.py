@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchface import __version__
 from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.action_units.local_warps import local_warps
+from torchface.capture.action_units.classifier_training import local_warps
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.onnx.exported_model import exported_model

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface import __version__
 from torchface.correctives.activation import CorrectiveActivation
-from torchface.enhancement.wrinkle_weights import ROTATION_STEPS, RigWrinkles, WrinkleWeights
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import ROTATION_STEPS, RigWrinkles, WrinkleWeights
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.graph_values import OPSET, Value, ValueGraph
 

@@ -18,17 +18,17 @@ from torchface.capture.action_units import (
     ActionUnitClassifier,
     RegionGroup,
     RegionVideo,
+    TrainingSettings,
     action_unit_curves,
     classify,
     load_shape_table,
     read_regions,
 )
 from torchface.capture.action_units.classifier_evaluation import cross_validation, level_agreement
-from torchface.capture.action_units.classifier_training import TrainingSettings, label_group
+from torchface.capture.action_units.classifier_training import intensity_levels, label_group
 from torchface.capture.action_units.gabor import GaborBank
-from torchface.capture.action_units.intensity_labels import intensity_levels
-from torchface.capture.action_units.intensity_smoothing import smooth_intensities
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
+from torchface.capture.action_units.weight_targets import smooth_intensities
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.onnx import export_action_units
 

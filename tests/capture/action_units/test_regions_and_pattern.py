@@ -9,10 +9,9 @@ import torch
 
 from planted.camera_stage import RecordedSession
 from torchface.capture.action_units import RegionVideo, read_regions
-from torchface.capture.action_units.local_warps import local_warps
-from torchface.capture.action_units.painted_pattern import otsu_threshold, pattern_levels
-from torchface.capture.action_units.pattern_flow import aligned_grid, neutral_flow
-from torchface.capture.action_units.regions import region_grid, sample_regions
+from torchface.capture.action_units.classifier_training import local_warps
+from torchface.capture.action_units.painted_pattern import aligned_grid, neutral_flow, otsu_threshold, pattern_levels
+from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
 

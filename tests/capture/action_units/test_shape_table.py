@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from planted.action_performance import MOVES
-from torchface.capture.action_units.regions import GROUPS
+from torchface.capture.action_units.painted_regions import GROUPS
 from torchface.capture.action_units.shape_table import ShapeTable, built_in_tables, load_shape_table
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import load_rig

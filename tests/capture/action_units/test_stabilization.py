@@ -65,7 +65,7 @@ def test_the_similarity_of_three_points_is_recovered() -> None:
 
 def test_a_steady_picture_changes_less_at_rest(session: RecordedSession, regions: RegionVideo) -> None:
     from torchface.capture.action_units.painted_pattern import pattern_levels
-    from torchface.capture.action_units.regions import region_grid, sample_regions
+    from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 
     video, labels = session.video, session.labels
     frames = torch.cat(list(video.chunks())).float() / 255

@@ -79,7 +79,7 @@ def test_agrees_with_scikit_learn(people: tuple[Tensor, Tensor], ridge: float) -
         ExpressionSettings(neutral_components=6, offset_components=5, ridge=ridge),
         region=torch.ones(V) > 0,
     )
-    # The reference is told the people as they are laid together, the rest is its own.
+    # The reference gets the people aligned with each other, the rest is its own.
     laid = neutrals.clone()
     for i in range(len(neutrals)):
         pose = model_pose(model, neutrals[i])
@@ -253,7 +253,7 @@ def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
         fit(neutrals, expressions[:, :, 1:])
     with pytest.raises(ShapeError, match="three at least"):
         fit(neutrals[:2], expressions[:2], ExpressionSettings(neutral_components=None))
-    with pytest.raises(ValueRangeError, match="expressions: 1 of 24 hold NaN"):
+    with pytest.raises(ValueRangeError, match="expressions: number 3 holds NaN"):
         fit(neutrals, torch.where(torch.arange(24).view(24, 1, 1, 1) == 3, torch.nan, expressions))
     with pytest.raises(ValueRangeError, match="all the same"):
         fit(neutrals[:1].expand(5, -1, -1), expressions[:5])

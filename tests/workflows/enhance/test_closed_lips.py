@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.enhancement import propagation
+from torchface.enhancement import thin_shell
 from torchface.geometry.meshes.operators import edges
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
@@ -65,8 +65,8 @@ def stretch(level: int) -> tuple[float, float]:
     pose = Similarity(*(part.double() for part in (torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))))
     lies = HeadCorrespondence(pose, head.vertices, torch.ones(len(head.vertices), dtype=torch.bool), 0.0, "made")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(propagation, "_LEAST_LEVEL", level)
-        patch.setattr(propagation, "_VERTICES_A_POINT", 0)
+        patch.setattr(thin_shell, "_LEAST_LEVEL", level)
+        patch.setattr(thin_shell, "_VERTICES_A_POINT", 0)
         found = other_topology(moving, dense, lies, None).read(1, 2)[0]
     truth = opened(dense, dense_lower)
     one, other = edges(dense.faces).T
@@ -85,5 +85,5 @@ def test_vertices_on_the_other_lip_would_tear_it(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(head_correspondence, "_ALIKE", -2.0)
     assert stretch(100_000)[0] > 2.3
     monkeypatch.undo()
-    monkeypatch.setattr(propagation, "_PULL_ON_A_LEVEL", propagation._PULL)
+    monkeypatch.setattr(thin_shell, "_PULL_ON_A_LEVEL", thin_shell._PULL)
     assert stretch(1500)[0] > 2.3  # 2.5 or 4, by how the processor rounds

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.action_units.gabor import GaborBank
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
-from torchface.capture.action_units.regions import RegionGroup
-from torchface.errors import NameMismatchError, ShapeError
+from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
+from torchface.capture.action_units.region_video import RegionVideo
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.io.action_labels import ActionLabels
+from torchface.progress import Progress
 
 _MAX_COUNT = 4096
 _MAX_CLASSES = 256  # there is a plane for every two
@@ -74,6 +77,38 @@ class GroupClassifier(nn.Module):
 
 
 @dataclass(frozen=True)
+class TrainingSettings:
+    """How a classifier is trained.
+
+    Args:
+        levels: of intensity, the lowest of them rest.
+        variance: fraction of the features' variance that the principal components explain.
+        penalty: of the support vector machines.
+        warps: replicas of every frame, each warped at random.
+        warp_amplitude: of their control points, pixels.
+        seed: of k-means and the warps.
+
+    Example:
+        >>> TrainingSettings(levels=3).levels  # rest, and two intensities
+        3
+    """
+
+    levels: int = 4
+    variance: float = 0.9
+    penalty: float = 10.0
+    warps: int = 0
+    warp_amplitude: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.levels < 2 or not 0 < self.variance <= 1 or not self.penalty > 0 or self.warps < 0:
+            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and a variance in (0,1]")
+
+
+DEFAULT_TRAINING = TrainingSettings()
+
+
+@dataclass(frozen=True)
 class GroupSize:
     """How many components and classes a group's classifier has learned."""
 
@@ -95,9 +130,6 @@ class ActionUnitClassifier(nn.Module):
     Source: thesis 4.1.10 to 4.1.12.
     """
 
-    fit: ClassVar[Callable[..., ActionUnitClassifier]]
-    """:func:`torchface.capture.action_units.fit_classifier`, bound where this package begins."""
-
     neutral: Tensor
 
     def __init__(self, groups: Sequence[RegionGroup], sizes: Sequence[GroupSize], size: int) -> None:
@@ -111,6 +143,47 @@ class ActionUnitClassifier(nn.Module):
         )
         # The first training performer's face at rest, to which others are warped.
         self.register_buffer("neutral", torch.zeros(len(self.regions), size, size))
+
+    @classmethod
+    def fit(
+        cls,
+        videos: Sequence[RegionVideo],
+        labels: Sequence[ActionLabels],
+        groups: Sequence[RegionGroup] = GROUPS,
+        settings: TrainingSettings = DEFAULT_TRAINING,
+        progress: Progress | None = None,
+    ) -> ActionUnitClassifier:
+        """Learns from one or several performers.
+
+        Args:
+            videos: each performer's regions; all but the first warped to the first's ``neutral``.
+            labels: of each video, with what was performed.
+            groups: which regions show which units.
+            settings: of the training.
+            progress: called with each step and how far it is.
+
+        Raises:
+            ShapeError: videos and labels differ in number or length.
+            NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
+
+        Example:
+            >>> from torchface.io.action_labels import Performed
+            >>> height = 6 + 9 * torch.linspace(0, 3.1416, 60).sin() ** 2  # a painted brow, up and down again
+            >>> stroke = torch.exp(-(((torch.arange(24.0) - height[:, None]) / 2.5) ** 2))
+            >>> shown = stroke[:, None, :, None].repeat(1, 1, 1, 24).float()
+            >>> video = RegionVideo(("brow",), shown, shown[0], shown[0], fps=30.0)
+            >>> box = {"brow": (0, 0, 24, 24)}
+            >>> labels = ActionLabels(60, 0, (0, 0), ((0, 0), (9, 9)), box, (Performed(("1",), 2, 58),))
+            >>> brow = (RegionGroup("brow", ("brow",), ("1",)),)
+            >>> classifier = ActionUnitClassifier.fit([video], [labels], brow)
+            >>> with torch.no_grad():
+            ...     intensity = classifier(shown, shown[0])[:, 0]
+            >>> intensity[0].item(), intensity[30].item()
+            (0.0, 1.0)
+        """
+        from torchface.capture.action_units.classifier_training import fit_classifier
+
+        return fit_classifier(videos, labels, groups, settings, progress)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -8,10 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.classifier import GroupClassifier, group_regions
+from torchface.capture.action_units.classifier import DEFAULT_TRAINING, GroupClassifier, TrainingSettings, group_regions
 from torchface.capture.action_units.classifier_training import (
-    DEFAULTS,
-    TrainingSettings,
     check_training,
     group_features,
     label_group,
@@ -19,8 +17,8 @@ from torchface.capture.action_units.classifier_training import (
     principal_components,
 )
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
+from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
 from torchface.capture.action_units.region_video import RegionVideo
-from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.errors import ShapeError
 from torchface.io.action_labels import ActionLabels
 
@@ -31,14 +29,14 @@ def cross_validation(
     videos: Sequence[RegionVideo],
     labels: Sequence[ActionLabels],
     groups: Sequence[RegionGroup] = GROUPS,
-    settings: TrainingSettings = DEFAULTS,
+    settings: TrainingSettings = DEFAULT_TRAINING,
     folds: int = 5,
     split: Split = "frames",
 ) -> dict[str, float]:
     """The fraction of frames in the right class of unit and intensity, by group of regions.
 
     Args:
-        videos: as for :func:`torchface.capture.action_units.fit_classifier`.
+        videos: as for :meth:`ActionUnitClassifier.fit`.
         labels: of each.
         groups: which regions show which units.
         settings: of the training; frames are not warped.
@@ -104,7 +102,7 @@ def labelled_intensities(
     video: RegionVideo,
     labels: ActionLabels,
     groups: Sequence[RegionGroup] = GROUPS,
-    settings: TrainingSettings = DEFAULTS,
+    settings: TrainingSettings = DEFAULT_TRAINING,
 ) -> Tensor:
     """Intensities (T,A) from a video's own labels and the clustering of its frames: the truth of a test."""
     found = []

@@ -1,4 +1,4 @@
-"""Learns an :class:`ActionUnitClassifier` from performed action units."""
+"""Training of a classifier of action units from performed ones."""
 
 from __future__ import annotations
 
@@ -7,56 +7,25 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
 
 from torchface.capture.action_units.classifier import (
     ActionUnitClassifier,
     GroupClassifier,
     GroupSize,
+    TrainingSettings,
     check_groups,
     group_regions,
 )
-from torchface.capture.action_units.intensity_labels import intensity_levels
-from torchface.capture.action_units.local_warps import local_warps
+from torchface.capture.action_units.painted_regions import RegionGroup
 from torchface.capture.action_units.region_video import RegionVideo
-from torchface.capture.action_units.regions import GROUPS, RegionGroup
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
 from torchface.progress import Progress, silent
 
 _CHUNK = 256
+_CONTROL = 5  # of local warps: control points a side
 _REST_FRAMES = 2  # at either end of a repetition
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a classifier is trained.
-
-    Args:
-        levels: of intensity, the lowest of them rest.
-        variance: fraction of the features' variance that the principal components explain.
-        penalty: of the support vector machines.
-        warps: replicas of every frame, each warped at random.
-        warp_amplitude: of their control points, pixels.
-        seed: of k-means and the warps.
-
-    Example:
-        >>> TrainingSettings(levels=3).levels  # rest, and two intensities
-        3
-    """
-
-    levels: int = 4
-    variance: float = 0.9
-    penalty: float = 10.0
-    warps: int = 0
-    warp_amplitude: float = 0.8
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.levels < 2 or not 0 < self.variance <= 1 or not self.penalty > 0 or self.warps < 0:
-            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and a variance in (0,1]")
-
-
-DEFAULTS = TrainingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,38 +44,12 @@ class GroupClasses:
 def fit_classifier(
     videos: Sequence[RegionVideo],
     labels: Sequence[ActionLabels],
-    groups: Sequence[RegionGroup] = GROUPS,
-    settings: TrainingSettings | None = None,
-    progress: Progress | None = None,
+    groups: Sequence[RegionGroup],
+    settings: TrainingSettings,
+    progress: Progress | None,
 ) -> ActionUnitClassifier:
-    """Learns from one or several performers.
-
-    Args:
-        videos: each performer's regions; all but the first warped to the first's ``neutral``.
-        labels: of each video, with what was performed.
-        groups: which regions show which units.
-        settings: of the training.
-        progress: called with each step and how far it is.
-
-    Raises:
-        ShapeError: videos and labels differ in number or length.
-        NameMismatchError: regions are missing, a unit of a group is never performed, or an unknown one is.
-
-    Example:
-        >>> from torchface.io.action_labels import Performed
-        >>> height = 6 + 9 * torch.linspace(0, 3.1416, 60).sin() ** 2  # a painted brow, up and down again
-        >>> stroke = torch.exp(-(((torch.arange(24.0) - height[:, None]) / 2.5) ** 2))
-        >>> shown = stroke[:, None, :, None].repeat(1, 1, 1, 24).float()
-        >>> video = RegionVideo(("brow",), shown, shown[0], shown[0], fps=30.0)
-        >>> box = {"brow": (0, 0, 24, 24)}
-        >>> labels = ActionLabels(60, 0, (0, 0), ((0, 0), (9, 9)), box, (Performed(("1",), 2, 58),))
-        >>> classifier = fit_classifier([video], [labels], (RegionGroup("brow", ("brow",), ("1",)),))
-        >>> with torch.no_grad():
-        ...     intensity = classifier(shown, shown[0])[:, 0]
-        >>> intensity[0].item(), intensity[30].item()
-        (0.0, 1.0)
-    """
-    settings, progress = settings or TrainingSettings(), progress or silent
+    """The classifier of :meth:`ActionUnitClassifier.fit`, which says what the arguments are."""
+    progress = progress or silent
     check_training(videos, labels, groups)
     size = videos[0].patterns.shape[-1]
     names = group_regions(groups)
@@ -272,3 +215,75 @@ def check_training(
     unknown = sorted({unit for own in labels for unit in own.units} - set(wanted))
     if unknown:
         raise NameMismatchError(f"training: {', '.join(unknown)} is performed, but no group of regions shows it")
+
+
+def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int = 0) -> Tensor:
+    """The level of each frame of one action, 0 for rest.
+
+    The first principal component gives one number a frame; k-means clusters these into ``levels``, which are
+    ordered by how far they lie from the frames at rest.
+
+    Args:
+        images: one region, or several side by side, in every repetition of the action, (T,...).
+        at_rest: frames just before and after a repetition, (T,) bool.
+        levels: k; the lowest is rest.
+        seed: of k-means.
+
+    Returns:
+        (T,) int64 from 0 to ``levels - 1``.
+
+    Raises:
+        ShapeError: ``at_rest`` is not (T,), or no frame is at rest.
+        ValueRangeError: fewer frames than levels, or frames that do not differ.
+
+    Source: thesis 4.1.11.
+    """
+    if at_rest.shape != images.shape[:1] or not bool(at_rest.any()):
+        raise ShapeError(f"at_rest: found {int(at_rest.sum())} of {tuple(at_rest.shape)}, expected (T,) with some")
+    mode = main_mode(images)
+    if len(mode.unique()) < levels:
+        raise ValueRangeError(
+            f"intensity levels: found {len(mode.unique())} different frames, expected at least {levels} to cluster"
+        )
+    from sklearn.cluster import KMeans  # takes a second, and only training needs it
+
+    clusters = KMeans(levels, n_init=10, random_state=seed).fit(mode[:, None].numpy())
+    centres = torch.from_numpy(clusters.cluster_centers_[:, 0]).double()
+    order = (centres - mode[at_rest].median()).abs().argsort()
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(levels)
+    return rank[torch.from_numpy(clusters.labels_).long()]
+
+
+def main_mode(images: Tensor) -> Tensor:
+    """Scores (T,) float64 of frames (T,...) along their first principal component."""
+    samples = images.flatten(1).double()
+    centred = samples - samples.mean(0)
+    values, vectors = torch.linalg.eigh(centred @ centred.T)
+    first = vectors[:, -1] * values[-1].clamp(min=0).sqrt()
+    # The sign of an eigenvector is arbitrary: the same frames give the same scores.
+    return first * torch.where(first[first.abs().argmax()] < 0, -1.0, 1.0)
+
+
+def local_warps(images: Tensor, amplitude: float, generator: torch.Generator, alike: int = 1) -> Tensor:
+    """Regions (T,R,h,w), each frame and region warped by a smooth field of its own.
+
+    Args:
+        images: patterns.
+        amplitude: standard deviation of the control points' displacement, pixels.
+        generator: where the randomness comes from.
+        alike: into how many parts the regions fall that get the same field, region by region.
+
+    Source: thesis 4.1.14.
+    """
+    frames, regions, height, width = images.shape
+    control = torch.randn(frames, regions // alike, 2, _CONTROL, _CONTROL, generator=generator)
+    control = control.repeat(1, alike, 1, 1, 1).flatten(0, 1)
+    field = interpolate(amplitude * control, (height, width), mode="bicubic", align_corners=True)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    places = torch.stack([x, y], dim=-1) + field.permute(0, 2, 3, 1)
+    grid = 2 * places / torch.tensor([width, height]) - 1
+    warped = grid_sample(
+        images.reshape(frames * regions, 1, height, width), grid, padding_mode="border", align_corners=False
+    )
+    return warped.view_as(images)

@@ -10,9 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.painted_pattern import pattern_levels
-from torchface.capture.action_units.pattern_flow import Method, aligned_grid, neutral_flow
-from torchface.capture.action_units.regions import region_grid, sample_regions
+from torchface.capture.action_units.painted_pattern import Method, aligned_grid, neutral_flow, pattern_levels
+from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
 from torchface.errors import ShapeError
 from torchface.io.action_labels import ActionLabels

@@ -10,14 +10,22 @@ import torch
 from torch import Tensor
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.action_units.intensity_smoothing import WINDOWS, smooth_intensities
 from torchface.capture.action_units.region_video import RegionVideo, read_regions
 from torchface.capture.action_units.shape_table import ShapeTable
-from torchface.errors import NameMismatchError
+from torchface.errors import NameMismatchError, ShapeError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile
 from torchface.progress import Progress
+from torchface.temporal import savitzky_golay
 
+WINDOW = 25
+"""Frames at 60 a second; a blink is over sooner than the others, so its window is the shortest."""
+
+WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29}
+"""Windows of units that have their own."""
+
+_RATE = 60.0
+_MIN_WINDOW = 5
 _CHUNK = 256
 
 
@@ -110,6 +118,34 @@ def action_unit_curves(
     if settings.at_rest:
         active |= (matrix > 0).any(0) & ~_moved(levels, whole)
     return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
+
+
+def smooth_intensities(
+    intensities: Tensor,
+    units: Sequence[str],
+    windows: Mapping[str, int] = WINDOWS,
+    order: int = 2,
+    fps: float = _RATE,
+) -> Tensor:
+    """A classifier's levels as continuous curves in [0,1].
+
+    Args:
+        intensities: (T,A).
+        units: their names, A.
+        windows: of the Savitzky-Golay filter by unit, frames at 60 a second; ``WINDOW`` for the others.
+        order: of its polynomial.
+        fps: frames a second; a window lasts as long at any rate.
+
+    Raises:
+        ShapeError: ``intensities`` is not (T,A).
+
+    Source: thesis 4.1.12.
+    """
+    if intensities.ndim != 2 or intensities.shape[1] != len(units):
+        raise ShapeError(f"intensities: found {tuple(intensities.shape)}, expected (T,{len(units)})")
+    frames = [max(round(windows.get(unit, WINDOW) * fps / _RATE), _MIN_WINDOW) for unit in units]
+    curves = [savitzky_golay(intensities[:, a].double(), window, order) for a, window in enumerate(frames)]
+    return torch.stack(curves, dim=1).clamp(0, 1).float()
 
 
 def _moved(levels: Tensor, matrix: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.geometry.sample_batches import Samples, blocks
+from torchface.optim.eigenpairs import largest_eigenpairs
 
 _MAX_LEFT_OUT = 400
 
@@ -71,8 +72,8 @@ def model_quality(
             "samples and from 1 component to two fewer than samples"
         )
     gram = _centred_gram(samples)
-    values, vectors = torch.linalg.eigh(gram)
-    values, vectors = values.flip(0).clamp(min=0), vectors.flip(1)
+    values, vectors = largest_eigenpairs(gram)
+    values = values.clamp(min=0)
     along = vectors * values.sqrt()  # training samples along all components, (M,M)
     left = torch.linspace(0, count - 1, min(count, _MAX_LEFT_OUT)).round().long()
     missed = torch.stack([_left_out(gram, int(i), numbers) for i in left]) / vertices
@@ -115,8 +116,7 @@ def _left_out(gram: Tensor, index: int, numbers: Tensor) -> Tensor:
     others = torch.arange(len(gram)) != index
     own, cross = gram[others][:, others], gram[others, index]
     means = own.mean(1)
-    values, vectors = torch.linalg.eigh(own - means[:, None] - means[None] + means.mean())
-    values, vectors = values.flip(0), vectors.flip(1)
+    values, vectors = largest_eigenpairs(own - means[:, None] - means[None] + means.mean())
     toward = vectors.T @ (cross - cross.mean() - means + means.mean())
     there = values > 1e-12 * values[0]
     along = torch.where(there, toward.square() / values.clamp(min=1e-300), 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +12,9 @@ from torch import Tensor, nn
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.geometry.sample_batches import Samples, SamplesInMemory
 from torchface.modeling.morphable.principal_components import principal_components
+from torchface.progress import Progress
 
 _MAX_BYTES = 2**31
 
@@ -76,27 +79,61 @@ class MorphableModel(nn.Module):
         self.samples = samples
 
     @classmethod
-    def fit(cls, samples: Tensor, components: int | None = None) -> MorphableModel:
-        """Learns from samples in correspondence.
+    def fit(
+        cls,
+        samples: Tensor | Samples,
+        components: int | None = None,
+        checkpoint: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> MorphableModel:
+        """Learns from samples in correspondence, in memory or read in blocks.
 
         Args:
-            samples: (M,V,C), aligned.
-            components: how many; as many as the samples differ in if absent, at most M-1.
+            samples: (M,V,C), aligned: a tensor, or what reads some at a time, such as a
+                :class:`torchface.io.meshes.mesh_sequence.MeshSequence`.
+            components: how many; if absent as many as the samples differ in, at most M-1, and at most 200 of more
+                than 1,500 samples that are read in blocks.
+            checkpoint: a folder in which a killed run continues, see
+                :func:`~torchface.modeling.morphable.principal_components.principal_components`.
+            progress: called with each step and how far it is.
 
         Raises:
             ShapeError: no (M,V,C), or fewer than two samples.
             ValueRangeError: NaN or infinity, samples that are all the same, or more components than they hold.
+            FileFormatError: the checkpoint cannot be written.
+
+        Example:
+            >>> from torchface.io import MeshSequence, MeshSequenceWriter
+            >>> heads = torch.randn(6, 40, 3, generator=torch.Generator().manual_seed(0)).float()
+            >>> with MeshSequenceWriter("heads.safetensors", 6, 40, torch.tensor([[0, 1, 2]])) as writer:
+            ...     writer.append(heads)
+            >>> streamed = MorphableModel.fit(MeshSequence("heads.safetensors"), 3)
+            >>> at_once = MorphableModel.fit(heads, 3)
+            >>> torch.allclose(streamed.standard_deviations, at_once.standard_deviations, rtol=1e-4)
+            True
         """
-        if samples.ndim != 3:
-            raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (M,V,C)")
-        learned = principal_components(samples.detach().flatten(1), components)
-        return cls(
+        count, most = samples.shape[0], components
+        if len(samples.shape) != 3 or (isinstance(samples, Tensor) and not samples.is_floating_point()):
+            raise ShapeError(f"samples: found {tuple(samples.shape)}, expected floats (M,V,C)")
+        if components is not None and not 1 <= components < max(count, 2):
+            raise ValueRangeError(f"components: found {components}, expected 1 to {count - 1} with {count} samples")
+        device = torch.device("cpu")
+        if isinstance(samples, Tensor):
+            device, samples, most = samples.device, SamplesInMemory(samples.detach().cpu()), most or count
+        learned = principal_components(samples, most, checkpoint, progress)
+        if components is not None and components > len(learned.components):
+            raise ValueRangeError(
+                f"components: found {components}, expected at most {len(learned.components)}: that is in how many "
+                f"ways the {count} samples differ (some are duplicates or mixtures of others)"
+            )
+        model = cls(
             learned.mean.reshape(samples.shape[1:]),
             learned.components.reshape(-1, *samples.shape[1:]),
             learned.standard_deviations,
             learned.total_variance,
-            len(samples),
+            count,
         )
+        return model.to(device)
 
     def extra_repr(self) -> str:
         return f"{self.count} components of {len(self.mean)} vertices"

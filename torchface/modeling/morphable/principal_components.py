@@ -1,151 +1,234 @@
-"""Principal components of few samples with many numbers each, by way of their Gram matrix."""
+"""Principal components of samples in memory or on disk, in passes over them; a killed run continues."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.files.checkpoints import read_checkpoint, write_checkpoint
+from torchface.files.content_keys import content_key
+from torchface.files.whole_files import make_folder
+from torchface.geometry.sample_batches import Samples, blocks
+from torchface.modeling.morphable.subspace_iteration import SUBSPACE, leading_components
+from torchface.optim.eigenpairs import largest_eigenpairs
+from torchface.progress import Progress, silent
 
-_CHUNK = 4096
-_BLOCK = 64
+_BLOCK_BYTES = 2**27
+_ROWS = 64  # of a block's product with itself, of which only the lower triangle is formed
+_WHOLE_SPECTRUM = 1500
+_MAX_COMPONENTS = 200
+_GRAM_SAMPLES = 4000
+"""Above, time and memory of the Gram matrix grow past those of passes over the samples."""
 _NO_VARIANCE = 1e-12
 """Of the largest eigenvalue: what rounding leaves where there is nothing."""
+_METHOD = "gram rows/2"
+_STEP = "fitting principal components"
 
 
 @dataclass(frozen=True, eq=False)
 class PrincipalComponents:
-    """What a linear Gaussian model learns.
+    """The mean of samples and the directions in which they vary, what a linear Gaussian model learns.
 
     Args:
         mean: (D,) float64.
-        components: orthonormal rows (K,D) floats, the one that varies most first.
+        components: orthonormal rows (K,D) float64, the one that varies most first.
         standard_deviations: of the samples along them, (K,) float64.
-        total_variance: of the samples, all D dimensions summed, kept or not.
-        rank: how many components the samples have.
+        total_variance: of the samples, all D dimensions summed, whether a component holds it or not.
     """
 
     mean: Tensor
     components: Tensor
     standard_deviations: Tensor
     total_variance: float
-    rank: int
 
 
-def principal_components(samples: Tensor, count: int | None = None) -> PrincipalComponents:
-    r"""The directions in which samples vary most.
+def principal_components(
+    samples: Samples,
+    most: int | None = None,
+    checkpoint: str | Path | None = None,
+    progress: Progress | None = None,
+) -> PrincipalComponents:
+    r"""The directions in which samples vary most; fewer than ``most`` where there are no more.
 
     .. math:: G = X X^\top = V \Lambda V^\top, \quad u_k = X^\top v_k / \sqrt{\lambda_k}, \quad
         \sigma_k^2 = \lambda_k / (M - 1)
 
-    for centred samples X (M,D) with :math:`M \ll D`. Sums are taken in float64. A component points to where
+    for centred samples X (M,D) with :math:`M \ll D`. Three passes: the mean; the Gram matrix, block by block of rows,
+    in float64; the components. Memory is taken by the Gram matrix (8 M² bytes), the components (8 K D bytes) and two
+    blocks. Of more than 4,000 samples, and components fewer than an eighth of them, no Gram matrix is made: subspace
+    iteration takes memory that does not depend on M and time in proportion to it, see
+    :func:`~torchface.modeling.morphable.subspace_iteration.leading_components`. A component points to where
     :math:`\sum_i u_i \cos i` is positive, so that the same samples in any order give the same ones.
 
     Args:
-        samples: (M,D) floats.
-        count: how many components; as many as the samples have if absent.
+        samples: (M,V,C), D = V·C.
+        most: how many components; if absent as many as the samples differ in, but at most 200 of more than 1,500.
+        checkpoint: a folder for the rows of the Gram matrix, or the passes, that are finished. Killed and started
+            again with the same samples in the same order and the same folder, the run continues; rows of other samples
+            and damaged ones are computed again. In the end the files are removed.
+        progress: called with each step and how far it is.
 
     Raises:
-        ShapeError: fewer than two samples, or no (M,D).
-        ValueRangeError: a sample is NaN or infinite, the samples are all the same, or have fewer components than
-            asked for.
+        ShapeError: fewer than two samples.
+        ValueRangeError: NaN or infinity, or samples that are all the same.
+        FileFormatError: the checkpoint cannot be written.
 
     Source: thesis 3.2.4, equation 8; Turk, Pentland 1991.
     """
-    if samples.ndim != 2 or not samples.is_floating_point():
-        raise ShapeError(f"samples: found {samples.dtype} {tuple(samples.shape)}, expected floats (M,D)")
-    check_count(len(samples), count)
-    mean = samples.new_empty(samples.shape[1], dtype=torch.float64)
-    gram = samples.new_zeros((len(samples), len(samples)), dtype=torch.float64)
-    # In pieces: the samples in float64 all at once would be twice what is already in memory.
-    for begin in range(0, samples.shape[1], _CHUNK):
-        piece = samples[:, begin : begin + _CHUNK].double()
-        mean[begin : begin + _CHUNK] = piece.mean(0)
-        add_outer_product(gram, piece.sub_(mean[begin : begin + _CHUNK]))
-    if not bool(torch.isfinite(mean).all()):
-        bad = int((~torch.isfinite(samples)).any(1).sum())
-        raise ValueRangeError(f"samples: {bad} of {len(samples)} hold NaN or infinity; expected none")
-    spectrum = gram_spectrum(gram, rounding(samples), count)
-    components = samples.new_empty((len(spectrum.values), samples.shape[1]), dtype=torch.float32)
-    toward = (spectrum.vectors / spectrum.values.sqrt()).T.contiguous()
-    for begin in range(0, samples.shape[1], _CHUNK):
-        piece = samples[:, begin : begin + _CHUNK].double().sub_(mean[begin : begin + _CHUNK])
-        components[:, begin : begin + _CHUNK] = toward @ piece
-    components.mul_(signs(components)[:, None])
-    return PrincipalComponents(
-        mean,
-        components,
-        (spectrum.values / (len(samples) - 1)).sqrt(),
-        spectrum.trace / (len(samples) - 1),
-        spectrum.rank,
+    count, vertices, channels = samples.shape
+    if count < 2:
+        raise ShapeError(f"samples: found {count}, expected at least two to learn how they differ")
+    if most is None and count > _WHOLE_SPECTRUM:
+        most = _MAX_COMPONENTS
+    most = count - 1 if most is None else min(most, count - 1)
+    parts = list(blocks(samples, _BLOCK_BYTES))
+    report = progress or silent
+    folder = None if checkpoint is None else Path(checkpoint)
+    if count > max(_GRAM_SAMPLES, 8 * most):
+        return _by_passes(samples, parts, most, folder, report)
+    work = 2 * len(parts) + len(parts) * (len(parts) + 1) // 2
+    steps = iter(range(1, work + 1))
+
+    def step() -> None:
+        report(_STEP, next(steps), work)
+
+    mean, floor, contents = _mean(samples, parts, step, keyed=folder is not None)
+    gram = torch.zeros(count, count, dtype=torch.float64)
+    rows = _Rows(folder, content_key(_METHOD, samples=contents, parts=parts))
+    block: Tensor | None = None
+    for number, (begin, end) in enumerate(parts):
+        if (stored := rows.read(number, end - begin, end)) is not None:
+            gram[begin:end, :end] = stored
+            for _ in range(number + 1):
+                step()
+            continue
+        block = _centred(samples, begin, end, mean)
+        for first, last in parts[:number]:
+            gram[begin:end, first:last] = block @ _centred(samples, first, last, mean).T
+            step()
+        for row in range(0, end - begin, _ROWS):
+            upper = min(row + _ROWS, end - begin)
+            gram[begin + row : begin + upper, begin : begin + upper] = block[row:upper] @ block[:upper].T
+        step()
+        rows.write(number, gram[begin:end, :end])
+    trace = float(gram.diagonal().sum())
+    values, vectors = largest_eigenpairs(gram, most)
+    rank = _rank(values, floor, count)
+    values, vectors = values[:rank], vectors[:, :rank]
+    toward = (vectors / values.sqrt()).T.contiguous()
+    del gram, vectors
+    components = torch.zeros(rank, vertices * channels, dtype=torch.float64)
+    for begin, end in parts:
+        if block is None or len(parts) > 1:
+            block = _centred(samples, begin, end, mean)
+        components.addmm_(toward[:, begin:end], block)
+        step()
+    rows.remove()
+    return _learned(mean, components, values, trace, count)
+
+
+def _by_passes(
+    samples: Samples, parts: list[tuple[int, int]], most: int, checkpoint: Path | None, report: Progress
+) -> PrincipalComponents:
+    count, vertices, channels = samples.shape
+    mean, floor, contents = _mean(samples, parts, lambda: None, keyed=checkpoint is not None)
+    if checkpoint is not None:
+        make_folder(checkpoint)
+    leading = leading_components(
+        lambda begin, end: _centred(samples, begin, end, mean),
+        parts,
+        vertices * channels,
+        most,
+        checkpoint,
+        content_key(_METHOD, samples=contents, parts=parts, components=most),
+        lambda done, total: report(_STEP, done, total),
     )
+    rank = _rank(leading.values, floor, count)
+    if checkpoint is not None:
+        (checkpoint / SUBSPACE).unlink(missing_ok=True)
+        if not any(checkpoint.iterdir()):
+            checkpoint.rmdir()
+    return _learned(mean, leading.vectors[:rank], leading.values[:rank], leading.trace, count)
 
 
-def add_outer_product(gram: Tensor, piece: Tensor) -> None:
-    """Adds P Pᵀ of a piece (M,D) to the lower triangle of a matrix (M,M), block by block of rows."""
-    for begin in range(0, len(piece), _BLOCK):
-        end = begin + _BLOCK
-        gram[begin:end, :end].addmm_(piece[begin:end], piece[:end].T)
+def _learned(mean: Tensor, components: Tensor, values: Tensor, trace: float, count: int) -> PrincipalComponents:
+    """The components (K,D) with their signs settled, of eigenvalues (K,) of the scatter matrix of so many samples."""
+    weights = torch.arange(components.shape[1], dtype=torch.float64).cos()
+    components = components.mul_(torch.where(components @ weights < 0, -1.0, 1.0).to(components)[:, None])
+    return PrincipalComponents(mean, components, (values / (count - 1)).sqrt(), trace / (count - 1))
 
 
-@dataclass(frozen=True, eq=False)
-class GramSpectrum:
-    """Largest eigenvalues (K,) of a Gram matrix with eigenvectors (M,K), its trace and its rank."""
-
-    values: Tensor
-    vectors: Tensor
-    trace: float
-    rank: int
-
-
-def rounding(samples: Tensor) -> float:
-    """An eigenvalue of the Gram matrix of samples (M,D) below which there is only their rounding."""
-    largest = float(torch.maximum(samples.max(), -samples.min()))
-    return (torch.finfo(samples.dtype).eps * largest) ** 2 * samples.shape[1]
-
-
-def gram_spectrum(gram: Tensor, floor: float, count: int | None = None) -> GramSpectrum:
-    """The largest eigenpairs of a matrix (M,M) whose lower triangle is filled, checked to be there.
-
-    Args:
-        gram: of centred samples, float64.
-        floor: an eigenvalue below this counts as none.
-        count: how many pairs; all above the floor if absent.
+def _rank(values: Tensor, floor: float, count: int) -> int:
+    """How many eigenvalues (K,), falling, are more than rounding.
 
     Raises:
-        ValueRangeError: the samples are all the same, or have fewer components than asked for.
+        ValueRangeError: none.
     """
-    values, vectors = torch.linalg.eigh(gram)
-    values, vectors = values.flip(0), vectors.flip(1)
-    rank = min(int((values > max(floor, _NO_VARIANCE * float(values[0]))).sum()), len(gram) - 1)
-    check_rank(len(gram), rank, count)
-    keep = rank if count is None else count
-    return GramSpectrum(values[:keep], vectors[:, :keep], float(gram.diagonal().sum()), rank)
-
-
-def signs(components: Tensor) -> Tensor:
-    """+1 or -1 for each row (K,D): what makes its sum over cos(0), cos(1), ... positive."""
-    weights = torch.arange(components.shape[1], device=components.device, dtype=torch.float64).cos()
-    along = components @ weights.to(components)
-    return torch.where(along < 0, -1.0, 1.0).to(components)
-
-
-def check_count(samples: int, count: int | None) -> None:
-    """Refuses what cannot be learned whatever the numbers are."""
-    if samples < 2:
-        raise ShapeError(f"samples: found {samples}, expected at least two to learn how they differ")
-    if count is not None and not 1 <= count <= samples - 1:
-        raise ValueRangeError(f"components: found {count}, expected 1 to {samples - 1} with {samples} samples")
-
-
-def check_rank(samples: int, rank: int, count: int | None) -> None:
-    """Refuses samples that are all the same, or differ in fewer ways than asked for."""
+    rank = int((values > max(floor, _NO_VARIANCE * float(values[0]))).sum())
     if rank == 0:
-        raise ValueRangeError(f"samples: found {samples} that are all the same, expected some that differ")
-    if count is not None and count > rank:
-        raise ValueRangeError(
-            f"components: found {count}, expected at most {rank}: that is in how many ways the {samples} samples "
-            "differ (some are duplicates or mixtures of others)"
-        )
+        raise ValueRangeError(f"samples: found {count} that are all the same, expected some that differ")
+    return min(rank, count - 1)
+
+
+def _mean(
+    samples: Samples, parts: list[tuple[int, int]], step: Callable[[], None], keyed: bool
+) -> tuple[Tensor, float, list[str]]:
+    """The mean (D,) float64, the eigenvalue that rounding alone makes, and if asked for the key of each block."""
+    total: Tensor | None = None
+    largest = eps = 0.0
+    contents = []
+    for begin, end in parts:
+        part = samples.read(begin, end).flatten(1)
+        summed = torch.from_numpy(part.numpy().sum(0, dtype=np.float64))  # torch's takes ten times as long
+        if not bool(torch.isfinite(summed).all()):
+            bad = (~torch.isfinite(part)).any(1).nonzero()[:, 0] + begin
+            raise ValueRangeError(f"samples: number {int(bad[0])} holds NaN or infinity; expected none")
+        total = summed if total is None else total + summed
+        largest, eps = max(largest, float(part.max()), -float(part.min())), torch.finfo(part.dtype).eps
+        if keyed:
+            contents.append(content_key(_METHOD, block=part))
+        step()
+    assert total is not None
+    return total / samples.shape[0], (eps * largest) ** 2 * len(total), contents
+
+
+def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
+    return samples.read(begin, end).flatten(1).double().sub_(mean)
+
+
+class _Rows:
+    """Finished rows of the Gram matrix on disk; with another key they begin anew."""
+
+    def __init__(self, folder: Path | None, key: str) -> None:
+        self._folder, self._key = folder, key
+        if folder is not None:
+            make_folder(folder)
+
+    def read(self, number: int, rows: int, columns: int) -> Tensor | None:
+        """The rows if they are there and whole."""
+        found = None if self._folder is None else read_checkpoint(self._path(number), self._key)
+        gram = None if found is None else found.get("rows")
+        if gram is None or gram.shape != (rows, columns) or gram.dtype != torch.float64:
+            return None
+        return gram if bool(torch.isfinite(gram).all()) else None
+
+    def write(self, number: int, rows: Tensor) -> None:
+        if self._folder is not None:
+            write_checkpoint(self._path(number), {"rows": rows}, self._key)
+
+    def remove(self) -> None:
+        if self._folder is not None and self._folder.is_dir():
+            for path in [*self._folder.glob("gram_*"), *self._folder.glob(".gram_*.part")]:
+                path.unlink(missing_ok=True)
+            if not any(self._folder.iterdir()):
+                self._folder.rmdir()
+
+    def _path(self, number: int) -> Path:
+        assert self._folder is not None
+        return self._folder / f"gram_{number:05}.safetensors"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError
+from torchface.optim.eigenpairs import largest_eigenpairs
 
 RIDGES = (0.0, 1e-3, 1e-2, 1e-1)
 _NO_VARIANCE = 1e-10
@@ -115,7 +116,6 @@ def _fold_errors(gram_in: Tensor, gram_out: Tensor, left_out: int, ridges: tuple
 
 
 def _spectrum(gram: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    values, vectors = torch.linalg.eigh(gram)
-    values, vectors = values.flip(0)[:most], vectors.flip(1)[:, :most]
+    values, vectors = largest_eigenpairs(gram, most)
     held = values > _NO_VARIANCE * values[0].clamp(min=1e-300)
     return values[held], vectors[:, held]

@@ -1,23 +1,61 @@
-"""Expressions from a neutral face alone: what has been learned from other people's faces and expressions."""
+"""Expressions from a neutral face alone, as learned from other people's faces and expressions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from torchface.errors import NameMismatchError, ShapeError, TopologyError, ValueRangeError
+from torchface.geometry.sample_batches import Samples
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
+from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
+from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
 Form = Literal["offsets", "expressions"]
 
 STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
+
+
+NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
+
+
+@dataclass(frozen=True)
+class ExpressionSettings:
+    """How many components an expression regression has, how strongly they are held down, and what it predicts.
+
+    Args:
+        neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
+            has them chosen by leaving out one person after the other.
+        ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
+        form: "offsets" (equation 32) or "expressions" (equation 31).
+
+    Raises:
+        ValueRangeError: no component, or a negative ridge.
+
+    Example:
+        >>> ExpressionSettings(neutral_components=None).offset_components
+        13
+    """
+
+    neutral_components: int | None = NEUTRAL_COMPONENTS
+    offset_components: int | None = OFFSET_COMPONENTS
+    ridge: float | None = 0.0
+    form: Form = "offsets"
+
+    def __post_init__(self) -> None:
+        for what in ("neutral_components", "offset_components"):
+            if getattr(self, what) is not None:
+                checked_count(what, getattr(self, what), 1)
+        if self.ridge is not None:
+            checked_number("ridge", self.ridge, most=LARGEST_WEIGHT)
 
 
 class ExpressionRegression(nn.Module):
@@ -29,7 +67,7 @@ class ExpressionRegression(nn.Module):
     "expressions" it is S itself, as the thesis tries first: there the identity that 13 components cannot hold leaks
     away, and it is here for comparison.
 
-    A neutral face may have any pose: it is laid onto the mean neutral first, rotation and translation only, and
+    A neutral face may have any pose: it is aligned with the mean neutral first, rotation and translation only, and
     what is predicted is rotated back. N is the part of the neutral that moves in some expression. Vertices that no
     example moves are not stored and stay exactly where they are.
 
@@ -53,9 +91,6 @@ class ExpressionRegression(nn.Module):
         >>> bool(open_jaw[head.landmarks[8], 1] < head.vertices[head.landmarks[8], 1] - 10)
         True
     """
-
-    fit: ClassVar[Callable[..., ExpressionRegression]]
-    """:func:`fit_expressions`, bound where ``torchface.modeling`` begins."""
 
     neutral_mean: Tensor
     region: Tensor
@@ -92,6 +127,52 @@ class ExpressionRegression(nn.Module):
         self.register_buffer("coefficients", torch.zeros(neutral_components, offset_components))
         self.register_buffer("places", torch.zeros(moving, dtype=torch.int64))
 
+    @classmethod
+    def fit(
+        cls,
+        neutrals: Tensor | Samples,
+        expressions: Tensor | Samples,
+        settings: ExpressionSettings = ExpressionSettings(),
+        names: Sequence[str] | None = None,
+        topology: str | None = None,
+        region: Tensor | None = None,
+        progress: Progress | None = None,
+    ) -> ExpressionRegression:
+        """Learns from people in correspondence, each with a neutral face and the same expressions.
+
+        People may be read in blocks. Passes over them: four align the neutrals with each other, one finds what moves,
+        two sets of principal components take what ``MorphableModel.fit`` takes, and one sums up the normal equations.
+        Memory does not grow with their number but by a pose each. Numbers of components and a ridge that are to be
+        chosen are chosen from 300 people, evenly spread, where there are more.
+
+        Args:
+            neutrals: (M,V,3), millimetres, in any pose.
+            expressions: (M,N,V,3), each person's in the space of his or her own neutral; read in blocks, (M,N·V,3), a
+                person's expressions one after the other.
+            settings: how many components, and what they predict.
+            names: of the expressions; ``expression0``, ... if absent.
+            topology: ``Mesh.fingerprint()`` of the faces.
+            region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
+                most in some expression, if absent; all of them for the form "expressions", as in the thesis.
+            progress: called with each step and how far it is.
+
+        Raises:
+            ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
+            ValueRangeError: NaN or infinity, or neutrals that are all the same.
+            NameMismatchError: not one name an expression, or one twice.
+
+        Example:
+            >>> generator = torch.Generator().manual_seed(0)
+            >>> faces = 50 * torch.randn(1, 40, 3, generator=generator) + torch.randn(8, 40, 3, generator=generator)
+            >>> smiles = faces[:, None] + torch.tensor([0.0, 5.0, 0.0])  # everybody's goes up by as much
+            >>> regression = ExpressionRegression.fit(faces, smiles, names=["smile"])
+            >>> bool((regression(faces[:1]) - smiles[:1]).abs().max() < 0.1)
+            True
+        """
+        from torchface.modeling.rigging.expression_training import fit_expressions
+
+        return fit_expressions(neutrals, expressions, settings, names, topology, region, progress)
+
     @property
     def config(self) -> dict[str, Any]:
         """What the constructor needs: plain values only."""
@@ -124,16 +205,15 @@ class ExpressionRegression(nn.Module):
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         pose = similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
-        laid = pose.apply(neutrals)
-        X = (laid - self.neutral_mean.to(laid))[:, self.region].flatten(1) @ self.neutral_components.flatten(1).T.to(
-            laid
-        )
+        aligned = pose.apply(neutrals)
+        beyond = (aligned - self.neutral_mean.to(aligned))[:, self.region].flatten(1)
+        X = beyond @ self.neutral_components.flatten(1).T.to(aligned)
         Y = X @ self.coefficients.to(X)
         moving = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
         whole = moving.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
         whole = whole.index_copy(1, self.places, moving).unflatten(1, (len(self.names), -1))
         if self.form == "expressions":
-            whole = whole - laid[:, None]
+            whole = whole - aligned[:, None]
         return whole @ pose.rotation.to(whole)[:, None]
 
     def check_state(self) -> None:
@@ -178,11 +258,11 @@ def rig_from_neutral(regression: ExpressionRegression, template: BlendshapeRig, 
         >>> rig.names
         ('jawOpen', 'mouthSmileLeft')
     """
-    own = neutral.fingerprint()
+    expected = neutral.fingerprint()
     for what, found in (("template", template.neutral.fingerprint()), ("regression", regression.topology)):
-        if found is not None and found != own:
+        if found is not None and found != expected:
             raise TopologyError(
-                f"rig_from_neutral: found a {what} of topology {found}, expected the neutral's own, {own} "
+                f"rig_from_neutral: found a {what} of topology {found}, expected the neutral's, {expected} "
                 "(vertex count, hash of the triangles)"
             )
     if len(regression.neutral_mean) != len(neutral.vertices):

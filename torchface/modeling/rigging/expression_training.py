@@ -1,4 +1,4 @@
-"""How an expression regression learns: in passes over people, who are read a few at a time."""
+"""Training of an expression regression, in passes over people who are read a few at a time."""
 
 from __future__ import annotations
 
@@ -10,128 +10,34 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
-from torchface.modeling.morphable.principal_components import PrincipalComponents
-from torchface.modeling.morphable.streamed_training import sequence_components
+from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.rigging.component_choice import choose_components
-from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, Form
-from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, laid_together
-from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
+from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, ExpressionSettings, Form
+from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, align_neutrals
 from torchface.progress import Progress, silent
 
-NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 _CHOSEN_FROM = 300
 """People from whom components and ridge are chosen at most; their Gram matrices are decomposed once a person."""
 # Of the vertex that moves most. The form of ears and neck predicts little of a smile, and would fill the components.
 _MOVES = 0.05
 
 
-@dataclass(frozen=True)
-class ExpressionSettings:
-    """How many components an expression regression has, how strongly they are held down, and what it predicts.
-
-    Args:
-        neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
-            has them chosen by leaving out one person after the other.
-        ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
-        form: "offsets" (equation 32) or "expressions" (equation 31).
-
-    Raises:
-        ValueRangeError: no component, or a negative ridge.
-
-    Example:
-        >>> ExpressionSettings(neutral_components=None).offset_components
-        13
-    """
-
-    neutral_components: int | None = NEUTRAL_COMPONENTS
-    offset_components: int | None = OFFSET_COMPONENTS
-    ridge: float | None = 0.0
-    form: Form = "offsets"
-
-    def __post_init__(self) -> None:
-        for what in ("neutral_components", "offset_components"):
-            if getattr(self, what) is not None:
-                checked_count(what, getattr(self, what), 1)
-        if self.ridge is not None:
-            checked_number("ridge", self.ridge, most=LARGEST_WEIGHT)
-
-
 def fit_expressions(
-    neutrals: Tensor,
-    expressions: Tensor,
-    settings: ExpressionSettings = ExpressionSettings(),
-    names: Sequence[str] | None = None,
-    topology: str | None = None,
-    region: Tensor | None = None,
+    neutrals: Tensor | Samples,
+    expressions: Tensor | Samples,
+    settings: ExpressionSettings,
+    names: Sequence[str] | None,
+    topology: str | None,
+    region: Tensor | None,
+    progress: Progress | None,
 ) -> ExpressionRegression:
-    """Learns from people in correspondence, each with a neutral face and the same expressions.
-
-    Args:
-        neutrals: (M,V,3), millimetres, in any pose.
-        expressions: (M,N,V,3), each person's in the space of his or her own neutral.
-        settings: how many components, and what they predict.
-        names: of the expressions; ``expression0``, ... if absent.
-        topology: ``Mesh.fingerprint()`` of the faces.
-        region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
-            most in some expression, if absent; all of them for the form "expressions", as in the thesis.
-
-    Raises:
-        ShapeError: the shapes do not fit, or there are fewer people than it takes to see how they differ.
-        ValueRangeError: NaN or infinity, or neutrals that are all the same.
-        NameMismatchError: not one name an expression, or one twice.
-
-    Example:
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> faces = 50 * torch.randn(1, 40, 3, generator=generator) + torch.randn(8, 40, 3, generator=generator)
-        >>> smiles = faces[:, None] + torch.tensor([0.0, 5.0, 0.0])  # everybody's goes up by as much
-        >>> regression = fit_expressions(faces, smiles, names=["smile"])
-        >>> bool((regression(faces[:1]) - smiles[:1]).abs().max() < 0.1)
-        True
-    """
-    names = [f"expression{i}" for i in range(expressions.shape[1])] if names is None else list(names)
-    _check_examples(neutrals, expressions, names)
-    samples = SamplesInMemory(neutrals), SamplesInMemory(expressions.flatten(1, 2))
-    return fit_expression_samples(*samples, names, settings, topology, region)
-
-
-def fit_expression_samples(
-    neutrals: Samples,
-    expressions: Samples,
-    names: Sequence[str],
-    settings: ExpressionSettings = ExpressionSettings(),
-    topology: str | None = None,
-    region: Tensor | None = None,
-    progress: Progress | None = None,
-) -> ExpressionRegression:
-    """What :func:`fit_expressions` learns, from people who are read in blocks.
-
-    Passes over the people: four lay the neutrals on each other, one finds what moves, two sets of principal components
-    take what :func:`~torchface.modeling.morphable.streamed_training.fit_sequence` takes, and one sums up the normal
-    equations. Memory does not grow with their number but by a pose each. Numbers of components and a ridge that are to
-    be chosen are chosen from 300 people, evenly spread, where there are more.
-
-    Args:
-        neutrals: (M,V,3).
-        expressions: (M,N·V,3), a person's expressions one after the other.
-        names: of the N expressions.
-        progress: called with each step and how far it is.
-
-    All others, Raises: as :func:`fit_expressions`.
-
-    Example:
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> faces = 50 * torch.randn(1, 40, 3, generator=generator) + torch.randn(8, 40, 3, generator=generator)
-        >>> smiles = faces + torch.tensor([0.0, 5.0, 0.0])
-        >>> in_blocks = fit_expression_samples(SamplesInMemory(faces), SamplesInMemory(smiles), ["smile"])
-        >>> at_once = fit_expressions(faces, smiles[:, None], names=["smile"])
-        >>> torch.allclose(in_blocks(faces), at_once(faces), atol=1e-3)
-        True
-    """
+    """The regression of :meth:`ExpressionRegression.fit`, which says what the arguments are."""
+    neutrals, expressions, names = _people(neutrals, expressions, names)
     progress = progress or silent
     form, ridge = settings.form, settings.ridge
     neutral_components, offset_components = settings.neutral_components, settings.offset_components
-    progress("laying the neutrals on each other")
-    mean, poses = laid_together(neutrals)
+    progress("aligning the neutrals")
+    mean, poses = align_neutrals(neutrals)
     predicted = Predicted(neutrals, expressions, poses, form)
     progress("finding what moves")
     motion = _motion(predicted, len(names))
@@ -142,17 +48,17 @@ def fit_expression_samples(
         inputs, outputs = (_some(samples).flatten(1) for samples in (flat, moving))
         choice = choose_components(inputs, outputs, neutral_components, offset_components, ridge)
         neutral_components, offset_components, ridge = choice.inputs, choice.outputs, choice.ridge
-    neutral = sequence_components(flat, neutral_components, progress=progress)
+    neutral = principal_components(flat, neutral_components, progress=progress)
     offset = _components_or_mean(moving, motion, offset_components, progress)
-    kept = len(neutral.components), len(offset.components)
-    model = ExpressionRegression(len(mean), names, len(considered), len(motion.places), *kept, topology, form)
+    counts = len(neutral.components), len(offset.components)
+    model = ExpressionRegression(len(mean), names, len(considered), len(motion.places), *counts, topology, form)
     model.neutral_mean.copy_(mean)
     model.region.copy_(considered)
     model.neutral_components.copy_(neutral.components.unflatten(1, (-1, 3)))
     model.offset_mean.copy_(offset.mean.view(-1, 3))
-    model.offset_components.copy_(offset.components.reshape(kept[1], len(motion.places), 3))
+    model.offset_components.copy_(offset.components.reshape(counts[1], len(motion.places), 3))
     progress("solving for the coefficients")
-    gram, product = torch.zeros(kept[0], kept[0]).double(), torch.zeros(kept).double()
+    gram, product = torch.zeros(counts[0], counts[0]).double(), torch.zeros(counts).double()
     for begin, end in blocks(expressions):
         X = flat.read(begin, end).flatten(1).double().sub_(neutral.mean)
         Y = moving.read(begin, end).flatten(1).double().sub_(offset.mean)
@@ -214,13 +120,13 @@ def _considered(motion: _Motion, region: Tensor | None, form: Form) -> Tensor:
 def _components_or_mean(moving: MovingPlaces, motion: _Motion, most: int, progress: Progress) -> PrincipalComponents:
     """Principal components; none where all people make the same offsets."""
     if motion.differs:
-        return sequence_components(moving, most, progress=progress)
+        return principal_components(moving, most, progress=progress)
     count, places, _ = moving.shape
     total = torch.zeros(places * 3, dtype=torch.float64)
     for begin, end in blocks(moving) if places else ():
         total += moving.read(begin, end).flatten(1).sum(0, dtype=torch.float64)
     none = torch.zeros(0, places * 3, dtype=torch.float64)
-    return PrincipalComponents(total / count, none, none.new_zeros(0), 0.0, 0)
+    return PrincipalComponents(total / count, none, none.new_zeros(0), 0.0)
 
 
 def _some(samples: Samples) -> Tensor:
@@ -232,15 +138,22 @@ def _some(samples: Samples) -> Tensor:
     return torch.cat([samples.read(row, row + 1) for row in rows])
 
 
-def _check_examples(neutrals: Tensor, expressions: Tensor, names: Sequence[str]) -> None:
-    if neutrals.ndim != 3 or neutrals.shape[-1] != 3 or len(neutrals) < 2:
+def _people(
+    neutrals: Tensor | Samples, expressions: Tensor | Samples, names: Sequence[str] | None
+) -> tuple[Samples, Samples, list[str]]:
+    """People as samples (M,V,3) and (M,N·V,3), and the names of the N expressions; refuses what does not fit."""
+    count, vertices = neutrals.shape[0], neutrals.shape[1] if len(neutrals.shape) > 1 else 0
+    if len(neutrals.shape) != 3 or neutrals.shape[2] != 3 or count < 2:
         raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (M,V,3) of at least two people")
-    wanted = (len(neutrals), len(names), *neutrals.shape[1:])
-    if expressions.ndim != 4 or expressions.shape[:1] + expressions.shape[2:] != wanted[:1] + wanted[2:]:
-        raise ShapeError(f"expressions: found {tuple(expressions.shape)}, expected ({wanted[0]},N,{wanted[2]},3)")
-    if expressions.shape[1] != len(names):
-        raise NameMismatchError(f"names: found {len(names)}, expected one for each of {expressions.shape[1]}")
-    for what, tensor in (("neutrals", neutrals), ("expressions", expressions)):
-        bad = int((~torch.isfinite(tensor)).flatten(1).any(1).sum())
-        if bad:
-            raise ValueRangeError(f"{what}: {bad} of {len(tensor)} hold NaN or infinity; expected none")
+    found = tuple(expressions.shape)
+    if isinstance(expressions, Tensor):
+        if found[:1] + found[2:] != (count, vertices, 3):
+            raise ShapeError(f"expressions: found {found}, expected ({count},N,{vertices},3)")
+        expressions = SamplesInMemory(expressions.flatten(1, 2))
+    elif len(found) != 3 or (found[0], found[1] % vertices, found[2]) != (count, 0, 3):
+        raise ShapeError(f"expressions: found {found}, expected ({count},N·{vertices},3)")
+    shown = expressions.shape[1] // vertices
+    names = [f"expression{i}" for i in range(shown)] if names is None else list(names)
+    if len(names) != shown:
+        raise NameMismatchError(f"names: found {len(names)}, expected one for each of {shown}")
+    return SamplesInMemory(neutrals) if isinstance(neutrals, Tensor) else neutrals, expressions, names

@@ -1,4 +1,4 @@
-"""People with expressions, laid on each other as they are read."""
+"""People with expressions, aligned with each other as they are read."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torchface.modeling.rigging.expression_regression import Form
 _ROUNDS = 4
 
 
-def laid_together(neutrals: Samples) -> tuple[Tensor, Similarity]:
-    """The mean (V,3) of neutrals (M,V,3) laid on it, rotation and translation only, and what moves each there, float64.
+def align_neutrals(neutrals: Samples) -> tuple[Tensor, Similarity]:
+    """The mean (V,3) of neutrals (M,V,3) aligned with it, rotation and translation only, and each one's pose, float64.
 
     Raises:
         ShapeError: they are not (M,V,3) of two people at least.
@@ -28,16 +28,16 @@ def laid_together(neutrals: Samples) -> tuple[Tensor, Similarity]:
     first = neutrals.read(0, 1)[0].double()
     mean = first - first.mean(0)
     for _ in range(_ROUNDS):
-        found, total = [], torch.zeros_like(mean)
+        poses, total = [], torch.zeros_like(mean)
         for begin, end in blocks(neutrals):
             points = neutrals.read(begin, end).double()
             if not bool(torch.isfinite(points.sum())):
                 bad = (~torch.isfinite(points)).flatten(1).any(1).nonzero()[:, 0] + begin
                 raise ValueRangeError(f"neutrals: number {int(bad[0])} holds NaN or infinity; expected none")
-            found.append(similarity_transform(points, mean.expand_as(points), scale=False))
-            total += found[-1].apply(points).sum(0)
+            poses.append(similarity_transform(points, mean.expand_as(points), scale=False))
+            total += poses[-1].apply(points).sum(0)
         mean = total / count
-    return mean, Similarity(*(torch.cat([getattr(p, name) for p in found]) for name in _POSE))
+    return mean, Similarity(*(torch.cat([getattr(p, name) for p in poses]) for name in _POSE))
 
 
 _POSE = ("scale", "rotation", "translation")
@@ -49,11 +49,11 @@ def _of(poses: Similarity, begin: int, end: int) -> Similarity:
 
 @dataclass(frozen=True, eq=False)
 class NeutralRegion:
-    """The part of each neutral that is learned from, (M,R,3) float32, laid on the others.
+    """The part of each neutral that is learned from, (M,R,3) float32, aligned with the others.
 
     Args:
         neutrals: (M,V,3).
-        poses: of :func:`laid_together`.
+        poses: of :func:`align_neutrals`.
         rows: which vertices, (R,).
     """
 
@@ -68,21 +68,21 @@ class NeutralRegion:
 
     def read(self, begin: int, end: int) -> Tensor:
         """See ``Samples``."""
-        found = torch.empty(end - begin, *self.shape[1:])
+        part = torch.empty(end - begin, *self.shape[1:])
         for first, last in _within(self.neutrals, begin, end):
-            laid = _of(self.poses, first, last).apply(self.neutrals.read(first, last).double())
-            found[first - begin : last - begin] = laid[:, self.rows]
-        return found
+            aligned = _of(self.poses, first, last).apply(self.neutrals.read(first, last).double())
+            part[first - begin : last - begin] = aligned[:, self.rows]
+        return part
 
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What is to be predicted of each person, (M,N·V,3) float64: offsets or expressions, turned as the neutral is laid.
+    """What is to be predicted of each person, (M,N·V,3) float64: offsets or expressions, turned as the neutral is.
 
     Args:
         neutrals: (M,V,3).
         expressions: (M,N·V,3).
-        poses: of :func:`laid_together`.
+        poses: of :func:`align_neutrals`.
         form: "offsets" or "expressions".
     """
 
@@ -125,10 +125,10 @@ class MovingPlaces:
 
     def read(self, begin: int, end: int) -> Tensor:
         """See ``Samples``."""
-        found = torch.empty(end - begin, *self.shape[1:])
+        part = torch.empty(end - begin, *self.shape[1:])
         for first, last in _within(self.predicted, begin, end):
-            found[first - begin : last - begin] = self.predicted.read(first, last)[:, self.places]
-        return found
+            part[first - begin : last - begin] = self.predicted.read(first, last)[:, self.places]
+        return part
 
 
 def _within(samples: Samples, begin: int, end: int) -> list[tuple[int, int]]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.io import MeshSequence, save_animation
 from torchface.mesh import Mesh
+from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
@@ -74,9 +75,8 @@ def animation_targets(
     for number, row in enumerate(rows):  # a frame at a time: they lie far apart on disk
         offsets[number] = (sequence.read(row, row + 1)[0] - neutral).reshape(-1)
         progress("finding morph targets", number + 1, len(rows))
-    gram = (offsets @ offsets.T).double()
-    values, vectors = torch.linalg.eigh((gram + gram.T) / 2)
-    values, vectors = values.flip(0).clamp(min=0), vectors.flip(1)
+    values, vectors = largest_eigenpairs(offsets @ offsets.T)
+    values = values.clamp(min=0)
     left = values.sum() - values.cumsum(0)
     enough = (left / (len(rows) * vertices)).sqrt() <= _EXACT_MM
     wanted = int(enough.nonzero()[0, 0]) + 1 if enough.any() else len(values)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.low_pass import LowPass
-from torchface.enhancement.propagation import rigid_motion
+from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.thin_shell import rigid_motion
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_areas, vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.enhancement.coarse_level import coarse_level
-from torchface.enhancement.propagation import LEAST_POINTS, ThinShell
+from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell
 from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key

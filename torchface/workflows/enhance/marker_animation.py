@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture import align_take
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
-from torchface.enhancement.propagation import LEAST_POINTS, ThinShell, rigid_motion
+from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell, rigid_motion
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.enhancement.propagation import LEAST_POINTS, ThinShell
+from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.similarity import Similarity

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.enhancement.low_pass import small_part_triangles
-from torchface.enhancement.propagation import LEAST_POINTS, ThinShell
+from torchface.enhancement.detail.low_pass import small_part_triangles
+from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.proximity import SurfaceIndex
 from torchface.geometry.meshes.uv_raster import interpolate

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail
 from torchface.geometry.meshes.region_maps import RegionMaps
 from torchface.geometry.meshes.uv_raster import rasterise_uvs
 from torchface.geometry.similarity import Similarity

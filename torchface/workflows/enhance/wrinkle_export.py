@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement import EnhancementModel
-from torchface.enhancement.detail_basis import LearnedBasis
-from torchface.enhancement.low_pass import vertex_areas
-from torchface.enhancement.wrinkle_basis import MAPS, WrinkleBasis, learn_wrinkle_basis
-from torchface.enhancement.wrinkle_teaching import captured_poses, taught_details, teaching_poses
-from torchface.enhancement.wrinkle_weights import RigWrinkles, WrinkleWeights
+from torchface.enhancement.detail.detail_basis import LearnedBasis
+from torchface.enhancement.detail.low_pass import vertex_areas
+from torchface.enhancement.wrinkle_maps.wrinkle_basis import MAPS, WrinkleBasis, learn_wrinkle_basis
+from torchface.enhancement.wrinkle_maps.wrinkle_teaching import captured_poses, taught_details, teaching_poses
+from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.documents import write_json
 from torchface.files.job_lock import within_job

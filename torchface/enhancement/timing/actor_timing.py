@@ -1,14 +1,24 @@
-"""The actor's timing as a regression: from where a motion begins and ends, and how long it lasts, to its velocity."""
+"""The actor's timing of motions between keyframes, by region: learned where the database has motions enough.
+
+A learned timing is a regression from where a motion begins and ends, and how long it lasts, to its velocity.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.enhancement.motion_keyframes import find_keyframes, without_holds
+from torchface.enhancement.timing.motion_keyframes import find_keyframes, without_holds
+from torchface.enhancement.timing.nearest_timing import (
+    captured_sequences,
+    check_keyframes,
+    moving_regions,
+    nearest_timing,
+)
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import checked_count, checked_number
 
@@ -23,6 +33,60 @@ _MOST_TUNED = 200  # motions of which the scales are learned
 _STEPS, _RATE = 60, 0.1  # of the descent on the scales
 _LEAST_RIDGE = 1e-4  # of the kernel's diagonal
 _FEWER_INPUTS = 1e-3  # how much the descent prefers inputs that count for nothing
+
+
+class ActorTiming:
+    """How the captured actor moves between two poses.
+
+    A region of enough captured motions has a regression of its own, see
+    :class:`LearnedTiming`; any other takes the mean of its nearest motions, see
+    :func:`~torchface.enhancement.timing.nearest_timing.nearest_timing`; one at rest follows the whole face.
+
+    Args:
+        database: features of the captured frames, (K,P,C).
+        sequences: the number of each captured frame's sequence, (K,).
+        weights: of patches in each region, (R,P).
+        fps: of the captured frames.
+
+    Raises:
+        ShapeError: the shapes do not fit.
+        ValueRangeError: no sequence has two frames.
+    """
+
+    def __init__(self, database: Tensor, sequences: Tensor, weights: Tensor, fps: float) -> None:
+        self._captured = captured_sequences(database, sequences)
+        self._weights = weights
+        self._whole = weights.mean(0)
+        self._learned = [LearnedTiming.fit(database, sequences, region, fps) for region in (*weights, self._whole)]
+
+    def times(self, keyframes: Tensor, frames: int, length: float) -> Tensor:
+        """How far the motion between two keyframes has come in each frame, (R,frames), 0 first, 1 last, never falling.
+
+        Args:
+            keyframes: features of both, (2,P,C).
+            frames: at even distance, both keyframes counted.
+            length: of the motion, in frames of the database.
+
+        Raises:
+            ShapeError: features of other patches.
+            ValueRangeError: the keyframes are equal, or fewer than two frames.
+        """
+        checked_count("frames", frames, 2)
+        checked_number("length", length, above=True)
+        check_keyframes(keyframes, self._captured[0].shape[1:])
+        moves = moving_regions(keyframes, self._weights)
+        whole = self._region(-1, self._whole, keyframes, frames, length)
+        rows = [
+            self._region(row, region, keyframes, frames, length) if moves[row] else whole
+            for row, region in enumerate(self._weights)  # each has a regression of its own
+        ]
+        return torch.stack(rows)
+
+    def _region(self, row: int, region: Tensor, keyframes: Tensor, frames: int, length: float) -> Tensor:
+        learned = self._learned[row]
+        if learned is not None:
+            return learned.times(keyframes, frames, length)
+        return nearest_timing(keyframes, self._captured, region, frames, length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +182,14 @@ class LearnedTiming:
         # Velocity does not go below nothing: time never runs backwards.
         velocity = (self.mean_profile + _kernel(inputs, self.inputs)[0] @ self.dual).clamp(min=0)
         way = torch.cat([velocity.new_zeros(1), velocity.cumsum(0)])
-        place = torch.linspace(0, _MOMENTS, frames, dtype=torch.float64)
-        before = place.floor().long().clamp(max=_MOMENTS - 1)
-        times = torch.lerp(way[before], way[before + 1], place - before) / way[-1]
+        times = _evenly(way, frames) / way[-1]
         times[0], times[-1] = 0, 1
         return times.to(keyframes.dtype)
 
 
 def _motions(frames: Tensor, sequences: Tensor, fps: float) -> list[Tensor]:
     """The motions of captured sequences between holds and turns, (n,D) each; what hardly moves is left out."""
-    found = []
+    motions = []
     for number in sequences.unique():  # of different length
         path = frames[sequences == number]
         if len(path) < 2:
@@ -135,21 +197,25 @@ def _motions(frames: Tensor, sequences: Tensor, fps: float) -> list[Tensor]:
         for first, last in pairwise(find_keyframes(path, _BEND)):
             begin, end = without_holds(path[first : last + 1], fps)
             if end > begin:
-                found.append(path[first + begin : first + end + 1])
-    if not found:
+                motions.append(path[first + begin : first + end + 1])
+    if not motions:
         return []
-    sizes = torch.stack([(motion[-1] - motion[0]).norm() for motion in found])
+    sizes = torch.stack([(motion[-1] - motion[0]).norm() for motion in motions])
     least = _SMALL * float(sizes.quantile(_USUAL))
-    return [motion for motion, size in zip(found, sizes.tolist(), strict=True) if size > max(least, 0.0)]
+    return [motion for motion, size in zip(motions, sizes.tolist(), strict=True) if size > max(least, 0.0)]
 
 
 def _velocities(motion: Tensor) -> Tensor:
     """Along the straight way from a motion's (n,D) first to its last pose, (40,), 1 in the mean."""
     way = motion[-1] - motion[0]
     progress = (motion - motion[0]) @ way / way.square().sum()
-    place = torch.linspace(0, len(motion) - 1, _MOMENTS + 1, dtype=torch.float64)
-    before = place.floor().long().clamp(max=len(motion) - 2)
-    return _MOMENTS * torch.lerp(progress[before], progress[before + 1], place - before).diff()
+    return _MOMENTS * _evenly(progress, _MOMENTS + 1).diff()
+
+
+def _evenly(values: Tensor, count: int) -> Tensor:
+    """Values (n,) at ``count`` even moments from the first to the last, between them linearly."""
+    moments = np.linspace(0, len(values) - 1, count)
+    return torch.from_numpy(np.interp(moments, np.arange(len(values)), values.numpy()))
 
 
 def _inputs(ends: Tensor, lengths: Tensor, centre: Tensor, directions: Tensor) -> Tensor:
@@ -186,5 +252,5 @@ def _least_left_out(inputs: Tensor, profiles: Tensor) -> tuple[Tensor, Tensor]:
             loss = (left_out.square().mean(1) + 1e-9).sqrt().mean() + _FEWER_INPUTS * scales.sum()
             loss.backward()
             optimizer.step()
-        found = logarithms.detach().exp()
-    return found[:-1], found[-1].clamp(min=_LEAST_RIDGE)
+        learned = logarithms.detach().exp()
+    return learned[:-1], learned[-1].clamp(min=_LEAST_RIDGE)

@@ -10,9 +10,9 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
 from torchface.attachment import Attachment
-from torchface.enhancement import propagation
+from torchface.enhancement import thin_shell
 from torchface.enhancement.coarse_level import coarse_level
-from torchface.enhancement.propagation import ThinShell, rigid_motion
+from torchface.enhancement.thin_shell import ThinShell, rigid_motion
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.meshes.shell_energies import bending_energy, stretching_energy
@@ -85,7 +85,7 @@ def own_solution(
 
 @pytest.mark.parametrize("operator", [True, False])
 def test_it_agrees_with_a_solve_of_its_own(operator: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(propagation, "_OPERATOR_POINTS", 400 if operator else 0)
+    monkeypatch.setattr(thin_shell, "_OPERATOR_POINTS", 400 if operator else 0)
     vertices, faces = sheet(20.0, 130)
     points = sites(faces, 16)
     wanted = torch.randn(2, 16, 3, generator=torch.Generator().manual_seed(2))
@@ -101,7 +101,7 @@ def test_it_agrees_with_a_solve_of_its_own(operator: bool, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("operator", [True, False])
 def test_affine_motion_of_a_flat_sheet_is_kept_to_its_rims(operator: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(propagation, "_OPERATOR_POINTS", 400 if operator else 0)
+    monkeypatch.setattr(thin_shell, "_OPERATOR_POINTS", 400 if operator else 0)
     vertices, faces = sheet(0.0)
     field = vertices @ torch.tensor([[0.3, -0.1, 0.2], [0.1, 0.2, -0.3], [0.0, 0.0, 0.0]]) + 2.0
     points = sites(faces, 20)
@@ -120,7 +120,7 @@ def test_a_translation_is_kept_exactly(level: int | None) -> None:
 
 @pytest.mark.parametrize("operator", [True, False])
 def test_a_point_that_was_not_seen_holds_nothing(operator: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(propagation, "_OPERATOR_POINTS", 400 if operator else 0)
+    monkeypatch.setattr(thin_shell, "_OPERATOR_POINTS", 400 if operator else 0)
     vertices, faces = sheet(20.0)
     points = sites(faces, 30)
     wanted = torch.randn(3, 30, 3, generator=torch.Generator().manual_seed(4))

@@ -1,10 +1,15 @@
-"""Frames of any rigid place, laid on the neutral and back; what is of another size or mesh is refused."""
+"""The encoder of frames: aligned with the neutral, split into a smooth part and detail, compared by patches."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
-from torchface.enhancement.sparse_operator import SparseOperator
+from torchface.enhancement.detail.detail_encodings import DetailKind, DisplacementDetail, GradientDetail
+from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.detail.sparse_operator import SparseOperator
+from torchface.enhancement.detail.surface_frames import PatchGradients, SurfaceFrames
 from torchface.errors import AlignmentError, TopologyError
 from torchface.geometry.similarity import Similarity, similarity_transform
 
@@ -12,8 +17,41 @@ _SCALES = (0.5, 2.0)
 _MOST_RESIDUAL = 0.35  # of the head's size: beyond, vertices are not where they should be
 
 
+@dataclass(frozen=True, eq=False)
+class Encoder:
+    """The steps that turn frames into smooth parts, features and details.
+
+    Args:
+        alignment: aligns frames with the neutral.
+        low_pass: smooths their displacements.
+        frames: turns the vertices' frames with their smooth part.
+        gradients: takes the features of patches.
+        detail: encodes what the smooth part lacks.
+    """
+
+    alignment: FrameAlignment
+    low_pass: LowPass
+    frames: SurfaceFrames
+    gradients: PatchGradients
+    detail: DisplacementDetail | GradientDetail
+
+
+def make_encoder(neutral: Tensor, faces: Tensor, patches: Tensor, wavelength: float, detail: DetailKind) -> Encoder:
+    """Of a neutral (V,3) and its faces (F,3), in patches (F,); ``wavelength`` in millimetres."""
+    frames = SurfaceFrames(neutral, faces)
+    gradients = frames.patch_gradients(patches, faces, neutral)
+    by_vertex = detail == "displacements"
+    return Encoder(
+        FrameAlignment(neutral, gradients.means),
+        LowPass(neutral, faces, wavelength),
+        frames,
+        gradients,
+        DisplacementDetail(neutral, faces, frames) if by_vertex else GradientDetail(neutral, faces),
+    )
+
+
 class FrameAlignment:
-    """Lays frames on the neutral by the means over patches: Horn's alignment, translation and rotation.
+    """Frames aligned with the neutral by the means over patches: Horn's alignment, translation and rotation.
 
     Args:
         neutral: (V,3), millimetres.
@@ -24,8 +62,8 @@ class FrameAlignment:
         self.neutral, self._means = neutral, means
         self._points = means(neutral.double())
 
-    def laid_on_neutral(self, frames: Tensor, name: str) -> tuple[Tensor, Similarity]:
-        """Displacements from the neutral of frames laid on it, and how they were laid.
+    def aligned(self, frames: Tensor, name: str) -> tuple[Tensor, Similarity]:
+        """Displacements from the neutral of frames aligned with it, and how they were moved.
 
         Args:
             frames: (B,V,3), millimetres; differentiable.
@@ -54,7 +92,7 @@ class FrameAlignment:
     def _check(self, points: Tensor, target: Tensor, name: str) -> None:
         fitted = similarity_transform(points, target)
         size = (target - target.mean(1, keepdim=True)).square().sum((-1, -2)).sqrt()
-        own = (points - points.mean(1, keepdim=True)).square().sum((-1, -2)).sqrt()
+        extent = (points - points.mean(1, keepdim=True)).square().sum((-1, -2)).sqrt()
         residual = (fitted.apply(points) - target).square().sum((-1, -2)).sqrt() / size
         worst = int(residual.argmax())
         if float(residual[worst]) > _MOST_RESIDUAL:
@@ -63,7 +101,7 @@ class FrameAlignment:
                 f"neutral, expected at most {100 * _MOST_RESIDUAL:.0f} %: its vertices are in another order, or it is "
                 "another mesh"
             )
-        ratio = own / size
+        ratio = extent / size
         odd = ((ratio < _SCALES[0]) | (ratio > _SCALES[1])).nonzero()[:, 0]
         if len(odd):
             raise AlignmentError(

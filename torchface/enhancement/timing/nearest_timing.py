@@ -1,4 +1,4 @@
-"""The actor's timing for keyframes: where a motion between two poses stands at each moment, by his captured motions."""
+"""The timing of a motion between two keyframes by its nearest captured motions: a path in order through each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.optimize import isotonic_regression
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
@@ -72,14 +74,14 @@ def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
     inside = shares[frames, segments]
     for segment in segments.unique():  # runs differ in length
         run = segments == segment
-        inside[run] = _isotonic(inside[run])
+        inside[run] = torch.from_numpy(isotonic_regression(inside[run].numpy()).x)
     step = beta[segments + 1] - beta[segments]
-    found = beta[segments] + inside[:, None] * step
-    return SequenceProjection(segments + inside, (alpha - found).norm(dim=1))
+    nearest = beta[segments] + inside[:, None] * step
+    return SequenceProjection(segments + inside, (alpha - nearest).norm(dim=1))
 
 
 def nearest_timing(
-    keyframes: Tensor, owned: Sequence[Tensor], region: Tensor, frames: int, length: float, nearest: int = NEAREST
+    keyframes: Tensor, captured: Sequence[Tensor], region: Tensor, frames: int, length: float, nearest: int = NEAREST
 ) -> Tensor:
     """How far a region's motion between two keyframes has come in each frame, by its nearest captured motions.
 
@@ -89,7 +91,7 @@ def nearest_timing(
 
     Args:
         keyframes: features of both, (2,P,C).
-        owned: features of each captured sequence, (n,P,C) each, see :func:`captured_sequences`.
+        captured: features of each captured sequence, (n,P,C) each, see :func:`captured_sequences`.
         region: the share of each patch in the region, (P,).
         frames: at even distance, both keyframes counted.
         length: of the motion, in frames of the database.
@@ -107,10 +109,10 @@ def nearest_timing(
     size = float((pair[1] - pair[0]).norm().clamp(min=1e-12))
     motions: list[Tensor] = []
     errors: list[float] = []
-    for sequence in owned:
-        captured = (sequence.double() * scale).flatten(1)
-        times, error = _on_one_motion(pair, captured)
-        motion = _extended(captured, times, pair[1] - pair[0])
+    for sequence in captured:
+        path = (sequence.double() * scale).flatten(1)
+        times, error = _on_one_motion(pair, path)
+        motion = _extended(path, times, pair[1] - pair[0])
         if len(motion) < 2:
             continue
         # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
@@ -140,13 +142,13 @@ def captured_sequences(database: Tensor, sequences: Tensor) -> list[Tensor]:
         raise ShapeError(
             f"database: found {tuple(database.shape)} and sequences {tuple(sequences.shape)}, expected (K,P,C), (K,)"
         )
-    owned = [database[sequences == number] for number in sequences.unique()]
-    owned = [sequence for sequence in owned if len(sequence) > 1]
-    if not owned:
+    captured = [database[sequences == number] for number in sequences.unique()]
+    captured = [sequence for sequence in captured if len(sequence) > 1]
+    if not captured:
         raise ValueRangeError(
             "sequences: found none of two frames or more, expected captured motions to take timing from"
         )
-    return owned
+    return captured
 
 
 def check_keyframes(keyframes: Tensor, shape: tuple[int, ...]) -> None:
@@ -208,8 +210,8 @@ def motion_progress(motion: Tensor, frames: int) -> Tensor:
     times[0], times[-1] = 0, len(motion) - 1
     # A jump leaves several blends at one time: the least of slopes lets them be told apart.
     times = (times + 1e-6 * asked) * ((len(motion) - 1) / (len(motion) - 1 + 1e-6))
-    moments = torch.linspace(0, len(motion) - 1, frames, dtype=torch.float64)
-    progress = _interpolated(moments, times, asked)
+    moments = np.linspace(0, len(motion) - 1, frames)
+    progress = torch.from_numpy(np.interp(moments, times.numpy(), asked.numpy()))
     progress[0], progress[-1] = 0, 1
     return progress
 
@@ -263,24 +265,3 @@ def _segment_projections(alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
     offset = alpha.square().sum(1)[:, None] - 2 * alpha @ beta[:-1].T + beta[:-1].square().sum(1)
     squared = offset - 2 * shares * along + shares.square() * length
     return shares, squared.clamp(min=0).sqrt()
-
-
-def _isotonic(values: Tensor) -> Tensor:
-    """The nearest sequence to (m,) that never falls, by pooling neighbours that do."""
-    pools: list[tuple[float, int]] = []
-    # Each value may merge any number of pools before it.
-    for value in values.tolist():
-        total, count = value, 1
-        while pools and pools[-1][0] * count > total * pools[-1][1]:
-            before = pools.pop()
-            total, count = total + before[0], count + before[1]
-        pools.append((total, count))
-    means = torch.tensor([total / count for total, count in pools], dtype=values.dtype)
-    return means.repeat_interleave(torch.tensor([count for _, count in pools]))
-
-
-def _interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
-    """Values (k,) known at rising places (k,), between them at others (n,)."""
-    right = torch.searchsorted(known, at).clamp(1, len(known) - 1)
-    span = (known[right] - known[right - 1]).clamp(min=1e-12)
-    return torch.lerp(values[right - 1], values[right], ((at - known[right - 1]) / span).clamp(0, 1))

@@ -6,26 +6,27 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchface.enhancement.motion_clusters import motion_clusters
-from torchface.enhancement.patches import (
+from torchface.enhancement.matching.motion_clusters import motion_clusters
+from torchface.enhancement.matching.patches import (
     grow_labels,
-    grow_patches,
     neighbour_table,
     neighbouring_triangles,
     patch_means,
 )
-from torchface.enhancement.region_names import named_regions
-from torchface.enhancement.soft_borders import soft_weights, surface_distances
+from torchface.enhancement.matching.region_names import named_regions
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.meshes.operators import components, corners, triangle_areas
+from torchface.geometry.meshes.operators import components, corners, edges, triangle_areas
 from torchface.number_checks import checked_count, checked_number
 
 SIGMA = 10.0
 """Standard deviation of the regions' borders, millimetres."""
 
+_LIMIT = 4.0  # standard deviations, where 0.0003 of the weight is left: half precision holds it
 _LANDMARKS = 68
 _MIDDLE = (8, 27, 28, 29, 30, 33, 51, 57, 62, 66)
 _EYES = {"eye_right": range(36, 42), "eye_left": range(42, 48)}
@@ -77,27 +78,6 @@ class Regions:
         loose = total.sum(0) == 0
         total[:, loose] = 1.0
         return total / total.sum(0)
-
-
-def find_regions(
-    displacements: Tensor,
-    neutral: Tensor,
-    faces: Tensor,
-    count: int = 13,
-    landmarks: Tensor | None = None,
-    sigma: float = SIGMA,
-    seed: int = 0,
-) -> Regions:
-    """Regions of correlated motion, from frames in memory.
-
-    Args:
-        displacements: of the frames from the neutral, laid on it, (K,V,3), millimetres.
-        neutral, faces, count, landmarks, sigma, seed, Returns, Raises, Source: as :func:`regions_of_motion`.
-    """
-    patches = grow_patches(faces, len(neutral), max(4, min(100, len(neutral) // 400)), seed)
-    areas = triangle_areas(neutral, faces)
-    motion = torch.cat([patch_means(some[:, faces].mean(2), patches, areas) for some in displacements.split(8)])
-    return regions_of_motion(motion, patches, neutral, faces, count, landmarks, sigma, seed)
 
 
 def regions_of_motion(
@@ -215,3 +195,51 @@ def _pieces(links: Tensor, count: int) -> Tensor:
     """The connected piece of each triangle, (F,), by links (E,2)."""
     # A triangle of a pair twice: the same search as over a mesh's vertices.
     return components(torch.cat([links, links[:, 1:]], dim=1), count)
+
+
+def surface_distances(vertices: Tensor, faces: Tensor, sources: Tensor, limit: float = float("inf")) -> Tensor:
+    """The length of the shortest way along edges from the nearest source to each vertex, (V,), millimetres.
+
+    Args:
+        vertices: (V,3), millimetres.
+        faces: (F,3) int64.
+        sources: ids (S,) int64.
+        limit: what is further away gets infinity.
+    """
+    pairs = edges(faces)
+    lengths = (vertices[pairs[:, 0]] - vertices[pairs[:, 1]]).norm(dim=1).double().clamp(min=1e-9)
+    ways = coo_array((lengths.cpu().numpy(), pairs.T.cpu().numpy()), shape=(len(vertices),) * 2).tocsr()
+    distance = dijkstra(ways, directed=False, indices=sources.cpu().numpy(), min_only=True, limit=limit)
+    return torch.from_numpy(distance).to(vertices)
+
+
+def soft_weights(labels: Tensor, count: int, vertices: Tensor, faces: Tensor, sigma: float) -> Tensor:
+    r"""The weight of each region at each triangle, (R,F) half: 1 inside, outside a Gaussian of the distance.
+
+    .. math:: \omega_{r,t} = \exp(-d_{r,t}^2 / 2\sigma^2)
+
+    Args:
+        labels: the region of each triangle, (F,) int64.
+        count: of regions, R.
+        vertices: (V,3), millimetres.
+        faces: (F,3) int64.
+        sigma: millimetres.
+
+    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 5.3.
+    """
+    weights = torch.zeros(count, len(faces), dtype=torch.float16)
+    corner_label = labels[:, None].expand(-1, 3)
+    low = torch.full((len(vertices),), count).scatter_reduce(0, faces.flatten(), corner_label.flatten(), "amin")
+    high = torch.full((len(vertices),), -1).scatter_reduce(0, faces.flatten(), corner_label.flatten(), "amax")
+    on_border = low != high
+    for region in range(count):  # one after the other: the distances of all would be large
+        inside = labels == region
+        corners = faces[inside].unique()
+        sources = corners[on_border[corners]]
+        if len(sources):
+            distance = surface_distances(vertices, faces, sources, _LIMIT * sigma)
+            distance[corners] = 0.0
+            distance = distance[faces].mean(1)
+            weights[region] = torch.exp(-0.5 * (distance / sigma).square()).half()
+        weights[region, inside] = 1.0
+    return weights

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
-from torchface.enhancement.patches import Ids, grow_groups, grow_labels, neighbour_table
+from torchface.enhancement.matching.patches import Ids, grow_groups, grow_labels, neighbour_table
 from torchface.errors import ValueRangeError
 
 Numbers = NDArray[np.float64]

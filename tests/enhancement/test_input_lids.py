@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel
-from torchface.enhancement.low_pass import LowPass
-from torchface.enhancement.own_lids import OwnLids
+from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.input_lids import InputLids
 from torchface.synthetic.head.performer import performer
 
 UPPER, LOWER = {"right": (37, 38), "left": (43, 44)}, {"right": (41, 40), "left": (47, 46)}
@@ -40,14 +40,14 @@ def test_an_eye_closes_as_the_input_does(model, database, blink, monkeypatch):
     found = model(blink)
     assert float((opening(database, found, "right") - given).abs().max()) < 0.1
     assert torch.allclose(opening(database, found, "left"), opening(database, blink, "left"), atol=0.05)
-    monkeypatch.setattr(OwnLids, "__call__", lambda self, enhanced, low, own: enhanced)
+    monkeypatch.setattr(InputLids, "__call__", lambda self, enhanced, low, own: enhanced)
     assert float((opening(database, model(blink), "right") - given).abs().max()) > 0.15
 
 
 def test_lids_of_a_smoothed_input_are_those_found(model, database, blink, monkeypatch):
     smoothed = model.low(blink)
     found = model(smoothed)
-    monkeypatch.setattr(OwnLids, "__call__", lambda self, enhanced, low, own: enhanced)
+    monkeypatch.setattr(InputLids, "__call__", lambda self, enhanced, low, own: enhanced)
     print((found - model(smoothed)).norm(dim=-1).amax(1))
     assert torch.equal(found, model(smoothed))
 
@@ -63,7 +63,7 @@ def test_wrinkles_of_the_lids_stay():
         torch.tensor([0.0, 1.0, 0.0]) * (torch.pi * neutral[:, :1] / 32).cos() * (torch.pi * neutral[:, 1:2] / 24).cos()
     )
     waves = torch.tensor([0.0, 0.0, 0.1]) * (torch.pi * neutral[:, :1]).sin()
-    lids, found = OwnLids(neutral, faces, inside[None]), neutral + 3.0 * lid + waves
+    lids, found = InputLids(neutral, faces, inside[None]), neutral + 3.0 * lid + waves
     closed = lids(found[None], neutral[None], (neutral + 3.4 * lid)[None])[0]
     middle = neutral.abs().amax(1) < 4
     assert torch.allclose(closed[middle, 1], (neutral + 3.4 * lid)[middle, 1], atol=0.06)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.enhancement.detail_basis import LearnedBasis
+from torchface.enhancement.detail.detail_basis import LearnedBasis
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import checked_count
 from torchface.optim.box_qp import box_qp

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.number_checks import checked_number
+from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.optim.simplex_qp import SimplexQP
 
 RIDGE = 1e-4
@@ -71,7 +72,7 @@ class RegionProjection:
     into the few coordinates that the database spans, in which all distances are the same.
 
     Args:
-        features: :math:`\tilde D`, (K,P,9), see :func:`~torchface.enhancement.polar_parts.encode_gradients`.
+        features: :math:`\tilde D`, (K,P,9), see :func:`~torchface.enhancement.detail.polar_parts.encode_gradients`.
         patch_weights: :math:`\omega`, (R,P), non-negative.
         ridge: :math:`\epsilon`, as a share of the database's mean squared distance from its mean.
         temporal: :math:`\tau`, likewise; frames are then solved one after the other.
@@ -189,8 +190,8 @@ def _space(features: Tensor, weights: Tensor) -> _Space:
     rows = (features[:, patches] * roots).flatten(1)
     mean = rows.mean(0)
     rows = rows - mean
-    values, vectors = torch.linalg.eigh((rows @ rows.T).double())
-    values, vectors = values.clamp(min=0).flip(0), vectors.flip(1)
+    values, vectors = largest_eigenpairs(rows @ rows.T)
+    values = values.clamp(min=0)
     left = values.sum() - values.cumsum(0)
     count = max(1, int((left > _LOST * values.sum()).sum()) + 1) if float(values.sum()) > 0 else 1
     vectors = vectors[:, :count].to(rows)

@@ -9,9 +9,9 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torchface.enhancement.low_pass import vertex_areas
-from torchface.enhancement.polar_parts import encode_gradients
-from torchface.enhancement.sparse_operator import SparseOperator
+from torchface.enhancement.detail.low_pass import vertex_areas
+from torchface.enhancement.detail.polar_parts import encode_gradients
+from torchface.enhancement.detail.sparse_operator import SparseOperator
 from torchface.geometry.meshes.deformation import gradient_operator
 from torchface.geometry.meshes.operators import edges, triangle_areas, vertex_normals
 

@@ -10,8 +10,7 @@ from forked_runs import killed
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.modeling import MorphableModel
-from torchface.modeling.morphable import streamed_training as module
-from torchface.modeling.morphable.streamed_training import fit_sequence
+from torchface.modeling.morphable import principal_components as module
 
 
 class InMemory:
@@ -33,14 +32,11 @@ def values() -> torch.Tensor:
     return (100 + torch.randn(90, 30, generator=generator) @ basis + noise).reshape(90, 20, 3)
 
 
-@pytest.mark.parametrize("lanczos", [False, True])
-def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)  # seven blocks of 13, the last of 12
-    if lanczos:
-        monkeypatch.setattr(module, "_WHOLE_SPECTRUM", 10)
-    steps: list[tuple[int, int]] = []
-    ours = fit_sequence(InMemory(values), 10, progress=lambda _, done, of: steps.append((done, of)))
+def test_the_same_as_in_memory(values: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = MorphableModel.fit(values, 10)
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)  # seven blocks of 13, the last of 12
+    steps: list[tuple[int, int]] = []
+    ours = MorphableModel.fit(InMemory(values), 10, progress=lambda _, done, of: steps.append((done, of)))
     assert (ours.components - whole.components).abs().max() < 1e-6
     assert (ours.standard_deviations / whole.standard_deviations - 1).abs().max() < 1e-6
     assert torch.allclose(ours.mean, whole.mean)
@@ -52,9 +48,10 @@ def test_the_same_as_in_memory(values: torch.Tensor, lanczos: bool, monkeypatch:
 def test_passes_give_the_same_as_in_memory_and_go_on_where_they_were(
     values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    whole = MorphableModel.fit(values, 10)
     monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
     monkeypatch.setattr(module, "_GRAM_SAMPLES", 10)
-    whole, ours = MorphableModel.fit(values, 10), fit_sequence(InMemory(values), 10)
+    ours = MorphableModel.fit(InMemory(values), 10)
     assert (ours.standard_deviations / whole.standard_deviations - 1).abs().max() < 1e-5
     assert (ours.components * whole.components).sum((1, 2)).min() > 1 - 1e-3
     assert torch.allclose(ours.mean, whole.mean)
@@ -65,10 +62,10 @@ def test_passes_give_the_same_as_in_memory_and_go_on_where_they_were(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
+        MorphableModel.fit(InMemory(values), 10, tmp_path / "check", stop)
     again, from_start = InMemory(values), InMemory(values)
-    continued = fit_sequence(again, 10, tmp_path / "check")
-    assert torch.equal(continued.components, fit_sequence(from_start, 10).components)
+    continued = MorphableModel.fit(again, 10, tmp_path / "check")
+    assert torch.equal(continued.components, MorphableModel.fit(from_start, 10).components)
     assert again.read_count == from_start.read_count - 2 * 7
     assert not (tmp_path / "check").exists()
 
@@ -81,18 +78,18 @@ def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
+        MorphableModel.fit(InMemory(values), 10, tmp_path / "check", stop)
     finished = sorted((tmp_path / "check").glob("gram_*.safetensors"))
     assert len(finished) == 6
     finished[1].write_bytes(finished[1].read_bytes()[:-8])  # this one is computed again
     again, whole = InMemory(values), InMemory(values)
-    ours, theirs = fit_sequence(again, 10, tmp_path / "check"), fit_sequence(whole, 10)
+    ours, theirs = MorphableModel.fit(again, 10, tmp_path / "check"), MorphableModel.fit(whole, 10)
     assert again.read_count < whole.read_count - 10
     assert torch.equal(ours.components, theirs.components)
     assert not (tmp_path / "check").exists()
     with pytest.raises(KeyboardInterrupt):
-        fit_sequence(InMemory(values), 10, tmp_path / "check", stop)
-    other = fit_sequence(InMemory(2 * values), 10, tmp_path / "check")
+        MorphableModel.fit(InMemory(values), 10, tmp_path / "check", stop)
+    other = MorphableModel.fit(InMemory(2 * values), 10, tmp_path / "check")
     assert torch.allclose(other.mean, 2 * ours.mean)
     assert torch.allclose(other.standard_deviations, 2 * ours.standard_deviations, rtol=1e-5)
 
@@ -101,38 +98,41 @@ def test_a_killed_fit_gives_the_same_and_never_takes_the_rows_of_others(
     values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
-    killed(lambda progress: fit_sequence(InMemory(values), 10, tmp_path, progress), "fitting principal components", 20)
+    killed(
+        lambda progress: MorphableModel.fit(InMemory(values), 10, tmp_path, progress),
+        "fitting principal components",
+        20,
+    )
     left = sorted(tmp_path.glob("gram_*.safetensors"))
     assert len(left) == 4
     data = left[2].read_bytes()
     left[2].write_bytes(data[:-100] + bytes(100))  # finite numbers, of the right size
     again, whole = InMemory(values), InMemory(values)
     with pytest.warns(UserWarning, match=r"gram_00002\.safetensors: found a damaged checkpoint"):
-        ours = fit_sequence(again, 10, tmp_path)
-    theirs = fit_sequence(whole, 10)
+        ours = MorphableModel.fit(again, 10, tmp_path)
+    theirs = MorphableModel.fit(whole, 10)
     assert again.read_count < whole.read_count
     assert all(torch.equal(a, b) for a, b in zip(ours.state_dict().values(), theirs.state_dict().values(), strict=True))
-    killed(lambda progress: fit_sequence(InMemory(values), 10, tmp_path, progress), "fitting principal components", 20)
+    killed(
+        lambda progress: MorphableModel.fit(InMemory(values), 10, tmp_path, progress),
+        "fitting principal components",
+        20,
+    )
     turned = values.flip(0)  # the same mean, another order
-    ours, theirs = fit_sequence(InMemory(turned), 10, tmp_path), fit_sequence(InMemory(turned), 10)
+    ours, theirs = MorphableModel.fit(InMemory(turned), 10, tmp_path), MorphableModel.fit(InMemory(turned), 10)
     assert torch.equal(ours.components, theirs.components)
 
 
-@pytest.mark.parametrize("lanczos", [False, True])
-def test_samples_that_teach_nothing_are_refused(
-    values: torch.Tensor, lanczos: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if lanczos:
-        monkeypatch.setattr(module, "_WHOLE_SPECTRUM", 10)
+def test_samples_that_teach_nothing_are_refused(values: torch.Tensor) -> None:
     with pytest.raises(ShapeError, match="found 1, expected at least two"):
-        fit_sequence(InMemory(values[:1]), 1)
+        MorphableModel.fit(InMemory(values[:1]), 1)
     with pytest.raises(ValueRangeError, match="found 90, expected 1 to 89"):
-        fit_sequence(InMemory(values), 90)
+        MorphableModel.fit(InMemory(values), 90)
     with pytest.raises(ValueRangeError, match="all the same"):
-        fit_sequence(InMemory(values[:1].expand(40, -1, -1)), 5)
+        MorphableModel.fit(InMemory(values[:1].expand(40, -1, -1)), 5)
     with pytest.raises(ValueRangeError, match="found 5, expected at most 2"):
-        fit_sequence(InMemory(values[:3].repeat(20, 1, 1)), 5)
+        MorphableModel.fit(InMemory(values[:3].repeat(20, 1, 1)), 5)
     broken = values.clone()
     broken[77, 3, 0] = float("inf")
     with pytest.raises(ValueRangeError, match="number 77 holds NaN or infinity"):
-        fit_sequence(InMemory(broken), 5)
+        MorphableModel.fit(InMemory(broken), 5)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchface.enhancement.detail_basis import LearnedBasis, StreamingBasis
-from torchface.enhancement.displacement_detail import DisplacementDetail
+from torchface.enhancement.detail.detail_basis import LearnedBasis, StreamingBasis
+from torchface.enhancement.detail.detail_encodings import DisplacementDetail
 from torchface.enhancement.enhancement_model import EnhancementModel
 from torchface.optim.box_qp import box_qp
 from torchface.progress import Progress, silent
@@ -34,7 +34,7 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
     Returns:
         (K,N), in [0,1].
     """
-    areas = model.patch_weights.sum(0).double()
+    areas = model.prepared.patch_weights.sum(0).double()
     root = (areas / areas.sum()).sqrt()[:, None]
     own = (shapes.double() * root).flatten(1)
     shown = (model.database_features.double() * root).flatten(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchface.enhancement.projection import Matched, RegionProjection
+from torchface.enhancement.matching.region_projection import Matched, RegionProjection
 from torchface.number_checks import checked_count, checked_number
 
 COMPONENTS = 60
@@ -28,8 +28,6 @@ class LearnedMap:
     Args:
         projection: of the same database.
         coefficients: C, (K,r).
-        reach: :math:`\delta` of each region, (R,), in units of the database's spread.
-        shares: :math:`\beta` of each region, (R,).
         components: principal components of each region's features.
         ridge: as a share of their mean variance.
     """
@@ -38,27 +36,26 @@ class LearnedMap:
         self,
         projection: RegionProjection,
         coefficients: Tensor,
-        reach: Tensor,
-        shares: Tensor,
         components: int = COMPONENTS,
         ridge: float = RIDGE,
     ) -> None:
         checked_count("components", components, 1)
         checked_number("ridge", ridge, above=True)
         self._projection = projection
-        self._reach, self._shares = reach, shares
         # The projection's coordinates are principal components about the mean, the largest first.
         self._maps = [_ridge_regression(known[:, :components], coefficients, ridge) for known in projection.known]
 
-    def corrections(self, features: Tensor, matched: Matched) -> Tensor:
-        """What to add to the blend's coefficients, (T,R,r).
+    def corrections(self, features: Tensor, matched: Matched, reach: Tensor, shares: Tensor) -> Tensor:
+        r"""What to add to the blend's coefficients, (T,R,r).
 
         Args:
             features: (T,P,9); differentiable.
             matched: the projection of the same frames.
+            reach: :math:`\delta` of each region, (R,), in units of the database's spread.
+            shares: :math:`\beta` of each region, (R,).
         """
         beyond = self._projection.residuals(features, matched.weights)
-        share = self._shares.to(features) * _faded(self._reach.to(features), matched.distances.to(features))
+        share = shares.to(features) * _faded(reach.to(features), matched.distances.to(features))
         pairs = zip(beyond, self._maps, strict=True)
         added = [(rows[:, : len(learned)] @ learned).to(features) for rows, learned in pairs]
         return torch.stack(added, dim=1) * share[..., None]

@@ -9,7 +9,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from torchface.enhancement.sparse_operator import solved
+from torchface.enhancement.detail.sparse_operator import solved
 from torchface.errors import ShapeError
 from torchface.geometry.meshes.deformation import gradient_operator
 from torchface.geometry.meshes.operators import components, triangle_areas

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.enhancement.low_pass import LowPass
-from torchface.enhancement.soft_borders import surface_distances
+from torchface.enhancement.detail.low_pass import LowPass
+from torchface.enhancement.matching.face_regions import surface_distances
 
 _WAVELENGTH = 8.0  # millimetres: lids are placed by longer waves, shorter ones are their wrinkles
 _SOFT = 6.0  # millimetres inside an eye's region in which its lids become those of the input
@@ -25,7 +25,7 @@ class _Eye:
     low_pass: LowPass
 
 
-class OwnLids:
+class InputLids:
     r"""Puts an input's own lids into enhanced frames where both are nearly the same.
 
     Lids move far over little skin, so the smooth part of a blink is half open, and detail has to close it. A blend of

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.number_checks import checked_count
+from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.rig import BlendshapeRig
 
 SITES = 2000
@@ -247,10 +248,9 @@ class WrinkleWeights(nn.Module):
 
 def _principal_axes(rows: Tensor, count: int) -> Tensor:
     """The orthonormal axes (count,n) along which rows (K,n) are longest, zeros where there are no more."""
-    values, vectors = torch.linalg.eigh(rows @ rows.T)
-    values, vectors = values.flip(0)[:count], vectors.flip(1)[:, :count]
-    kept = values > 1e-12 * values[0].clamp(min=1e-30)
-    axes = (vectors[:, kept] / values[kept].sqrt()).T @ rows
+    values, vectors = largest_eigenpairs(rows @ rows.T, count)
+    moving = values > 1e-12 * values[0].clamp(min=1e-30)
+    axes = (vectors[:, moving] / values[moving].sqrt()).T @ rows
     return torch.cat([axes, axes.new_zeros(count - len(axes), rows.shape[1])])
 
 

@@ -1,0 +1,1 @@
+"""Smooth parts and detail of frames: how they are split, encoded and compressed."""

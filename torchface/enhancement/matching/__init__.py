@@ -1,0 +1,1 @@
+"""The database's frames that look like an input, region by region."""

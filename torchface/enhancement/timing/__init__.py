@@ -1,0 +1,1 @@
+"""The actor's timing of motions between keyframes."""
